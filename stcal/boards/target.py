@@ -175,6 +175,8 @@ def _printed_lines(face: FaceDesign) -> list[str]:
     lines = [f"sigma_mm = {face.sigma_mm!r}  # of a corner about the design, per axis"]
     if face.size_sigma:
         lines.append(f"size_sigma_mm = {face.size_sigma * _size_mm(board)!r}  # of the side of a square or tag")
+    else:
+        lines.append("# size_sigma_mm = 0.03  # of the side of a square or tag, where you measured it")
     if isinstance(board, TagLayout):
         return [*lines, "tags = [", *tag_rows(board), "]"]
     return [*lines, f"board = {{ type = {toml_string(TYPES[type(board)])}, {', '.join(keys_of(board))} }}"]

@@ -176,5 +176,9 @@ def drawn_text(drawn: Drawn) -> str:
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
-        lines.append(f"parts that are glued of several sheets are off at the seams: state it in sigma_mm, or {larger}")
+        single = ", or one by one without --net" if drawn.parts[0].name.startswith("net") else ""
+        lines.append(
+            f"parts that are glued of several sheets are off at the seams, the worse where one runs through a pattern: "
+            f"state it in sigma_mm, or {larger}{single}"
+        )
     return "\n".join(lines)

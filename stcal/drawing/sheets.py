@@ -220,29 +220,42 @@ def _ways(part: Part, paper: str) -> list[_Way]:
         shapes = [*framed(part), *table(part, below)]
         box = extent(shapes)
         room = np.array(size) - FURNITURE
+        words = np.array([shape.box() for shape in shapes if isinstance(shape, Text)])
         across, down = (
-            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k]) for k in (0, 1)
+            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k], words[:, :, k])
+            for k in (0, 1)
         )
         ways.append(_Way(shapes, box, size, (across, down)))
     return ways
 
 
-def seams_between(low: float, high: float, room: float, taken: np.ndarray) -> list[float]:
+def seams_between(
+    low: float, high: float, room: float, taken: np.ndarray, words: np.ndarray | None = None
+) -> list[float]:
     """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
 
-    Seams avoid the intervals ``taken`` (n, 2) if the second half of a piece has a free place.
+    Seams avoid the intervals ``taken`` (n, 2), and those of ``words`` (m, 2) too where they can, if the second half
+    of a piece has a free place.
     """
+    both = taken if words is None else np.concatenate([taken, words])
     seams, start = [], low
     while high - start > room:
-        last = place = start + room - OVERLAP / 2
-        while place > start + room / 2:
-            hit = taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]
-            if not len(hit):
-                break
-            place = min(float(hit[:, 0].min()) - CLEAR, place - 1e-6)
-        seams.append(place if place > start + room / 2 else last)
+        last = start + room - OVERLAP / 2
+        places = (_free(last, start + room / 2, avoided) for avoided in (both, taken))
+        seams.append(next((place for place in places if place is not None), last))
         start = seams[-1] - OVERLAP / 2
     return seams
+
+
+def _free(last: float, first: float, taken: np.ndarray) -> float | None:
+    """Return the last place up to ``last`` that is clear of the intervals ``taken``, or None beyond ``first``."""
+    place = last
+    while place > first:
+        hit = taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]
+        if not len(hit):
+            return place
+        place = min(float(hit[:, 0].min()) - CLEAR, place - 1e-6)
+    return None
 
 
 def _tiles(way: _Way, title: str) -> list[Sheet]:

@@ -413,12 +413,17 @@ def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]]
 
     ``printed`` : returns the lines of the board or tags of a face, needed if the target has such faces.
     """
-    lines = [
+    round_ = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+    ]
+    printed_alone = all(face.printed is not None for face in target.faces)
+    of_circles = '  # circles are "bright" or "dark" against what surrounds them'
+    lines = [
+        *(["# A body with tags or boards on its faces. Lengths in mm."] if printed_alone else round_),
         *(["# Faces of tags or boards: seen from outside X to the right, Y down."] if target.has_printed else []),
         f"name = {toml_string(target.name)}",
-        f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
+        f'polarity = "{target.polarity}"' + of_circles * (not printed_alone),
         *stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm),
     ]
     scales: list[str] = []

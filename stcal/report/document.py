@@ -47,7 +47,7 @@ def with_code(text: str) -> Markup:
 
 NEEDED = (
     'PDF: needs WeasyPrint, which is not installed; pip install "stereo-target-calibration[pdf]", or in a clone '
-    '`source scripts/setup "[pdf]"`'
+    '`scripts/setup "[pdf]"`'
 )
 NO_PANGO = (
     "PDF: WeasyPrint does not find a library of the system ({reason}); install Pango, as with `apt-get install "

@@ -163,6 +163,14 @@ def test_seams_leave_no_gap(taken):
     assert len(seams) == 2
 
 
+def test_seams_avoid_words_unless_a_circle_would_be_cut():
+    """The only seam may lie from 50 to 95. Words give way where there is no room for both."""
+    words, circles = np.array([[85.0, 101.0]]), np.array([[60.0, 101.0]])
+    assert seams_between(0.0, 110.0, 100.0, np.zeros((0, 2)), words) == [84.0]
+    assert seams_between(0.0, 110.0, 100.0, np.array([[90.0, 101.0]]), np.array([[40.0, 89.0]])) == [89.0]
+    assert seams_between(0.0, 110.0, 100.0, circles, words) == [59.0]
+
+
 def test_what_fits_a_page_is_not_split():
     room = np.array(PAPERS["A4"]) - FURNITURE
     assert seams_between(0.0, float(room[0]), float(room[0]), np.zeros((0, 2))) == []

@@ -1,5 +1,6 @@
 """Nets: plates at their edges, nothing covered, every circle where it was on its face; read back by detection."""
 
+import re
 from dataclasses import replace
 from itertools import combinations
 
@@ -7,15 +8,18 @@ import numpy as np
 import pytest
 
 from stcal.design import TargetDesign, reference_target
+from stcal.drawing.dimensions import framed
 from stcal.drawing.draw import OWN, draw, drawn_text, sheets_of
 from stcal.drawing.net import _overlap, net_parts
 from stcal.drawing.shapes import Disc, Text
+from stcal.drawing.sheets import OVERLAP, paper_sheets
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
+from stcal.synthetic.designs import tag_body
 from tests.drawing.raster import camera_of, page_image
 from tests.outcome import fails_with
 
@@ -153,3 +157,23 @@ def test_a_net_of_two_plates_apart_has_two_pieces():
     parts = net_parts(TargetDesign("two", "dark", tuple(moved)))
     assert [part.name for part in parts] == ["net 1 of 2", "net 2 of 2"]
     assert [len(circles_of(part)) for part in parts] == [18, 18]
+
+
+@pytest.mark.parametrize("edge_mm", [62.0, 75.0, 93.0])
+def test_no_seam_runs_through_the_words_of_a_net(edge_mm):
+    """Every word of a net on several sheets of A4 is on one of them alone when these are cut along the seams."""
+    (part,) = net_parts(tag_body("cube", edge_mm, "DICT_APRILTAG_36h11", 0))
+    sheets = paper_sheets([part], "A4", "net")
+    every = [shape.words for shape in framed(part) if isinstance(shape, Text)]
+    places = [tuple(map(int, re.findall(r"row (\d), column (\d)", sheet.title)[0])) for sheet in sheets]
+    rows, columns = np.max(places, axis=0)
+    found = []
+    for sheet, (row, column) in zip(sheets, places, strict=True):
+        clip = sheet.placed[0].clip
+        assert clip is not None
+        low = np.where([column > 1, row < rows], clip[0] + OVERLAP / 2, -np.inf)
+        high = np.where([column < columns, row > 1], clip[1] - OVERLAP / 2, np.inf)
+        boxes = [(shape.words, shape.box()) for shape in sheet.placed[0].shapes if isinstance(shape, Text)]
+        found += [words for words, box in boxes if (box[1] > low).all() and (box[0] < high).all()]
+    assert len(sheets) > 1
+    assert sorted(found) == sorted(every)

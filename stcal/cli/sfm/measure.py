@@ -13,7 +13,7 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if, write_out
+from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, verbose, write, write_if, write_out
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def measure(
             images, read_camera(camera), circles, design, load_board(board) if board else None, options, progress
         )
     text, apart = output.poses_csv(result, table)
-    document = output.measure_report(result, str(images))
+    document = output.measure_report(result, str(images), every=verbose())
     say(document.text())
     print_each("not joined", apart)
     write(out, text, "poses")

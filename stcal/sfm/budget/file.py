@@ -9,14 +9,14 @@ import numpy as np
 from pydantic import Field
 
 import stcal
-from stcal.design import StatedSize
+from stcal.design import BoardDesign, StatedSize
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
-from stcal.sfm.budget.sources import Source
+from stcal.sfm.budget.sources import REFERENCE_C, Source, Statement
 from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun
 from stcal.sfm.runs.verify import VerifyFile
@@ -173,8 +173,9 @@ class BudgetFile(ResultFile):
         "standard uncertainty `sigma` in `unit`, null where it is not one number; `words` on where it comes from"
     )
     stated: list[StatedRow] = Field(
-        description="sizes and temperatures: `body`, `key`, `value`, and the file of `origin`"
+        description="sizes and temperatures: `body`, `key`, `value`, and the file of `origin`, or why it is assumed"
     )
+    definitions: list[str] = Field(default=[], description="what positions, rotations and distances are of, in words")
     correction_ppm: float | None = Field(
         description="by which lengths of the run are to be enlarged for the stated expansion; the run did not apply "
         "it; null where the size is not known"
@@ -245,17 +246,56 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
             for each in budget.views
         ],
         "sources": [_source(each) for each in budget.sources],
-        "stated": [
-            {"body": body, "key": key, "value": value, "origin": stated.origin[body, key]}
-            for body, size in (("board", stated.board), ("target", stated.target))
-            for key, value in asdict(size).items()
-            if value is not None
-        ],
+        "stated": [*_standard(run.board_design), *_stated(stated)],
+        "definitions": _definitions(run),
         "correction_ppm": PPM * conditions.correction if conditions.size_known else None,
         "faces": {} if refused else _faces(budget, run.faces.poses()),
         "distances": [] if without_lengths else [_distance(row, budget) for row in budget.of_kind("distance")],
         "notes": notes_of(budget, verified, run),
     }
+
+
+def _standard(board: BoardDesign) -> list[dict]:
+    """Returns rows on the board that gives the size: its grid and pitch, as far as it has them."""
+    values = {key: getattr(board, key, None) for key in ("rows", "columns", "pitch_mm")} if board.rows else {}
+    return [
+        {"body": "board", "key": key, "value": value, "origin": "board.toml"} for key, value in values.items() if value
+    ]
+
+
+def _stated(statement: Statement) -> list[dict]:
+    """Returns rows on what is stated of both bodies, and on a reference temperature that is assumed."""
+    rows = []
+    for body, size in (("board", statement.board), ("target", statement.target)):
+        values = {key: value for key, value in asdict(size).items() if value is not None}
+        rows += [
+            {"body": body, "key": key, "value": value, "origin": statement.origin[body, key]}
+            for key, value in values.items()
+        ]
+        if values.keys() - {"pitch_sigma_ppm"} and size.reference_temperature_c is None:
+            assumed = {"value": REFERENCE_C, "origin": "assumed, ISO 1"}
+            rows.append({"body": body, "key": "reference_temperature_c"} | assumed)
+    return rows
+
+
+def _definitions(run: SavedRun) -> list[str]:
+    """Returns sentences that define the measurands."""
+    faces = []
+    for face in run.target_design.faces:
+        if face.printed is not None:
+            faces.append(f"face {face.id}: the frame of its drawing, Z into the body")
+        else:
+            normal = "normal to the plane of all its circles, " if run.faces.frame == "plane" else ""
+            faces.append(
+                f"face {face.id}: origin at circle {face.origin}, X towards circle {face.x}, Y on the side of circle "
+                f"{face.y}, Z {normal}out of the body"
+            )
+    return [
+        f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
+        "angle as its length, of the rotation that takes the axes of that frame to those of the face",
+        "a distance a–b is that of the points with the labels a and b, face:circle, as draw numbers them",
+        *faces,
+    ]
 
 
 def _source(source: Source) -> SourceRow:
@@ -356,9 +396,18 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
     if not run.board_design.rows and budget.statement.board != StatedSize():
         notes.append("no board was in view: what is stated of [board] is not used")
+    if (
+        run.board_design.rows
+        and budget.statement.board.temperature_sigma_k
+        and budget.statement.target.temperature_sigma_k
+    ):
+        notes.append(
+            "errors of the temperatures and expansions of board and target are taken as uncorrelated; where one "
+            "thermometer measured both, U is too large"
+        )
     notes += verified.said()
     notes.append(
-        "the reference face's frame is the target frame and carries no uncertainty; what its own circles do not know "
+        "the reference face's frame is the target frame and carries no uncertainty; what its own points do not tell "
         "is in the other faces"
     )
     return notes

@@ -8,9 +8,12 @@ from stcal.report.document import (
     Block,
     Document,
     Notes,
+    Printed,
     Section,
     Table,
+    bullets,
     legend,
+    macro,
     page_only,
     plot,
     subheading,
@@ -49,7 +52,7 @@ SIGNED = ("date", "name", "signature")
 """Lines that are left empty for whoever signs a certificate."""
 LEAST_SHARE = 1e-3
 """Least share of a variance that is drawn."""
-MANY = 1e6
+MANY = 1e4
 ROUNDING = 1e-6
 """Ratio to u below which a contribution is rounding error alone."""
 
@@ -66,21 +69,18 @@ def budget_report(file: BudgetFile) -> Document:
     lengths = [
         [
             name_of(e.circles),
-            *(number(v, 4) for v in (e.length_mm, e.corrected_mm)),
+            *(as_exact(v, 1e-3 * e.distance_um.expanded) for v in (e.length_mm, e.corrected_mm)),
             significant(e.distance_um.expanded),
         ]
         for e in file.distances
     ]
     k = file.coverage_factor
     positions = [
-        [face, *(number(v, 4) for v in e.position_mm), *(significant(k * v) for v in e.position_xyz_um)]
+        [face, *_with_u(e.position_mm, e.position_xyz_um, k)]
         for face, e in faces.items()
         if e.position_mm is not None and e.position_xyz_um is not None
     ]
-    rotations = [
-        [face, *(number(v, 4) for v in e.rotation_vector_deg), *(significant(k * v) for v in e.rotation_xyz_mdeg)]
-        for face, e in faces.items()
-    ]
+    rotations = [[face, *_with_u(e.rotation_vector_deg, e.rotation_xyz_mdeg, k)] for face, e in faces.items()]
     inputs = [
         [each.title, NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}", *_origin(each)]
         for each in file.sources
@@ -97,20 +97,20 @@ def budget_report(file: BudgetFile) -> Document:
     ]
     return Document(
         title_of(file),
-        f"{file.run.folder}: {images} photographs in {len(file.views)} groups; faces against face "
-        f"{file.reference_face}, the target frame",
+        f"{file.run.folder}: {images} photographs in {len(file.views)} group{'s' * (len(file.views) != 1)}; faces "
+        f"against face {file.reference_face}, the target frame",
         [
             Section(
                 "Result",
                 [
                     tiles(_headline(file)),
                     *([_what_u_is(file)] if faces else []),
-                    Notes(file.notes),
-                    *([f"May the run be used? {file.use}"] if file.use else []),
+                    Notes([*([_no_certificate(file)] if _unstated(file) and _is_valid(file) else []), *file.notes]),
+                    *([Printed([f"May the run be used? {file.use}"])] if file.use else []),
                     *([file.holds] if file.holds and file.size_known else []),
                     Table(_heads("position of face", "mm", "µm"), positions),
                     Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
-                    Table(["<distance of circles", "in the run, mm", "corrected, mm", "U, µm"], lengths),
+                    Table(["<distance of", "in the run, mm", "corrected, mm", "U, µm"], lengths),
                     *(
                         _shares(file, [(name, u) for _, columns in kinds for name, u in columns.items()])
                         if kinds
@@ -142,6 +142,7 @@ def budget_report(file: BudgetFile) -> Document:
             Section(
                 "Length test", [block for test in file.length_tests for block in _length_test(test)], terminal=True
             ),
+            Section("What is measured", [bullets(file.definitions)]),
             Section(
                 "What it rests on",
                 [
@@ -162,14 +163,49 @@ def budget_report(file: BudgetFile) -> Document:
             ),
         ],
         banner=[
-            Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts")
+            *([macro("answers", [("May the run be used?", file.use)], _tone(file))] if file.use else []),
+            Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts"),
         ],
     )
 
 
 def certifies(file: BudgetFile) -> bool:
-    """Returns whether the page is a certificate: sizes are known, and nothing says that the run must not be used."""
+    """Returns whether the page is a certificate: the run may be used, inputs and traceability are stated."""
+    return _is_valid(file) and not _unstated(file)
+
+
+def _is_valid(file: BudgetFile) -> bool:
+    """Returns whether sizes are known, and nothing says that the run must not be used."""
     return file.usable and file.size_known and all(test.agrees for test in file.length_tests)
+
+
+def _unstated(file: BudgetFile) -> list[str]:
+    """Returns what a certificate needs and nothing is stated of; faces that need not be flat need no statement."""
+    inputs = [row.title for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
+    return inputs + ["traceability"] * (not file.fields.get("traceability"))
+
+
+def _no_certificate(file: BudgetFile) -> str:
+    unstated = _unstated(file)
+    camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""
+    return f"this is not a certificate: nothing is stated of {', '.join(unstated)}; state it with --statement{camera}"
+
+
+def _tone(file: BudgetFile) -> str:
+    """Returns the tone of the run's own answer."""
+    return "failed" if not file.usable else "care" if file.use.startswith("With care") else "passed"
+
+
+def as_exact(value: float, expanded: float) -> str:
+    """Returns a value to the last digit of its expanded uncertainty with two digits (JCGM 100, 7.2.6), at most six."""
+    stated = significant(expanded)
+    return number(value, min(len(stated.partition(".")[2]), 6) if float(stated) else 4)
+
+
+def _with_u(values: Sequence[float], sigma: Sequence[float], k: float) -> list[str]:
+    """Returns x, y, z and U of each; ``sigma`` : in a thousandth of the unit."""
+    expanded = [k * v for v in sigma]
+    return [*(as_exact(v, 1e-3 * u) for v, u in zip(values, expanded, strict=True)), *map(significant, expanded)]
 
 
 def title_of(file: BudgetFile) -> str:
@@ -181,9 +217,9 @@ def title_of(file: BudgetFile) -> str:
 def _what_u_is(file: BudgetFile) -> str:
     k = f"{file.coverage_factor:g}"
     return (
-        f"U is the expanded uncertainty with k = {k} (JCGM 100:2008, GUM): along one axis {k} times the σ that the run "
-        "states, with what is stated of sizes and temperatures; in the tiles and under Contributions of x, y and z "
-        "together, the root of their summed variances"
+        f"U is the expanded uncertainty with k = {k} (JCGM 100:2008, GUM), which covers about 95 %. In tables it is of "
+        f"one axis: {k} times the σ of the run, with the contributions of what is stated. Where it is of x, y and z "
+        "together, it is the root of their summed variances"
     )
 
 
@@ -226,9 +262,9 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
     if faces:
         worst = max(faces, key=lambda face: (positions.get(face) or faces[face].rotation_mdeg).expanded)
         if worst in positions:
-            caption = f"U of the position of face {worst}, the worst"
+            caption = f"U of the position of face {worst}, the worst; x, y, z together"
             headline.append((significant(positions[worst].expanded), "µm", caption))
-        caption = f"U of the rotation of face {worst}{'' if positions else ', the worst'}"
+        caption = f"U of the rotation of face {worst}{'' if positions else ', the worst'}; x, y, z together"
         headline.append((significant(faces[worst].rotation_mdeg.expanded), "mdeg", caption))
     if file.distances:
         longest = file.distances[0]
@@ -236,6 +272,11 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
         headline.append((significant(longest.distance_um.expanded), "µm", caption))
     if not file.size_known:
         headline.append(("no", "size", "only the shape is known: no lengths and no positions in mm"))
+    for test in file.length_tests:
+        if test.beyond is not None:
+            word, count = verdict_of(test).partition(":")[0], len(test.lengths)
+            largest = max(abs(e) for e in _known(test))
+            headline.append((number(largest, 2), "", f"largest |E_n| of {count} lengths, {test.reference}: {word}"))
     unknown = sum(source.origin == "not stated" for source in file.sources)
     return [*headline, (str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact")]
 
@@ -249,6 +290,11 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
     for source in file.sources:
         slope = f"{_slope(first, source):.3g} {unit}/{source.unit}" if source.key in first.sensitivities else "–"
         parts = [number(u.contributions[source.key], 2) for u in columns.values()]
+        none = all(u.contributions[source.key] <= ROUNDING * u.standard for u in columns.values())
+        if (
+            source.key == "intrinsics" and source.origin == "estimated" and none
+        ):  # what they do is in the rows of the centres, with which they were adjusted
+            parts = ["in the others"] * len(parts)
         rows.append(
             [source.title, slope, *("–" if source.origin == "not stated" else contribution for contribution in parts)]
         )
@@ -266,7 +312,7 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
 
 
 def _freedom(degrees: float | None) -> str:
-    """Returns degrees of freedom; beyond a million they are as good as infinitely many."""
+    """Returns degrees of freedom; beyond ten thousand they are as good as infinitely many."""
     return "∞" if degrees is None or degrees > MANY else f"{degrees:.0f}"
 
 

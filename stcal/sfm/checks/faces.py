@@ -272,7 +272,7 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     least suspicious if the adjustment has not settled, which is no matter of chance: contradictory observations make
     its last steps slow.
     """
-    key, title = "agreement", "Groups, board and faces against one another (σ₀)"
+    key, title = "agreement", "Groups, board and faces against one another"
     extra, freedom, free = _added(joint, networks)
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
@@ -299,7 +299,7 @@ def flatness_check(
     It is taken from the free networks of all groups that see the circle, and tested against its σ and the stated
     flatness. ``printed`` : ids of faces of known shape, whose flatness is ``factor`` times the stated one.
     """
-    key, title = "flatness", "Each circle against the plane of its face"
+    key, title = "flatness", "Each point against the plane of its face"
     if flatness_mm is None:
         return impossible(key, title, "the run was asked not to use flatness", "state it with --flatness")
     heights: dict[str, list[tuple[tuple[str, ...], np.ndarray, np.ndarray]]] = {}
@@ -325,10 +325,10 @@ def flatness_check(
             if weight[i, i] > 0:
                 height = float(weight[i] @ adjusted_heights / weight[i, i])
                 trials.append(Trial(label, MICRO * height, "µm", height**2 * weight[i, i], 1, redundancy))
-    remedy = "a circle out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
+    remedy = "a point out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
     # Bent paper does no harm: its corners are where they are, and the frame is laid over all of them.
     worst = "suspicious" if heights.keys() <= set(printed) else "failed"
-    return judge(key, title, trials, "circles", remedy, worst)
+    return judge(key, title, trials, "points", remedy, worst)
 
 
 def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:

@@ -193,13 +193,18 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
     return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
 
 
-def evenness_check(networks: Sequence[Network], images: Sequence[ImageObservations], camera: Camera) -> Check:
+def evenness_check(
+    networks: Sequence[Network], images: Sequence[ImageObservations], camera: Camera, round_: bool = True
+) -> Check:
     """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe.
 
     Their centres would be off in the same way in all views, which no residual shows. Detection describes the variation
     by a wider model, with a larger σ. The value of a trial is the error that this avoids, in µm at the circle. One
-    centre in a hundred may be uneven by chance (binomial tail).
+    centre in a hundred may be uneven by chance (binomial tail). ``round_`` : whether there are circles or dots.
     """
+    key, title = "evenness", "Brightness within the circles"
+    if not round_:
+        return impossible(key, title, "corners alone, which have no rim", "")
     uneven = {image.name: image.uneven_px for image in images}
     shifts_of_label: dict[str, list[float]] = {}
     for network in networks:
@@ -217,7 +222,7 @@ def evenness_check(networks: Sequence[Network], images: Sequence[ImageObservatio
         "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, look at "
         "their light; their centres are measured by a wider model, with a larger σ"
     )
-    return judge("evenness", "Brightness within the circles", trials, "circles", remedy, "suspicious")
+    return judge(key, title, trials, "circles", remedy, "suspicious")
 
 
 def _dull(values: dict[str, float], unit: str) -> list[Trial]:
@@ -328,7 +333,10 @@ def labels_check(
     (squared residual over its own redundancy: Baarda's data snooping) are named, too; their weight is reduced. Labels
     of one image that are at each other's places are a fault: other labels may be exchanged without being noticed.
     """
-    remedy = "look at these circles in the overlays: hidden in part, dirty, a reflection, or a wrong label"
+    remedy = (
+        "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
+        "that was left out does no harm where other images show it"
+    )
     check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
     swapped = _exchanged(networks, outliers, images, camera)
     guilt = _images_of_outliers(networks, outliers)
@@ -339,7 +347,8 @@ def labels_check(
     measured = tuple(
         Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
     )
-    reason = f"{len(outliers)} left out, first {named[0]}: {outliers[0].residual_px:.3g} px"
+    first = f"{named[0]}: {outliers[0].residual_px:.3g} px, limit {outliers[0].limit_px:.3g}"
+    reason = f"{len(outliers)} left out, first {first}"
     verdict = "suspicious"
     if guilt:
         verdict = "failed"

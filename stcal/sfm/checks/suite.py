@@ -43,7 +43,7 @@ from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
 
 JOINT = (
-    ("agreement", "Groups, board and faces against one another (σ₀)"),
+    ("agreement", "Groups, board and faces against one another"),
     ("halves", "Two halves of the images against each other"),
     ("groups", "The result without each group"),
     ("loops", "Ways to a face through different groups"),
@@ -137,7 +137,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: moved_check(networks),
         lambda: image_check(networks),
         lambda: sharpness_check(networks, evidence.blur_px),
-        lambda: evenness_check(networks, evidence.images, camera),
+        lambda: evenness_check(networks, evidence.images, camera, bool(evidence.radius_mm())),
         lambda: labels_check(networks, evidence.outliers, evidence.images, camera),
         lambda: board_checks(networks, board),
         lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),

@@ -26,7 +26,7 @@ from stcal.report.document import (
 )
 from stcal.report.document import Table as ShownTable
 from stcal.report.figure import COLOURS, calm, locator, new_figure, plane, round_below
-from stcal.report.text import number
+from stcal.report.text import number, text_table
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import fit_verdict
 
@@ -95,6 +95,11 @@ class PosesFile(ResultFile):
     )
     left_out: list[NamedReason] = Field(description="`name`, `reason` of files and images without a pose")
 
+
+COMMON_SHARE = 0.5
+"""Share of the variance from which on it is told that poses err in common."""
+MOST_LISTED = 20
+"""Largest number of images for which the terminal has a line each."""
 
 IMAGE, FACES, CIRCLES, STATUS = "image", "faces", "circles", "status"
 QUALITY = ("rms_px", "chi2_per_dof")
@@ -227,32 +232,73 @@ def _image_json(each: MeasuredImage) -> dict:
     }
 
 
-def _printed(result: MeasureResult) -> list[str]:
+def _printed(result: MeasureResult, every: bool) -> list[str]:
     """Returns the table for the terminal, 80 columns wide for names of eight characters.
 
-    σ are the largest of three axes, n counts circles.
+    σ are the largest of three axes, n counts circles. Of more than :data:`MOST_LISTED` images, those are listed that
+    need a look, with the median and worst figures of all, unless ``every`` image is wanted.
     """
-    wide = max([len(image.name) for image in result.images] + [5])
-    faces = max([len("+".join(image.pose.faces)) for image in result.images] + [5])
-    lines = [
-        f"{'image':{wide}}  {'faces':{faces}}  n {'status':9} {'x':>9} {'y':>8} {'z':>8} mm {'σ µm':>5} {'σ mdeg':>6} "
-        f"{'RMS px':>6}"
-    ]
-    for image in result.images:
+    every = every or len(result.images) <= MOST_LISTED
+    doubtful = [image for image in result.images if not _sound(image)]
+    images = result.images if every else doubtful[:MOST_LISTED]
+    lines = [] if every else [*_figures(result), ""]
+    wide = max([len(image.name) for image in images] + [5])
+    faces = max([len("+".join(image.pose.faces)) for image in images] + [5])
+    if images:
+        lines.append(
+            f"{'image':{wide}}  {'faces':{faces}}  n {'status':9} {'x':>9} {'y':>8} {'z':>8} mm {'σ µm':>5} "
+            f"{'σ mdeg':>6} {'RMS px':>6}"
+        )
+    for image in images:
         pose = image.pose
-        sigma = np.sqrt(np.diag(pose.covariance))
+        mm, rad = _largest_sigma(image)
         place = " ".join(f"{v:8.3f}" for v in pose.camera_from_target.translation)
         verdict = fit_verdict(pose)
         lines.append(
             f"{image.name:{wide}}  {'+'.join(pose.faces):{faces}} {len(pose.labels):2} {pose.status:9}  {place}   "
-            f"{1e3 * sigma[3:].max():5.1f} {1e3 * np.degrees(sigma[:3].max()):6.2f} {pose.rms_px():6.4f}"
+            f"{1e3 * mm:5.1f} {1e3 * np.degrees(rad):6.2f} {pose.rms_px():6.4f}"
             + ("" if verdict == "passed" else f"  {verdict}")
         )
         lines += [
             f"  outlier {image.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
             for o in pose.outliers
         ]
-    return [*lines, *(f"left out {image.name}: {image.reason}" for image in result.left_out)]
+    left_out = result.left_out if every else result.left_out[:MOST_LISTED]
+    lines += [f"left out {image.name}: {image.reason}" for image in left_out]
+    if more := len(result.left_out) - len(left_out):
+        lines.append(f"left out: {more} more; --verbose prints all")
+    if not every:
+        rest = len(result.images) - len(images)
+        what = f"{rest} more" if images else f"{rest} poses, all certain and without outliers"
+        lines.append(f"{what}: the table that is written has all; --verbose prints them")
+    return lines
+
+
+def _figures(result: MeasureResult) -> list[str]:
+    """Returns the median and the worst figures of all images."""
+    sigma = np.array([_largest_sigma(image) for image in result.images])
+    columns = {
+        "σ position µm": 1e3 * sigma[:, 0],
+        "σ rotation mdeg": 1e3 * np.degrees(sigma[:, 1]),
+        "residuals RMS px": np.array([image.pose.rms_px() for image in result.images]),
+    }
+    rows = [
+        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", result.images[int(v.argmax())].name]
+        for what, v in columns.items()
+    ]
+    return text_table([[f"<{len(result.images)} poses", "median", "worst", "<in image"], *rows])
+
+
+def _largest_sigma(image: MeasuredImage) -> tuple[float, float]:
+    """Returns the largest σ of three axes: position, mm, and rotation, rad."""
+    sigma = np.sqrt(np.diag(image.pose.covariance))
+    return float(sigma[3:].max()), float(sigma[:3].max())
+
+
+def _sound(image: MeasuredImage) -> bool:
+    """Returns True if a pose is certain, fits, and has no outlier."""
+    pose = image.pose
+    return pose.status == "certain" and fit_verdict(pose) == "passed" and not pose.outliers
 
 
 def summary(result: MeasureResult) -> list[str]:
@@ -263,6 +309,15 @@ def summary(result: MeasureResult) -> list[str]:
     lines = [f"{len(poses)} poses: {counts}; centres' σ × {result.sigma_factor:.3g}"]
     held = "held: their errors are not in σ"
     lines[0] += f", intrinsics {held if result.intrinsics_held else 'with their σ'}"
+    if poses and result.common.size:
+        whole = np.array([np.diag(pose.covariance)[3:].sum() for pose in poses])
+        share = np.median((result.common[:, 3:] ** 2).sum((1, 2)) / whole)
+        if share > COMMON_SHARE:
+            alone = 1e3 * np.sqrt(np.median(whole) * max(1 - share, 0.0) / 3)
+            lines.append(
+                f"{100 * share:.0f} % of the variance of positions is common to all poses (target and intrinsics); "
+                f"between poses σ is about {alone:.2g} µm along an axis"
+            )
     if result.searched is not None:
         total = len(poses) + sum(image.gate == "pose" for image in result.left_out)
         lines.append(
@@ -288,8 +343,8 @@ ELLIPSE_SHARE = 0.06
 """Length with which the largest σ is drawn, as a share of the plot's width."""
 
 
-def measure_report(result: MeasureResult, where: str) -> Document:
-    """Returns the report of ``measure``."""
+def measure_report(result: MeasureResult, where: str, every: bool = False) -> Document:
+    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images."""
     at = np.array([image.pose.camera_from_target.translation for image in result.images])
     largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in result.images))
     times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
@@ -323,7 +378,7 @@ def measure_report(result: MeasureResult, where: str) -> Document:
         "Poses of the target",
         f"{where}: {summary_lines[0]}",
         [
-            Section("", [Printed(_printed(result)), Printed(summary_lines[1:])], terminal=True),
+            Section("", [Printed(_printed(result, every)), Printed(summary_lines[1:])], terminal=True),
             Section(
                 "Path in the camera frame",
                 [

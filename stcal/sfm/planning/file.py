@@ -278,7 +278,10 @@ def plan_text(plan: Plan, noise: str) -> str:
     if plan.setup.board.rows:
         lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
     else:
-        lines.append("which faces the photographs happen to show (--seed) makes about ±20 %")
+        lines.append(
+            "which faces the photographs happen to show (--seed) makes about ±20 % of many photographs, and up to a "
+            "factor of three of few that show a face twice or thrice: compare two seeds"
+        )
     return "\n".join(lines)
 
 

@@ -105,7 +105,7 @@ def checks_section(checks: list[dict]) -> list[Block]:
     columns_measured = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
     return [
         f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds of one check, however "
-        "many images or circles it tested",
+        "many images or points it tested",
         Table(heads, open_, css="text"),
         fold(f"{len(others)} checks that passed or were not possible", Table(heads, others, css="text")),
         fold("What was measured", Table(columns_measured, measured, css="text")),

@@ -206,8 +206,11 @@ def _by_result(report: dict) -> tuple[Use, str]:
         return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
     if n := counts["suspicious"]:
         message = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
-        by_chance = f"one sound run in {round(TESTS_OF_CHANCE / made)} has such a check by chance"
-        return "with care", f"With care: {message}{_first(report, 'suspicious')['title']}; {by_chance}."
+        first = _first(report, "suspicious")
+        # A residual beyond its limit that was left out is none by chance, and has no probability.
+        chance = all(value["probability"] is not None for value in first["measured"][:1])
+        by_chance = f"; of {made} checks one is so by chance in one sound run of {round(TESTS_OF_CHANCE / made)}"
+        return "with care", f"With care: {message}{first['title']}{by_chance if chance else ''}."
     if report["summary"]["sigma0"] is None:
         return (
             "with care",
@@ -373,13 +376,18 @@ def _control(report: dict) -> _Cause | None:
 
 
 def _by_checks(report: dict) -> _Cause | None:
-    """Returns the cause that the first of the worst checks names, or else the cross-check; None without either."""
+    """Returns the cause that the first failed check names, what limits a result with a suspicious one, or the
+    cross-check's; None without any."""
     verdicts = {check["verdict"] for check in report.get("checks", [])}
     for verdict in ("failed", "suspicious"):
         if verdict in verdicts:
             check = _first(report, verdict)
             remedy = check["remedy"] or "look at what the check names"
-            return _Cause(f"{check['title']}: {check['reason']}.", f"{remedy[0].upper()}{remedy[1:]}.")
+            found, remedy = f"{check['title']}: {check['reason']}.", f"{remedy[0].upper()}{remedy[1:]}."
+            if verdict == "failed":
+                return _Cause(found, remedy)
+            limits = _by_gaps(report) or _by_size(report) or _by_sigma(report)
+            return _Cause(limits.limit, f"{found} {remedy}")  # what is suspicious is to be looked at; σ still tell
     if different := report.get("crosscheck", {}).get("differences"):
         return _Cause(f"The native COLMAP differs: {different[0]}.", "Look at the cross-check: which of both is right?")
     return None

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
+from stcal.io.images import TOP_GROUP
 from stcal.labels import BOARD, parse_label
 from stcal.report.document import (
     Block,
@@ -23,24 +25,19 @@ from stcal.report.document import (
     tiles,
     tone_of,
 )
-from stcal.report.text import NONE, cells, join, number
+from stcal.report.text import cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.checks import checks_section, crosscheck_section, published_section
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
 from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
+from stcal.sfm.report.trust import Words, headline, settings, trust
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
+BY_ROWS = (2, 3, 4)
+"""Columns of the scales that only a board has."""
 FIRST_PAIRS = 15
 """Number of rows that the page has room for."""
-SOLVES = {
-    "joint": "joint: one adjustment over all groups",
-    "chain": "chain: group by group, then combined",
-    "paper": "paper: as published by Zhang & Wei (2017), for comparison",
-}
-SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
-SCALES |= {"drawing": "unknown: the drawing defines the unit"}
-FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
 def report_html(
@@ -63,27 +60,30 @@ def report_html(
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
     if judgement.verdict == "no":
         report = without_sigma(report)
+    report = _with_named_groups(report)
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     boards, views, bars = _drawn(report, colours)
-    summary = report["summary"]
+    summary, words = report["summary"], Words.of(report)
     sections = [
-        Section("Faces", _answer(report, colours, views), name="faces"),
-        Section("May I use it?", _use(report, judgement), name="use"),
-        Section("How far to trust it", _trust(report, judgement), name="trust"),
+        Section("Faces", _answer(report, colours, views, words), name="faces"),
+        Section("May I use it?", _use(report, judgement, words), name="use"),
+        Section("How far to trust it", trust(report, judgement, words), name="trust"),
         Section("Faces in detail", _faces_in_detail(report), name="detail"),
-        Section("Scale", _scale(report, boards), name="scale"),
+        Section("Scale", _scale(report, boards, words), name="scale"),
         Section("Residuals", _residuals(report, colours, bars), name="residuals"),
         Section("Focus", _focus(report), name="focus"),
         Section("Initial pairs", _pairs(report), name="pairs"),
-        Section("Left out", _left_out(report), name="left-out"),
+        Section("Left out", _left_out(report, words), name="left-out"),
         Section(
             "As published", published_section(report["comparison"]) if "comparison" in report else [], name="comparison"
         ),
         Section(
             "Cross-check", crosscheck_section(report["crosscheck"]) if "crosscheck" in report else [], name="crosscheck"
         ),
-        Section("Settings", [Table(["<Setting", "<Value"], _settings(report), css="text facts")], name="settings"),
-        Section("Overlays", _overlays(report, overlays, residuals or {}, gone), name="overlays"),
+        Section(
+            "Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")], name="settings"
+        ),
+        Section("Overlays", _overlays(report, overlays, residuals or {}, gone, words), name="overlays"),
     ]
     counts = (
         f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
@@ -94,6 +94,20 @@ def report_html(
     return Document(
         report["target"], counts, sections, banner, reload_s, f"{report['target']}: calibration report"
     ).page()
+
+
+def _with_named_groups(report: dict) -> dict:
+    """Returns the report with a word in place of the dot for the group of the folder itself."""
+    word = "all" if len(report["groups"]) == 1 else "top folder"
+
+    def named(value: Any, key: str) -> Any:
+        if isinstance(value, dict):
+            return {word if k == TOP_GROUP and key == "boards" else k: named(v, k) for k, v in value.items()}
+        if isinstance(value, list):
+            return [named(v, key) for v in value]
+        return word if value == TOP_GROUP and key in ("group", "groups", "name") else value
+
+    return named(report, "")
 
 
 def _warning(report: dict) -> Block:
@@ -133,7 +147,7 @@ covariance = faces["target_from_face_covariance"]["{face}"]"""
 """Program that reads the result."""
 
 
-def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, str]]) -> list[Block]:
+def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, str]], words: Words) -> list[Block]:
     """Returns the faces with σ, the target in space, and how to use the result."""
     rows = []
     for name, face in report["faces"].items():
@@ -151,20 +165,22 @@ def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, s
         )
     heads = ["<Face"] + ["X", "Y", "Z"] * 3 + ["found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
     over = [("", 1), ("Position (mm)", 3), ("σ of position (µm)", 3), ("σ of rotation about (mdeg)", 3)]
-    over += [("Circles", 2), ("", 3)]
+    over += [(words.points.capitalize(), 2), ("", 3)]
     others = [face for face in report["faces"] if face != report["reference_face"]]
+    with_it = "boards and cameras" if words.board else "cameras"
+    origin = "origin circle" if words.point == "circle" else "origin"
     stills = []
     for scene, target, side in views:
-        text = f"Cameras, boards and target (black){side}"
+        text = f"Cameras{', boards' if words.board else ''} and target (black){side}"
         stills += [plot(lambda picture=scene: picture, text, css="")]
-        text = f"Circles of the target, frames of its faces{side}"
+        text = f"{words.points.capitalize()} of the target, frames of its faces{side}"
         stills += [plot(lambda picture=target: picture, text, css="")]
     space = [
         macro(
             "turned",
             space_parts(figures.upright(report), colours),
-            "Target, boards and cameras in space",
-            [("target", "Target"), ("all", "With boards and cameras")],
+            f"Target, {with_it} in space",
+            [("target", "Target"), ("all", f"With {with_it}")],
         ),
         "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z",
         legend(colours, "Groups:"),
@@ -174,12 +190,12 @@ def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, s
         use = [
             subheading("How to use it"),
             "faces.json beside this page has the pose of each face as a 4×4 matrix, the covariance of each, and the "
-            "circles in the target frame; `stcal-sfm export RUN` writes it for other programs",
+            f"{words.points} in the target frame; `stcal-sfm export RUN` writes it for other programs",
             macro("verbatim", HOW_TO_USE.replace("{face}", others[0])),
         ]
     return [
         f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
-        "is that of the face's origin circle, σ are one standard deviation"
+        f"is that of the face's {origin}, σ are one standard deviation"
         if rows
         else "",
         Table(heads, rows, over),
@@ -188,50 +204,10 @@ def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, s
     ]
 
 
-def _use(report: dict, judgement: Judgement) -> list[Block]:
+def _use(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     """Returns the answers in words, the headline, and the checks."""
     checks = checks_section(report["checks"]) if "checks" in report else []
-    return [macro("answers", judgement.answers(), tone_of(judgement.verdict)), *checks, tiles(_headline(report))]
-
-
-def _trust(report: dict, judgement: Judgement) -> list[Block]:
-    """Returns for what σ hold, and the worst value of each kind."""
-    summary, options = report["summary"], report["options"]
-    pitch = "An error of the pitch as a whole (100 ppm is 4 K on aluminium) is not in them"
-    if options["solve"] != "joint":
-        scope = (
-            "No σ were computed, because the solve was group by group; look at the chains. All holds for the given "
-            "intrinsics: an error of the camera calibration goes into the faces"
-        )
-    elif judgement.verdict == "no":
-        scope = (
-            "No σ are shown, as they would not hold. What failed makes the result wrong by an amount that they do not "
-            "have in them"
-        )
-    elif options.get("refine_camera", False):
-        scope = (
-            f"σ hold for the given pitch of the board; the intrinsics were adjusted, and their σ are in them. {pitch}"
-        )
-    else:
-        scope = (
-            "σ hold for the given intrinsics and the given pitch of the board. An error of the camera calibration, or "
-            "of the pitch as a whole (100 ppm is 4 K on aluminium), is not in them"
-        )
-    factor = f"group by group, {_factor_in_words(summary['sigma_factor'])}"
-    if summary["sigma0"] is not None:
-        factor += (
-            ". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = "
-            f"{summary['sigma0']:.2f}; near 1, groups and boards agree with one another. The σ of the faces include "
-            "both factors"
-        )
-    single = [face for face, chains in report["chains"].items() if len(chains) == 1]
-    one_way = "reached by one way only, so that no second way confirms them: face"
-    return [
-        f"{scope}, and residuals hardly show it",
-        factor,
-        Table(["<Check", "Value", "<Where", "<Remark"], _worst_values(report), css="text"),
-        f"{one_way} {join(single)}" if single else "",
-    ]
+    return [macro("answers", judgement.answers(), tone_of(judgement.verdict)), *checks, tiles(headline(report, words))]
 
 
 def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[tuple[str, str, str]], str]:
@@ -250,106 +226,6 @@ def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[
         for azimuth, side in SIDES.items()
     ]
     return boards, views, figures.image_bars(report["residuals_by_image"], colours)
-
-
-# --- result and trust -------------------------------------------------------------------------------------------------
-
-
-def _size_mm(report: dict) -> float:
-    """Returns the diagonal of the box around the target's circles."""
-    circles = list(report["scene"]["circles"].values())
-    return math.dist(*[[pick(axis) for axis in zip(*circles, strict=True)] for pick in (min, max)]) if circles else 0.0
-
-
-def _factor_in_words(factor: float) -> str:
-    if 0.95 <= factor <= 1.05:
-        return "residuals are as large as the centres' own σ"
-    return f"residuals are {factor:.1f} times the centres' own σ"
-
-
-def _worst(found) -> tuple[float, str] | None:
-    return max(found, key=lambda candidate: candidate[0], default=None)
-
-
-def _largest_sigma(report: dict, key: str) -> tuple[float, str] | None:
-    return _worst((max(face[key]), f"face {name}") for name, face in report["faces"].items() if face[key] is not None)
-
-
-def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
-    return _worst(
-        (chain[key], f"face {face} by {' → '.join(chain['groups'])}")
-        for face, chains in report["chains"].items()
-        if len(chains) > 1
-        for chain in chains
-    )
-
-
-def _headline(report: dict) -> list[tuple[str, str, str]]:
-    """Returns (value, unit, description) of the tiles."""
-    summary = report["summary"]
-    sigma = _largest_sigma(report, "translation_sigma_um")
-    ppm = max((abs(group["scale"]["difference_ppm"]) for group in report["groups"]), default=None)
-    return [
-        (number(summary["residual_rms_px"], 4), "px", "residual, RMS per axis"),
-        (number(summary["sigma0"], 2), "", "σ₀ of the joint adjustment"),
-        (number(summary["sigma_factor"], 2), "×", _factor_in_words(summary["sigma_factor"])),
-        (number(sigma and sigma[0], 1), "µm", "largest σ of a face's position"),
-        (number(ppm, 1), "ppm", "largest difference of λ by rows"),
-    ]
-
-
-def _settings(report: dict) -> list[list[str]]:
-    summary, options, camera = report["summary"], report["options"], report["camera"]
-    left_out, last_move = report["left_out"], summary["last_move_px"]
-    sizes = " × ".join(str(size) for size in camera["size_px"])
-    solve, frame = str(options["solve"]), str(options["frame"])
-    return [
-        ["Solve", SOLVES.get(solve, solve)],
-        ["Face frames", FRAMES.get(frame, frame)],
-        ["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"],
-        *([["Surface", f"luminous, behind rims of {rim:.3f} mm"]] if (rim := summary.get("rim_mm")) else []),
-        *([["Dots of the board", f"behind rims of {rim:.3f} mm"]] if (rim := summary.get("dot_rim_mm")) else []),
-        ["Reference face", report["reference_face"]],
-        ["Faces not seen", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
-        ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
-        ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
-        [
-            "Left out",
-            f"{len(left_out['files'])} files, {len(left_out['images'])} images, {len(left_out['circles'])} circles",
-        ],
-        ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
-        [
-            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
-            f"{camera['model']}, {sizes} px",
-        ],
-        ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
-        ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
-        ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
-        ["Program", f"stcal {report['version']}"],
-    ]
-
-
-def _worst_values(report: dict) -> list[list[str]]:
-    """Returns rows of check, worst value, its place, remark."""
-    board = _worst((g["scale"]["board_rms_um"], f"group {g['name']}") for g in report["groups"])
-    ppm = _worst((abs(g["scale"]["difference_ppm"]), f"group {g['name']}") for g in report["groups"])
-    flat = _worst((face["plane_rms_um"], f"face {name}") for name, face in report["faces"].items())
-    single = _worst((row["max_px"], f"{row['image']}, {row['worst']}") for row in report["residuals_by_image"])
-    over = f"{number(1e-3 * ppm[0] * _size_mm(report), 1)} µm over the target's diagonal" if ppm else ""
-    parts = "each way uses a part of the images only, so it scatters more than the result"
-    return [
-        [name, number(worst and worst[0], digits), worst[1] if worst else NONE, remark if worst else "not computed"]
-        for name, worst, digits, remark in (
-            ("σ of a face's position (µm)", _largest_sigma(report, "translation_sigma_um"), 1, "largest of X, Y, Z"),
-            ("σ of a face's rotation (mdeg)", _largest_sigma(report, "rotation_sigma_mdeg"), 2, "largest of X, Y, Z"),
-            ("Disagreement of chains, position (µm)", _worst_chain(report, "translation_um"), 1, parts),
-            ("Disagreement of chains, rotation (mdeg)", _worst_chain(report, "rotation_mdeg"), 2, "likewise"),
-            ("Circles off their plane, RMS (µm)", flat, 1, "a face that is not flat, or noise"),
-            ("Board residual, RMS (µm)", board, 1, "the group's model against the board's grid"),
-            ("λ by rows against least squares (ppm)", ppm, 1, over),
-            ("Residual (px)", single, 4, "one centre in one image"),
-        )
-    ]
 
 
 # --- faces and scale --------------------------------------------------------------------------------------------------
@@ -385,7 +261,9 @@ def _faces_in_detail(report: dict) -> list[Block]:
             ],
             [
                 subheading("Chains"),
-                "Ways to each face through single groups, and how far each is off the combined pose"
+                "Ways to each face through single groups, before these are adjusted together, and how far each is off "
+                "the result. A way uses a part of the images, so that it may be off by many σ of the result; checks "
+                "judge whether the ways agree"
                 if ways
                 else "No face but the datum",
                 Table(heads, ways),
@@ -394,7 +272,7 @@ def _faces_in_detail(report: dict) -> list[Block]:
     ]
 
 
-def _scale(report: dict, boards: dict[str, str]) -> list[Block]:
+def _scale(report: dict, boards: dict[str, str], words: Words) -> list[Block]:
     """Returns λ and the board's residuals of each group."""
     heads = [
         "<Group",
@@ -403,8 +281,9 @@ def _scale(report: dict, boards: dict[str, str]) -> list[Block]:
         "Rows",
         "Difference (ppm)",
         "σ (ppm)",
-        "Dots",
+        "Dots" if words.board else "Points",
     ]
+    shown = [k for k in range(11) if words.board or k not in BY_ROWS]
     heads += ["Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]
     pictures = [
         plot(
@@ -428,9 +307,12 @@ def _scale(report: dict, boards: dict[str, str]) -> list[Block]:
     ]
     return [
         "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published "
-        "(first and last row, all pairs). σ is that of λ from the board's stated σ",
-        Table(heads, _scales(report)),
-        *([without] if len(pictures) < len(report["groups"]) else []),
+        "(first and last row, all pairs). σ is that of λ from the board's stated σ"
+        if words.board
+        else "λ turns a group's model into mm, by least squares over all corners of printed faces, or over the known "
+        "distances between points. σ is that of λ from their stated σ",
+        Table([heads[k] for k in shown], [[row[k] for k in shown] for row in _scales(report)]),
+        *([without] if words.board and len(pictures) < len(report["groups"]) else []),
         *(of_boards if pictures else []),
     ]
 
@@ -540,25 +422,26 @@ def _pairs(report: dict) -> list[Block]:
     ]
 
 
-def _left_out(report: dict) -> list[Block]:
+def _left_out(report: dict, words: Words) -> list[Block]:
     """Returns all that was left out, with reasons, and the notes."""
     left, unseen = report["left_out"], report["summary"]["faces_not_seen"]
     blocks: list[Block] = []
+    points = words.points.capitalize()
     for title, heads, rows in (
         ("Files", ["<File", "<Reason"], [cells(row, "name reason") for row in left["files"]]),
         ("Images", ["<Image", "<Reason"], [cells(row, "name reason") for row in left["images"]]),
-        ("Circles", ["<Image", "Number", "<Circles", "<Reason"], _circles_left_out(report)),
+        (points, ["<Image", "Number", f"<{points}", "<Reason"], _circles_left_out(report)),
         ("Notes on images", ["<Image", "<Note"], [cells(row, "image note") for row in left["notes"]]),
         ("Notes on the whole run", ["<No.", "<Note"], list(enumerate(report["notes"], 1))),
     ):
         if rows:
             blocks += [subheading(title), Table(heads, rows, css="text")]
     if unseen:
-        blocks.append(f"Faces of the design not seen: {join(unseen)}")
+        blocks.append(f"Faces of the design that are not in the result: {join(unseen)}")
     return blocks or ["Nothing was left out"]
 
 
-def _overlays(report: dict, overlays: dict, residuals: Mapping[str, Residuals], gone: int) -> list[Block]:
+def _overlays(report: dict, overlays: dict, residuals: Mapping[str, Residuals], gone: int, words: Words) -> list[Block]:
     """Returns the photographs with their circles."""
     rest = len(report["images"]) - len(overlays) - gone
     shown = photographs(report, overlays, residuals)
@@ -566,7 +449,7 @@ def _overlays(report: dict, overlays: dict, residuals: Mapping[str, Residuals], 
         f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
     )
     return [
-        macro("photographs", shown, rest) if shown.each else "" if gone else "There are none",
+        macro("photographs", shown, rest, words) if shown.each else "" if gone else "There are none",
         lost if gone else "",
     ]
 

@@ -84,6 +84,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "circle_sigma_px": result.calibration.circle_sigma_px,
                 "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
                 "edge_share": printed.edge_share if printed else None,
+                "printed_faces": sorted(result.target_design.printed_ids()),
             },
             "faces": {face: _face(result, face) for face in result.target.target_from_face},
             "between_faces": _between(result),
@@ -321,7 +322,7 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
         needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
         if len(sightings) == 1:
             gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
-            reason = "seen in one mapped image only; 2 needed"
+            reason = "seen in one mapped image of its group only; 2 needed"
         else:
             gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
             reason = (

@@ -63,6 +63,7 @@ class Summary(Part):
     circle_sigma_px: float | None = None
     size_sigma_ppm: float | None = None
     edge_share: float | None = None
+    printed_faces: list[str] = Field(default=[])
 
 
 class FaceRow(Part):
@@ -270,7 +271,7 @@ class ReportFile(ResultFile):
         "`camera_given` false where the camera was found from the photographs; `circle_sigma_px` of the target's "
         "circles and corners, RMS per axis (null without joint adjustment); `size_sigma_ppm` the largest σ of a "
         "printed face's size, `edge_share` the share of its variance that is due to the edges of tags (null "
-        "without such faces)"
+        "without such faces); `printed_faces` the ids of faces with boards or tags"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "

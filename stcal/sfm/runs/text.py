@@ -238,7 +238,13 @@ def _faces(result: RunResult) -> Iterator[str]:
         if images:
             yield f"read and left out, of {len(images)} images: face {face}"
         elif face in seen:
-            yield f"seen, but not by enough circles for its frame: face {face}"
+            images = sum(any(x.plane == face for x in i.observations.labels) for i in result.labelled)
+            what = (
+                "1 image; 2 needed, better 5"
+                if images == 1
+                else f"{images} images, but by too few points for its frame"
+            )
+            yield f"face {face} is not in the result: seen in {what}"
     if unseen := [face for face in absent if face not in seen and not images_left_out(face, notes)]:
         yield f"not seen in any image: face {', '.join(unseen)}"
 

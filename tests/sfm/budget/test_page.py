@@ -6,6 +6,11 @@ import pytest
 
 from stcal.report import document as pdf
 from stcal.report.text import significant
+from stcal.sfm.budget.combine import budget_of_run
+from stcal.sfm.budget.file import BudgetFile
+from stcal.sfm.budget.page import as_exact, budget_report
+from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error
 
 STATED = "[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n"
@@ -29,11 +34,12 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
     assert "by +40.0 ppm" in html
     assert "hold at the temperature at which the target was photographed, with a correction of +40.0 ppm" in html
-    assert "<h1>Certificate of calibration and uncertainty budget: " in html
+    assert "<h1>Uncertainty budget: " in html
+    assert "not a certificate: nothing is stated of" in html
     expanded = next(line for line in text.splitlines() if line.startswith("expanded uncertainty")).split()[6:]
     assert len(expanded) == 3
     assert all(len(value.replace(".", "").strip("0")) <= 2 for value in expanded), expanded
-    assert text.index("position of face") < text.index("distance of circles")
+    assert text.index("position of face") < text.index("distance of")
     assert "agrees: all 10 lengths within U" in html
     assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
@@ -52,3 +58,34 @@ def test_a_pdf_stands_beside_a_page(stcal_sfm, small_run, tmp_path):
 )
 def test_uncertainties_have_two_significant_digits(value, shown):
     assert significant(value) == shown
+
+
+@pytest.mark.parametrize(
+    ("value", "expanded", "shown"),
+    [(166.18664, 0.031, "166.187"), (195.9618, 0.12, "195.96"), (236.457, 15.0, "236"), (1.23456, 0.0, "1.2346")],
+)
+def test_values_end_with_the_last_digit_of_their_uncertainty(value, expanded, shown):
+    assert as_exact(value, expanded) == shown
+
+
+def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_path):
+    """Of a sound run with lengths at 20 °C; its head has the answer, its end the definitions and the board."""
+    run = load_run(small_run)
+    file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
+    stated = [row.model_copy(update={"origin": "stated"}) for row in file.sources]
+    full = file.model_copy(update={"sources": stated, "fields": {"traceability": "rule 7"}})
+    for one, lacks in (
+        (full.model_copy(update={"fields": {"traceability": ""}}), "traceability"),
+        (file.model_copy(update={"fields": full.fields}), "board's pitch"),
+    ):
+        page = budget_report(one).page()
+        assert "Certificate" not in page
+        assert re.search(
+            f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page
+        )
+    page = budget_report(full).page()
+    assert "<h1>Certificate of calibration and uncertainty budget: " in page
+    assert "not a certificate" not in page
+    assert page.index("May the run be used?") < page.index("<h2>")
+    assert "origin at circle" in page
+    assert [row.value for row in file.stated if row.key == "pitch_mm"] == [run.board_design.pitch_mm]

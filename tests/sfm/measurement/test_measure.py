@@ -22,7 +22,7 @@ from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
-from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
+from stcal.sfm.measurement.images import MeasuredImage, MeasureOptions, measure, measure_labelled
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
 from stcal.sfm.measurement.report import measure_report, poses_file
 from stcal.sfm.measurement.target import TargetCircles, read_target
@@ -584,3 +584,23 @@ def test_the_table_fits_into_80_columns(scene, known):
     assert [head.split()[:3], len(head)] == [["image", "faces", "n"], len(rows[0])]
     assert len(head) <= 80
     assert [row.split()[0] for row in rows] == ["0000.jpg", "0001.jpg"]
+
+
+def test_of_many_images_those_that_need_a_look_are_printed(scene, known):
+    """One ambiguous pose and one image that was left out, of a hundred each."""
+    rng = np.random.default_rng(4)
+    truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
+    poses = [
+        pose_of(see(scene, truth, faces, 0.5, rng), known.truth, scene.camera) for faces in (("1", "2", "4"), ("1",))
+    ]
+    images = tuple(MeasuredImage(f"{i:03}.jpg", poses[i == 70]) for i in range(100))
+    unknown = tuple(Skipped(f"x{i}.jpg", "no face of the target recognised", "pose") for i in range(100))
+    none = measure_labelled([], scene.camera, known.truth)
+    result = replace(none, images=images, common=np.zeros((100, 6, 0)), left_out=unknown)
+    lines = measure_report(result, "images").text().splitlines()
+    assert len(lines) < 40
+    assert [line.split()[:2] for line in lines if ".jpg  1" in line] == [["070.jpg", "1"]]
+    assert [line.split()[-1] for line in lines if line.startswith("σ position")] == ["070.jpg"]
+    assert [line.split()[0] for line in lines if "more" in line] == ["left", "99"]
+    every = measure_report(result, "images", every=True).text().splitlines()
+    assert sum(".jpg  1" in line for line in every) == sum(line.startswith("left out x") for line in every) == 100

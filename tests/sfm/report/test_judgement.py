@@ -119,8 +119,13 @@ def test_a_suspicious_check_says_how_often_chance_makes_one():
     found = judgement_of(report(check("a", "suspicious", remedy="repeat it"), *others, check("d", "not possible")))
     assert found.verdict == "with care"
     assert found.use == (
-        "With care: 1 of 17 checks is suspicious, the first: Check a; one sound run in 59 has such a check by chance."
+        "With care: 1 of 17 checks is suspicious, the first: Check a; of 17 checks one is so by chance in one sound "
+        "run of 59."
     )
+    assert found.limit.startswith("The centring of circles")
+    assert found.next.startswith("Check a: because of a. Repeat it.")
+    left_out = check("a", "suspicious") | {"measured": [{"probability": None}]}  # such a residual is none by chance
+    assert judgement_of(report(left_out, *others)).use == "With care: 1 of 17 checks is suspicious, the first: Check a."
 
 
 def test_the_face_that_stands_out_limits():

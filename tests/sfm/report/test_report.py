@@ -17,7 +17,8 @@ from stcal.report.figure import round_below
 from stcal.report.text import number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
-from stcal.sfm.report.page import _factor_in_words, report_html
+from stcal.sfm.report.page import report_html
+from stcal.sfm.report.trust import factor_in_words
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -254,7 +255,7 @@ def test_banner_only_where_eccentricity_is_off(joint, chained):
 
 @pytest.mark.parametrize(("factor", "words"), [(0.95, "as large as"), (1.0, "as large as"), (0.9, "0.9 times")])
 def test_residuals_within_5_percent_are_as_large_as_stated(factor, words):
-    assert f"residuals are {words} the centres' own σ" in _factor_in_words(factor)
+    assert f"residuals are {words} the centres' own σ" in factor_in_words(factor)
 
 
 def test_numbers_have_their_digits(joint):
@@ -332,7 +333,7 @@ def test_left_out_with_reasons():
     assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
     assert ["a/1.jpg", "board of 20 dots left out"] in rows
     assert ["1", "group a: face <6> has no frame"] in rows
-    assert "Faces of the design not seen: 6." in Page(page).text
+    assert "Faces of the design that are not in the result: 6." in Page(page).text
 
 
 def test_same_report_same_page(joint):
@@ -473,3 +474,35 @@ def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
     report_html(report, {NASTY: JPEG})
     assert drawn
     assert all(circles == report["scene"]["circles"] for circles in drawn)
+
+
+def test_a_body_of_tags_has_corners_and_no_board():
+    """All photographs in one folder, whose group is named by a dot in the files."""
+    report = make()
+    report["summary"] |= {"printed_faces": ["1", "2"], "scale_from": ["faces"]}
+    report["options"]["refine_camera"] = True
+    report["scene"]["boards"] = {}
+    report["residuals_by_label"].pop()
+    report["groups"][0]["scale"] |= {"source": "faces"}
+    report["groups"][0]["name"] = "."
+    report["groups"][0]["seeded"] = "faces of known shape, placed together"
+    for row in (*report["faces"].values(), *report["chains"]["2"]):
+        row["groups"] = ["."]
+    for row in (*report["residuals_by_image"], *report["scene"]["cameras"], *report["images"]):
+        row["group"] = "."
+    page = report_html(report, OVERLAYS)
+    text = Page(page).text.replace("on faces of circles, and into it on faces of boards and tags", "")
+    for word in ("circle", "Circle", "board", "Board", " dots", "Dots", "pitch", "Group ."):
+        assert word not in text, word
+    assert "σ hold for the stated size of the printed faces" in text
+    assert "Corners" in text
+    assert rows_of(page, "faces")[2][-1] == "all"
+
+
+def test_sigma0_is_what_the_certificate_says(joint):
+    """0.93 makes no σ smaller, 1.3 makes all larger: the factor of ``budget`` is named beside it."""
+    large = make()
+    large["summary"]["sigma0"] = 1.3
+    assert "leaves σ₀ = 0.93" in Page(joint).text
+    assert "states the latter as 1.000" in Page(joint).text
+    assert "states the latter as 1.300" in Page(report_html(large, OVERLAYS)).text
