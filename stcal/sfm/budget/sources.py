@@ -59,8 +59,7 @@ class Statement:
 def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
     """Returns the statement of a run. The file overrides ``board.toml``, and ``given`` overrides fields of the file.
 
-    ``own`` : sizes that the run's ``board.toml`` states; ``path`` : file of ``--statement``; ``given`` : fields by
-    name.
+    ``own`` : values stated in the run's ``board.toml``; ``path`` : file of ``--statement``; ``given`` : fields by name.
 
     Raises InputError if the file is not a statement, or a field is too long.
     """
@@ -140,7 +139,7 @@ def sources_of(
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out.
 
     ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
-    intrinsics were adjusted; ``camera_given`` : False if the photographs alone told it.
+    intrinsics were adjusted; ``camera_given`` : False if the camera was found from the photographs.
     """
     zero = np.zeros_like(contributions.joint.covariance_mm2)
     common = contributions.joint.board_common
@@ -271,7 +270,7 @@ def warmer_k(stated: StatedSize) -> float | None:
 
 
 def reference_temperature_c(stated: StatedSize) -> float:
-    """Returns the temperature for which a body's size is wanted: the one that is stated, or 20 °C."""
+    """Returns the temperature at which the size of a body is to be stated: the given one, or 20 °C."""
     return REFERENCE_C if stated.reference_temperature_c is None else stated.reference_temperature_c
 
 

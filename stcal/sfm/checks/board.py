@@ -25,7 +25,7 @@ EDGE_DIFFERENCE_PX = 0.01
 RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5
-"""Smallest number of circles of one design radius among which one can stand out."""
+"""Smallest number of circles of one design radius that are compared with each other."""
 MAD_EFFICIENCY = 0.37
 """Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
 
@@ -280,8 +280,8 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
 
     Positions: a similarity maps the design to the circles of each face, and its residuals give the σ of their
     placement. Radii: the slope of measured over designed radii, which a constant bias of the edges does not change. The
-    weighted mean of both is tested, with 100 ppm as σ of the target's own size beside that of the result. Without a
-    board (``has_board``) the result has its size from printed faces or known distances.
+    weighted mean of both is tested, with 100 ppm as σ of the target's own size, in addition to that of the result.
+    Without a board (``has_board``) the result has its size from printed faces or known distances.
     """
     if target.up_to_scale:
         return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")

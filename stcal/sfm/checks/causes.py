@@ -21,7 +21,7 @@ from stcal.sfm.checks.verdict import FAILED, Check, Measured
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8
-"""Least share, of what the best hypothesis explains, of one that is preferred for its fewer parameters."""
+"""A hypothesis with fewer parameters is preferred if it explains at least this share of what the best one explains."""
 MOST_IMAGES = 60
 """Largest number of images of a group in which parameters of single images are fitted; more take minutes."""
 FIXED_WITHIN = 0.2
@@ -32,7 +32,7 @@ ALONE = 0.93
 """Share of what all images explain at which a few explain it alone; of random changes in all of them they have 0.5 to
 0.87."""
 LEAST_SHIFT_PX = 3.0
-"""Smallest change of the principal point at which photographs that were turned by 180° can be told."""
+"""Smallest change of the principal point that reveals photographs turned by 180°."""
 
 
 @dataclass(frozen=True, slots=True)

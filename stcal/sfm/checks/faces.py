@@ -93,7 +93,7 @@ def _difference(a: Rigid, b: Rigid) -> np.ndarray:
 
 
 def halves_check(again: Again) -> Check:
-    """Compares two results from two halves of the images of every group, taken in turn.
+    """Compares the results from two halves of the images; each half has every second image of every group.
 
     The difference is tested against the sum of both covariances. The board's own deviations are common to both halves,
     which makes the test a little milder.

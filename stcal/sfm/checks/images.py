@@ -47,8 +47,8 @@ def camera_check(
     (score test). If they were refined, their distance from the given ones is tested against the stated σ.
 
     ``prior`` : prior of the intrinsics if they were refined. The stated σ of a camera file does not excuse intrinsics
-    that were held fixed, as the σ of the faces do not include it. ``given`` : False if the photographs alone told the
-    camera, so that there is nothing to test.
+    that were held fixed, as the σ of the faces do not include it. ``given`` : False if the camera was found from the
+    photographs, so that there is nothing to test.
     """
     key, title = "camera", "Intrinsics against the images"
     if not given:
@@ -367,7 +367,7 @@ def labels_check(
 
 
 def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]) -> list[Guilt]:
-    """Returns the culprits of each group of which an image lost :data:`MANY` centres or more."""
+    """Returns the culprits of each group in which an image lost :data:`MANY` centres or more."""
     count = Counter(o.image for o in outliers)
     found = []
     for network in networks:

@@ -23,7 +23,7 @@ TAIL = 2.0
 PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0
-"""Relative σ from which on it is stated in %."""
+"""Relative σ, in ppm, from which it is stated in %."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 QUESTIONS = {
@@ -36,7 +36,7 @@ Use = Literal["yes", "with care", "no"]
 CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
 GENERAL = ("centres", "agreement", "halves")
-"""Keys of the checks that tell that something is wrong and not what. Other checks are said before them."""
+"""Keys of the checks that show that something is wrong, but not what. Other checks are named before them."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "

@@ -50,8 +50,8 @@ def frames_of(key: str) -> Frames | None:
 
 
 def inverse_name(key: str) -> str:
-    """Returns a name with its two frames changed about, like ``t_cam2target`` of ``t_target2cam``; empty where the name
-    is of another form."""
+    """Returns a name with its two frames exchanged, such as ``t_cam2target`` for ``t_target2cam``; empty if the name
+    has another form."""
     for between in ("_from_", "_wrt_", "_in_", "2"):
         head, separator, tail = key.partition(between)
         if separator:
@@ -61,6 +61,6 @@ def inverse_name(key: str) -> str:
 
 
 def role_of(key: str) -> Role | None:
-    """Returns the side whose poses a name means, where the name has no direction."""
+    """Returns the side, robot or camera, that a name without a direction refers to; None if it refers to neither."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     return next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(name)), None)
