@@ -121,7 +121,7 @@ class GoalChain(Brief):
             return chain
         if scene not in self.flange:
             raise InputError(
-                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or take its exposures away"
+                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or remove its exposures"
             )
         return self.flange[scene] @ chain
 
@@ -134,7 +134,7 @@ class GoalChain(Brief):
         if missing := self.without_pose(scenes):
             raise InputError(
                 "E-ROBOT-POSES-SCENE",
-                f"{self.poses_source}: none of scene {missing[0]}; add a row, or take the scene away",
+                f"{self.poses_source}: none of scene {missing[0]}; add a row, or remove the scene",
             )
 
 

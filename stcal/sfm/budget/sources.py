@@ -186,9 +186,10 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
         stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
-        words = "no size_sigma_mm" + ("; what moves the edges of all tags alike" if sigma else "; taken as exact")
+        edges = "a common displacement of the edges of all tags"
+        words = f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
         if by_statement:
-            words = "size_sigma_mm" + (", and what moves the edges of all tags alike" if largest.edge_share else "")
+            words = "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
         ppm = 1e6 * sigma if sigma else None
         yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES])
     if known := known_distances(board):

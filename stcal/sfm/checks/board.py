@@ -123,7 +123,9 @@ def radius_checks(radii: Radii) -> list[Check]:
         "one, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
-        judge("radius", "Radius of each circle against those made alike", single, "circles", single_remedy),
+        judge(
+            "radius", "Radius of each circle against others of the same design radius", single, "circles", single_remedy
+        ),
         judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
     ]
 
@@ -150,7 +152,7 @@ def rim_check(
     if not has_circles:
         return impossible(key, title, "corners alone, which have no rim", "")
     if not rims:
-        return impossible(key, title, "too few tilts of circles to tell", "photograph faces from several angles")
+        return impossible(key, title, "too few different tilts of circles", "photograph faces from several angles")
     measured, names, reasons, settled = [], [], [], []
     for kind, rim in rims.items():
         limit = max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
@@ -171,7 +173,7 @@ def rim_check(
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
         return Check(key, title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
     remedy = (
-        "faces are where their circles seem to lie; for the luminous surface run with --rim, or state rim_mm in "
+        "faces are where their circles appear; for the luminous surface, run with --rim, or state rim_mm in "
         "target.toml, of dots in board.toml"
     )
     return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
@@ -295,8 +297,8 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
     freedom = sum(m.freedom for m in measures)
     remedy = (
-        "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and all distances of "
-        "the result with it: measure the board over its full length with a calliper"
+        "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and so are all "
+        "distances of the result: measure the board over its full length with a calliper"
         if has_board
         else "printed sizes or known distances in target.toml do not fit the circles there, and all distances of the "
         "result may be wrong with them: measure a side of each print with a calliper"

@@ -202,7 +202,12 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         "values or of contours need another correction"
     )
     trial = Trial(
-        "share of the eccentricity found, less 1", float(test.estimate[0]), "", test.statistic, test.freedom, redundancy
+        "share of the eccentricity found, minus 1",
+        float(test.estimate[0]),
+        "",
+        test.statistic,
+        test.freedom,
+        redundancy,
     )
     check = judge(key, CONTROL, [trial], "corrections", remedy)
     try:

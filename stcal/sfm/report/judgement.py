@@ -73,7 +73,7 @@ class Judgement(Part):
     """Section ``judgement`` of ``report.json``."""
 
     verdict: Use = Field(description="`yes`; `with care`; `no`")
-    use: str = Field(description="may I use it, in words")
+    use: str = Field(description="whether the result may be used, in words")
     quality: str = Field(description="how good is it: largest σ of position and rotation, and of the size")
     limit: str = Field(description="what limits it")
     next: str = Field(description="what to do next")
@@ -81,11 +81,11 @@ class Judgement(Part):
         description="largest σ of a face's position along an axis; null without covariances and after *no*, as the "
         "next three"
     )
-    position_face: str | None = Field(description="face that it is of")
+    position_face: str | None = Field(description="name of that face")
     rotation_sigma_mdeg: float | None = Field(description="largest σ of a face's rotation about an axis")
-    rotation_face: str | None = Field(description="face that it is of")
-    invalid: list[str] = Field(default=[], description="what does not hold, as checks failed that it rests on")
-    missing: list[str] = Field(default=[], description="faces that were to be there, and groups, that are not in it")
+    rotation_face: str | None = Field(description="name of that face")
+    invalid: list[str] = Field(default=[], description="what is invalid, because checks failed on which it rests")
+    missing: list[str] = Field(default=[], description="expected faces, and groups, that are not in the result")
 
     def answers(self) -> list[tuple[str, str]]:
         """Returns the questions with their answers, in order."""
@@ -178,7 +178,7 @@ def _by_result(report: dict) -> tuple[Use, str]:
     checks = [check for check in report.get("checks", []) if check["key"] != CAUSE]
     counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
     if not report["faces"]:
-        return "no", "No: there is no face in it, λ and residuals of the board alone."
+        return "no", "No: there is no face in it, only λ and residuals of the board."
     if _control(report):
         return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
     made = len(checks) - counts["not possible"]
@@ -197,7 +197,7 @@ def _by_result(report: dict) -> tuple[Use, str]:
     if report["summary"]["sigma0"] is None:
         return (
             "with care",
-            "With care: groups were solved one by one; there are no σ, and fewer checks.",
+            "With care: groups were solved one by one; there are no σ, and there are fewer checks.",
         )
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     n = counts["not possible"]
@@ -263,7 +263,7 @@ def _gaps(report: dict) -> list[str]:
     single = [name for name, face in report["faces"].items() if face["images"] == 1]
     if single:
         words.append(f"face {join(single)} rests on one image")
-    words += [f"{group} was left out whole" for group in _lost_groups(report)]
+    words += [f"{group} was left out completely" for group in _lost_groups(report)]
     return words
 
 
@@ -285,10 +285,10 @@ def _unknown(report: dict, invalid: list[str]) -> str:
     if not report["faces"]:
         return _quality(report, None, None)
     if invalid:
-        return f"That cannot be told: {join(invalid)} do not hold before what failed is put right."
+        return f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
     if _control(report):
-        return "That cannot be told: biased faces have no σ that holds."
-    return "That is not told of a part: what was to be measured is not all there."
+        return "That is unknown: biased faces have no valid σ."
+    return "No σ are given for a part: what was to be measured is not all there."
 
 
 def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
@@ -300,10 +300,10 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
     if position is None or rotation is None:
         ways = [chain for chains in report["chains"].values() if len(chains) > 1 for chain in chains]
         if not ways:
-            return "There are no σ, and no face is reached in two ways that could be compared."
+            return "There are no σ, and no face is reached by two chains that could be compared."
         apart, turned = (max(way[key] for way in ways) for key in ("translation_um", "rotation_mdeg"))
         return (
-            f"There are no σ; ways to the same face through different groups are up to {number(apart, 1)} µm and "
+            f"There are no σ; chains to the same face through different groups are up to {number(apart, 1)} µm and "
             f"{number(turned, 2)} mdeg off their mean."
         )
     size = report["summary"]["scale_sigma_ppm"]
@@ -350,10 +350,10 @@ def _control(report: dict) -> _Cause | None:
             "Look at the overlays; where a face is in view, give its design with --target.",
         )
     if options["solve"] == "paper":
-        return _Cause("The published method: contours, alike in weight, without the eccentricity of circles.",
+        return _Cause("The published method: contours with equal weights, without the eccentricity of circles.",
                       "Run it without --solve paper.")  # fmt: skip
     if not options["eccentricity"]:
-        return _Cause("The eccentricity of circles is left in.", "Run it without --no-eccentricity.")
+        return _Cause("The eccentricity of circles is not corrected.", "Run it without --no-eccentricity.")
     return None
 
 
@@ -366,7 +366,8 @@ def _by_checks(report: dict) -> _Cause | None:
             remedy = check["remedy"] or "look at what the check names"
             return _Cause(f"{check['title']}: {check['reason']}.", f"{remedy[0].upper()}{remedy[1:]}.")
     if different := report.get("crosscheck", {}).get("differences"):
-        return _Cause(f"The native COLMAP differs: {different[0]}.", "Look at the cross-check: which of both is right?")
+        remedy = "Look at the cross-check to see which of the two is right."
+        return _Cause(f"The native COLMAP differs: {different[0]}.", remedy)
     return None
 
 
@@ -374,7 +375,7 @@ def _by_gaps(report: dict) -> _Cause | None:
     """Returns the cause where faces are missing that were to be there; None if all are."""
     if missing := _missing_faces(report):
         return _Cause(
-            f"Face {join(missing)} was to be photographed and is not in the result.",
+            f"Face {join(missing)} should have been photographed, and is not in the result.",
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
     return None
@@ -394,10 +395,11 @@ def _by_size(report: dict) -> _Cause | None:
 def _by_sigma(report: dict) -> _Cause:
     """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
     if len(report["faces"]) == 1:
-        return _Cause("There is one face only, which nothing links.", "Photograph it together with others.")
+        remedy = "Photograph it together with other faces."
+        return _Cause("There is only one face, and nothing links it to others.", remedy)
     found = _largest(report, "translation_sigma_um")
     if found is None:
-        return _Cause("What limits it cannot be told without σ.", "Run it with --solve joint.")
+        return _Cause("What limits it is unknown without σ.", "Run it with --solve joint.")
     sigma, worst = found
     face = report["faces"][worst]
     axis = face["translation_sigma_um"].index(sigma)
@@ -427,7 +429,7 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
     not known."""
     summary, advice = report["summary"], "`stcal-sfm advise RUN` says which do most."
     if not variance:
-        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` tells it, and {advice}")
+        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")
     centre = summary.get("circle_sigma_px")
     of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
@@ -447,8 +449,8 @@ def _source(report: dict, kind: str) -> tuple[str, str]:
         given = "distances" in summary.get("scale_from", [])
         distance = f"state {'a longer or better known' if given else 'the'} distance of two points of the target"
         if (summary.get("edge_share") or 0.0) > 0.5:
-            remedy = f"all edges may be off alike, which no residual shows; {distance} with [[scale]] in target.toml."
-            return "The size, by the edges of tags", few + remedy
+            common = "all edges may have the same error, which no residual shows"
+            return "The size, by the edges of tags", f"{few}{common}; {distance} with [[scale]] in target.toml."
         remedy = f"measure it better than size_sigma_mm says, or {distance} with [[scale]] in target.toml."
         return "The size of the print", few + remedy
     remedies = {

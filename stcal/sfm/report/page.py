@@ -108,7 +108,7 @@ def _warning(report: dict) -> Block:
     if report["options"]["solve"] == "paper":
         return alarms(
             [
-                "As published, for comparison: centres of contours, alike in weight, without the eccentricity. Faces "
+                "As published, for comparison: centres of contours with equal weights, without the eccentricity. Faces "
                 "are biased by tens of µm; residuals do not show it. Do not use these faces."
             ]
         )
@@ -200,14 +200,11 @@ def _trust(report: dict, judgement: Judgement) -> list[Block]:
     pitch = "An error of the pitch as a whole (100 ppm is 4 K on aluminium) is not in them"
     if options["solve"] != "joint":
         scope = (
-            "No σ were computed, because the solve was group by group; look at the chains. All holds for the given "
-            "intrinsics: an error of the camera calibration goes into the faces"
+            "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
+            "the given intrinsics: an error of the camera calibration goes into the faces"
         )
     elif judgement.verdict == "no":
-        scope = (
-            "No σ are shown, as they would not hold. What failed makes the result wrong by an amount that they do not "
-            "have in them"
-        )
+        scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
     elif options.get("refine_camera", False):
         scope = (
             f"σ hold for the given pitch of the board; the intrinsics were adjusted, and their σ are in them. {pitch}"
@@ -225,7 +222,7 @@ def _trust(report: dict, judgement: Judgement) -> list[Block]:
             "both factors"
         )
     single = [face for face, chains in report["chains"].items() if len(chains) == 1]
-    one_way = "reached by one way only, so that no second way confirms them: face"
+    one_way = "reached by only one chain, so that no second chain confirms them: face"
     return [
         f"{scope}, and residuals hardly show it",
         factor,
@@ -336,7 +333,7 @@ def _worst_values(report: dict) -> list[list[str]]:
     flat = _worst((face["plane_rms_um"], f"face {name}") for name, face in report["faces"].items())
     single = _worst((row["max_px"], f"{row['image']}, {row['worst']}") for row in report["residuals_by_image"])
     over = f"{number(1e-3 * ppm[0] * _size_mm(report), 1)} µm over the target's diagonal" if ppm else ""
-    parts = "each way uses a part of the images only, so it scatters more than the result"
+    parts = "each chain uses only a part of the images, so it scatters more than the result"
     return [
         [name, number(worst and worst[0], digits), worst[1] if worst else NONE, remark if worst else "not computed"]
         for name, worst, digits, remark in (
@@ -385,7 +382,7 @@ def _faces_in_detail(report: dict) -> list[Block]:
             ],
             [
                 subheading("Chains"),
-                "Ways to each face through single groups, and how far each is off the combined pose"
+                "Chains to each face through single groups, and how far each is off the combined pose"
                 if ways
                 else "No face but the datum",
                 Table(heads, ways),
