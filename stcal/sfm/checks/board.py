@@ -123,9 +123,7 @@ def radius_checks(radii: Radii) -> list[Check]:
         "one, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
-        judge(
-            "radius", "Radius of each circle against others of the same design radius", single, "circles", single_remedy
-        ),
+        judge("radius", "Radius of each circle against others of its design radius", single, "circles", single_remedy),
         judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
     ]
 
