@@ -168,7 +168,7 @@ class TargetDesign(Brief):
 
     @property
     def has_scale(self) -> bool:
-        """True if the target itself tells its size: by printed faces, or by known distances."""
+        """True if the target itself determines the size: by printed faces, or by known distances."""
         return bool(self.distances) or any(face.printed is not None for face in self.faces)
 
     @property
@@ -271,7 +271,7 @@ class BoardDesign:
     corner_radius_mm : float, optional
         Radius of the larger dot, mm.
     stated : StatedSize
-        What is stated of its size beside the drawing.
+        What is stated about its size, in addition to the drawing.
     unusual_size : bool
         True if an unusually large or small pitch or radius is not a mistake of units.
     rim_mm : float
@@ -446,7 +446,8 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
 
 @lru_cache(maxsize=256)
 def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, same: bool) -> Likeness | None:
-    """Returns the likeness of two patterns, given as the bytes of their arrays; designs are often made anew."""
+    """Returns the similarity of two patterns, given as the bytes of their arrays so that it can be cached: the same
+    design is often made again."""
     places, radii, other_places, other_radii = map(np.frombuffer, (xy, radius, other_xy, other_radius))
     in_place = np.arange(len(radii)) if same else None
     return whole_likeness(places.reshape(-1, 2), radii, other_places.reshape(-1, 2), other_radii, in_place)
@@ -466,7 +467,8 @@ def require_board(
     corner_radius_mm: float | None,
     where: str,
 ) -> None:
-    """Refuses a grid of dots that is none, whose dots overlap, or whose larger dot is not larger or at no corner.
+    """Refuses a grid with too few dots or with overlapping dots, and a larger dot that is not larger or not at a
+    corner.
 
     Raises
     ------

@@ -14,7 +14,7 @@ LEAST_LINK_MM, MOST_LINK_MM = 10.0, 5e4
 """The longest link of an arm: 10 m in metres are 10 mm, and no arm has links of 50 m. Along joint axes that are nearly
 parallel the common normal may be any distance away, so that ``d`` has no upper limit."""
 KEY = "unusual_size"
-"""The key with which a file states that its lengths are as small, or as large, as they stand."""
+"""The key with which a file states that its unusually small or large lengths are meant."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,7 @@ def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | No
 
 
 def _order(likeness: Likeness) -> tuple[float, float]:
-    """Returns the key that orders likenesses by gap, then by angle."""
+    """Returns the key that orders similarities by gap, then by angle."""
     return round(likeness.gap_mm, 6), abs(likeness.turn_rad)
 
 

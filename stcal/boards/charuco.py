@@ -21,17 +21,18 @@ from stcal.io.images import grey_8bit
 LEAST_CORNERS = 4
 """Smallest number of corners of a view: they determine a homography."""
 NEIGHBOURS = 12
-"""Number of nearest corners that foretell a corner: neither a lens nor a bent board bends so small a patch by much."""
+"""Number of nearest corners that predict a corner: neither a lens nor a bent board bends such a small patch by much."""
 TESTED_FROM = 8
-"""Smallest number of corners of a view in which corners are tested: fewer do not foretell one another."""
+"""Smallest number of corners of a view in which corners are tested: fewer cannot predict one another."""
 SLOPE_SIGMA_PX = 5.0
 """σ of the change of a deviation from the homography from one square to the next, px; it keeps the fit regular."""
 ROBUST_PASSES = 10
 LEAST_SCATTER_PX = 0.05
 """Smallest scatter of corners about a smooth field, px: printing and lenses cause it even in sharp views."""
 GATE = 5.0
-"""Largest deviation of a corner from where its neighbours foretell it, in the robust σ of such deviations in the view,
-or of the neighbours' own, whichever is larger: a bent board or a wide lens makes the latter large near an edge."""
+"""Largest deviation of a corner from the prediction by its neighbours. It is in units of the robust σ of such
+deviations in the view, or of the scatter of the neighbours themselves, whichever is larger. A bent board or a wide lens
+makes the latter large near an edge."""
 SMOOTHING_PX = 0.8
 """σ of the smoothing before gradients are taken."""
 ALIKE_PX2 = 4 * np.pi * SMOOTHING_PX**2
@@ -53,13 +54,14 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
     """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen.
 
     One visible neighbour tag is enough for a corner, and tags that the first pass missed are searched at their expected
-    places: OpenCV's default settings lose a quarter of the corners of real image sets. As corners of a single blurred
-    tag lie several px off, each corner is measured from where the corners about it foretell it, and is left out if the
-    measurement ends far from there.
+    places: OpenCV's default settings lose a quarter of the corners of real image sets. Corners from a single blurred
+    tag may be several px off. Each measurement therefore starts at the place that the surrounding corners predict, and
+    the corner is left out if the measurement ends far from there.
 
-    It is where the edges cross by the areas that they leave in the pixels of a window clear of the tags; if what is
-    seen there does not fit, where the gradients of the edges meet; if these edges are too blurred, the saddle in a
-    window of the size to which the board is symmetric about the corner.
+    A corner is measured in one of three ways. The first is the crossing of the edges by the areas that they cover in
+    the pixels of a window clear of the tags. If the pixels do not fit such a crossing, it is the point where the
+    gradients of the edges meet. If the edges are too blurred for that, it is the saddle of the grey values, in a window
+    in which the board is symmetric about the corner.
     """
     grey = grey_8bit(image)
     ids, corners = _read(grey, board)
@@ -105,8 +107,8 @@ def _read(grey: np.ndarray, board: CharucoDesign) -> tuple[np.ndarray, np.ndarra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Foretold:
-    """Corners as the corners about each foretell it: ``xy_px`` (n, 2); ``scatter_px`` : (n,) median deviation of those
-    corners from their own smooth field; ``step_px`` : (n,) shorter side of a square there."""
+    """Corners as predicted by the corners around each of them: ``xy_px`` (n, 2); ``scatter_px`` : (n,) median deviation
+    of those corners from their own smooth field; ``step_px`` : (n,) shorter side of a square there."""
 
     xy_px: np.ndarray
     scatter_px: np.ndarray
@@ -122,10 +124,10 @@ class _Foretold:
 
 
 def _foretold(squares: np.ndarray, corners: np.ndarray) -> _Foretold:
-    """Return the places of corners (n, 2), px, without their own measurements.
+    """Return the places of corners as predicted by the corners around them, (n, 2) px.
 
-    ``squares`` : (n, 2) places on the board in squares. A homography of the whole view leaves what the lens and a bent
-    board do, which is smooth: it is linear among the corners about each.
+    ``squares`` : (n, 2) places on the board in squares. The deviations from a homography of the whole view come from
+    the lens and a bent board. They are smooth, and are modelled as linear among the corners around each.
     """
     image_from_squares = _robust_homography(squares, corners)
     base = apply_homography(image_from_squares, squares)
@@ -253,7 +255,7 @@ class _Window:
 
     @classmethod
     def of(cls, half: int) -> "_Window":
-        """Return a square window of which half a side is ``half`` px."""
+        """Return a square window with half sides of ``half`` px."""
         offsets = np.stack(np.meshgrid(*[np.arange(-half, half + 1.0)] * 2), axis=-1).reshape(-1, 2)
         return cls(half, offsets, np.exp(-(offsets**2).sum(1) / half**2))
 
@@ -264,7 +266,7 @@ class _Window:
         return self.bell * (inside & inside[:, ::-1])
 
     def whole(self, weight: np.ndarray) -> np.ndarray:
-        """Return a mask (n,) of the windows of which the image's edge takes less than half."""
+        """Return a mask (n,) of the windows that lie in the image by more than half."""
         return weight.sum(1) > self.bell.sum() / 2
 
     def sampled(self, image: np.ndarray, xy: np.ndarray) -> np.ndarray:

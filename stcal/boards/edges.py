@@ -57,8 +57,8 @@ BLURS, LEAST_INSIDE_PX = 2.5, 1.0
 """Distance from the tag's inner cells, in σ of blur and pixel, from which on pixels are used, and the least width of
 the border's band that is used, px."""
 CLEAR_BLURS = 1.5
-"""Distance from what is beside a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what the
-blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
+"""Distance from the pattern next to a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what
+the blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
 SHADED_HALF_PX, LEAST_REDUNDANCY = 4, 5
 """Half the side of a window from which on grey values may change along it; the fewest pixels beyond the unknowns."""
 CROSSING_STEPS = 4
@@ -273,7 +273,7 @@ class _Area:
     ``offset``, ``slope`` : (n, 4), as in :class:`_Lines`; ``settled`` : (n, 4) False where the profiles' line is kept;
     ``blur`` : (m,) variances, px²; ``levels`` : (m, 2) dark and rise; ``by_noise`` : (m, 2, 2) covariance of offset and
     slope without sampling; ``by_sampling`` : (m, 2, 2) their derivatives by its two harmonics, in columns; ``told`` :
-    what the profiles along turned edges say of it.
+    estimate of the offset from the profiles along rotated edges.
     """
 
     offset: np.ndarray
@@ -402,8 +402,9 @@ def _noise_of(residual, distance, weight) -> np.ndarray:
 
 
 def _growth_of_tags(residual, offset, weight, noise, good, shape) -> np.ndarray:
-    """Return the factors (m,) of the variances, by edges that are not straight: squares of the profiles' pulls at the
-    offset over what the noise of single pixels makes of them, for each tag."""
+    """Return the factors (m,) by which edges that are not straight increase the variances, for each tag. A factor is
+    the sum of the squared pulls of the profiles on the offset, divided by its expectation from the noise of single
+    pixels."""
     of_profile = ((weight * offset * residual).sum(2) ** 2).sum(1)
     profiles = weight.any(2).sum(1)
     expected = noise * (weight * offset**2).sum((1, 2)) * (1 - 2 / np.maximum(profiles, 3))
@@ -445,7 +446,8 @@ def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossings:
-    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False where a window shows none."""
+    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False if a window shows no
+    crossing."""
 
     xy_px: np.ndarray
     covariance_px2: np.ndarray
@@ -457,9 +459,9 @@ def crossings(
 ) -> Crossings:
     """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
 
-    ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest thing
-    that is none of the two edges. What the blur carries into the window from there is not used, but in windows of which
-    half a side is below :data:`SHADED_HALF_PX`: they are needed whole.
+    ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest pattern
+    other than the two edges. Pixels into which blur carries light from there are not used, except in windows with half
+    sides below :data:`SHADED_HALF_PX`, which need all of their pixels.
     """
     n = len(start)
     xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
@@ -541,7 +543,8 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
 
 
 def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
-    """Return Σ over classes of distances of the squares (n, 2, 2) of what all pixels of a class pull (n, k, 2)."""
+    """Return the sum over classes of distances of P Pᵀ, (n, 2, 2), with P the summed pulls (n, k, 2) of the pixels in a
+    class."""
     n, most = len(pull), round(2 * half / BIN_PX)
     bins = 2 * most + 1
     row = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most + bins * np.arange(n)[:, None]

@@ -1,7 +1,7 @@
 """Parameters of commands: what a command writes beside a parameter's type, and Typer's form of it.
 
-``count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3`` is the option ``--count``: its text of help,
-and whatever else must be said. Its name, and its panel of the help text, follow from the parameter's name and type.
+``count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3`` is the option ``--count``: with its help
+text and range. Its name, and its panel in the help, follow from the parameter's name and type.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from stcal.cli.help import panel_of
 
 @dataclass(frozen=True, slots=True)
 class Opt:
-    """An option, with what its text of help and its parameter do not say.
+    """An option: what its help text and its parameter do not state.
 
     ``name`` : its names, such as ``--a``, or ``--robust/--least-squares``; ``--held-out`` for ``held_out`` if not
     given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is written; ``metavar``,

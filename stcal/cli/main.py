@@ -21,7 +21,7 @@ from stcal.errors import NO_MEMORY, StcalError, at_command_line, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
 AGAIN_S = 0.02
-"""Time after which a signal is sent once more, s."""
+"""Time after which a signal is sent again, s."""
 MESSAGE_CHARACTERS = 600
 """Largest length of an error's line. Texts from files, which it may quote, can have any length."""
 RESUMED = {"run", "detect", "watch"}
@@ -130,7 +130,7 @@ def _terminate(*_) -> NoReturn:
 
 
 def again(lost: "sys.UnraisableHookArgs") -> None:
-    """Sends a signal once more whose exception came where Python prints and forgets it, as in a finaliser."""
+    """Sends a signal again if its exception was raised where Python only prints it, such as in a finaliser."""
     number = {KeyboardInterrupt: signal.SIGINT, _Terminated: signal.SIGTERM}.get(lost.exc_type)  # type: ignore[arg-type]
     if number is None:
         sys.__unraisablehook__(lost)

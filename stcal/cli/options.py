@@ -346,7 +346,8 @@ def _protected(command: Callable) -> Callable:
 
 
 def _with(camera_name: str, bayer: str, command: Callable, given: dict):
-    """Run a command with the camera of this name of files of several, and with images as mosaics of this pattern."""
+    """Run a command with the camera of this name if a camera file has several, and with images read as mosaics of this
+    pattern."""
     from stcal.io.cameras.read import camera_chosen
     from stcal.io.images import mosaic_of
 
@@ -356,7 +357,7 @@ def _with(camera_name: str, bayer: str, command: Callable, given: dict):
 
 @contextmanager
 def input_notes() -> Iterator[None]:
-    """Print what readers of files pass over, once each."""
+    """Print the parts of files that their readers ignore, once each."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", InputNote)
         before, told = warnings.showwarning, set()

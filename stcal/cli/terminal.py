@@ -26,7 +26,7 @@ LINE_EVERY_S = 5.0
 LEFT_FROM_S = 2.0
 """Shortest remaining time that a stage shows, s."""
 STANDARD_OUTPUT = Path("-")
-"""Name that stands for standard output in place of a JSON file."""
+"""Name that means standard output instead of a JSON file."""
 _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 """Standard output while a file goes there."""
 
@@ -182,7 +182,7 @@ def write_out(text: str) -> None:
 
 
 def write_if(path: Path | None, content: Callable[[], object], said: str = "written") -> None:
-    """Saves what ``content`` returns if a path is given; it is not made else."""
+    """Writes the result of ``content`` if a path is given; otherwise ``content`` is not called."""
     if path:
         write(path, content(), said)
 
@@ -194,7 +194,7 @@ def _escaped(text: str, encoding: str) -> str:
 
 
 def print_each(said: str, lines: Iterable[object]) -> None:
-    """Prints each on a line of its own, after the word ``said``."""
+    """Prints each item on a line of its own, after the word ``said``."""
     for line in lines:
         if _quiet.get() and said.startswith("warning"):
             sys.stderr.write(f"{printable(f'{said}: {line}')}\n")

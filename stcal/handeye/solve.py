@@ -408,7 +408,7 @@ def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ..
     notes: tuple[str, ...] = ()
     if camera_gain > CAMERA_GAIN:
         notes += (
-            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera anew",
+            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera again",
         )
     doubted = {name: factor for name, factor in sigma.items() if name in FACTORS and factor > WIDENED}
     if doubted:

@@ -1,7 +1,7 @@
 """Cache of results between runs: arrays and plain values in one file, with what they were made from and a checksum.
 
 A file's name is the hash of its inputs. A file that is damaged, was edited, or lies under the name of another one is
-not used: it is made anew, and a note says so.
+not used: it is made again, and a note says so.
 """
 
 import functools

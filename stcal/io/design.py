@@ -54,7 +54,7 @@ Name = Annotated[
 
 
 RimHeight = Annotated[float, Field(ge=-20, le=20)]
-"""Height in mm of a rim in front of a circle; negative of a disc that stands out of its plate."""
+"""Height in mm of a rim in front of a circle; negative for a disc that is raised from its plate."""
 
 
 class _CircleFile(Strict):

@@ -346,9 +346,9 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
 
 
 def _turn(data: bytes) -> int | None:
-    """Return how to turn an image as its EXIF says, None if it says no quarter turn, or contradicts itself.
-
-    A program that turns pixels and leaves the orientation as it was also leaves the sides that EXIF states.
+    """Return the rotation that EXIF states for an image; None if it is not a multiple of 90°, or if EXIF contradicts
+    itself. A program that rotates the pixels without changing the orientation also leaves the old width and height in
+    EXIF.
     """
     turns = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
     try:
@@ -399,7 +399,7 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
 
 
 def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
-    """Raise an error if there are several sizes, each with as many images, of which some are readable."""
+    """Raise an error if several sizes have the same number of images, and some of these images are readable."""
     sizes = [size for size, own in equal.items() if any(_is_readable(file) for file in own)] if len(equal) > 1 else []
     if len(sizes) < 2:
         return
@@ -496,7 +496,7 @@ def grey_fine(image: np.ndarray) -> np.ndarray:
 
 
 def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "image") -> None:
-    """Refuse an array that is no grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px.
+    """Refuse an array that is not a grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px.
 
     Raises InputError: the message begins with ``name``.
     """

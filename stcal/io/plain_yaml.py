@@ -1,7 +1,7 @@
 """YAML as other programs write it: plain values and OpenCV's matrices.
 
-Aliases are refused: with them, ten lines can expand to more than any memory holds. So is a key that stands twice, of
-which the last one would count without a word.
+Aliases are refused: with them, ten lines can expand to more than any memory holds. A repeated key is refused too, since
+the last one would silently count.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Tables with a header: units stand in the names of the columns, and messages name the line of a bad row."""
+"""Tables with a header: units are in the names of the columns, and messages name the line of a bad row."""
 
 import csv
 import io
@@ -46,7 +46,7 @@ class Table:
     rows : sequence of m str
         Text of the lines if all columns are numbers, since a name such as 01 must be kept.
     form : str
-        Form in words, where it is not that of the package: ``; between columns, decimal commas``.
+        Form in words, if it is not that of the package: ``; between columns, decimal commas``.
     """
 
     where: str

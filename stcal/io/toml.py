@@ -99,6 +99,6 @@ def toml_string(value: str) -> str:
 
 
 class Sized(Strict):
-    """A file of hardware, which may state that its lengths are meant as they stand."""
+    """A file of hardware, which may state that unusual lengths in it are meant."""
 
     unusual_size: bool = False

@@ -97,7 +97,7 @@ class Table:
     over : heads above the heads, each with the number of columns that it spans
     css : ``text`` if cells hold sentences, ``text facts`` for names and values without heads
 
-    Of many rows only the first ones are shown, and their number is told; result files have all.
+    Of many rows, only the first ones are shown, with the number of all; result files have all rows.
     """
 
     heads: Sequence[str]
@@ -109,7 +109,7 @@ class Table:
         return len(self.rows) > 0
 
     def lines(self) -> list[str]:
-        """Return the lines of the table; a head above others stands in front of each of them."""
+        """Return the lines of the table; a heading that spans several columns is put before each of their headings."""
         if "facts" in self.css:
             return [f"{name}: {value}" for name, value in self.rows if value != NONE]
         above = [text for text, span in self.over for _ in range(span)] or [""] * len(self.heads)
@@ -278,7 +278,7 @@ class Document:
 
 
 def _lines(blocks: Iterable[Block]) -> Iterator[str]:
-    """Yield the lines of sentences and tables; an empty line stands between a table and what is beside it."""
+    """Yield the lines of sentences and tables, with an empty line before and after each table."""
     before: Block = None
     for block in blocks:
         if not block or isinstance(block, Html):

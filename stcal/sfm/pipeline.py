@@ -80,7 +80,7 @@ ASSUMED = (
 Images = str | Path | Mapping[str, Sequence[np.ndarray]]
 """A folder of images, or grey or RGB arrays by the name of their group."""
 OwnCheck = Callable[[RunResult], Check]
-"""A check of a caller's own."""
+"""A check that the caller supplies."""
 
 
 @require_arguments

@@ -30,7 +30,7 @@ CIRCLE_CORNERS = 360
 """Corners of the polygon that a circle is drawn as."""
 SAMPLES, LATTICE = 13, 8
 """Samples of a pixel: a Fibonacci lattice, shifted at random from pixel to pixel. An edge along the pixel rows is then
-where it is, which a grid of points places in steps."""
+exactly in place; a grid of points would place it in steps."""
 EDGE_SIGMA_PX = 0.1
 """σ of the shift that ink, light and the camera's response give the edges of all tags alike."""
 BEND_MM = 0.02

@@ -20,7 +20,7 @@ from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "second_design"]
 
 FACE_MARGIN_MM = 15.0
-"""How far a plate of which the design states no outline is assumed to reach beyond the rims of its circles."""
+"""How far a plate is assumed to reach beyond the rims of its circles, mm, if the design states no outline."""
 BOARD_MARGIN_MM = 15.0
 SENSOR_WIDTH_MM = 22.3
 FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM

@@ -159,7 +159,7 @@ class GrowingRun:
         return Update(images, new, left_out, tuple(gone), result, reason, advice, blur_px)
 
     def _files(self, complete: Collection[str] | None) -> ImageFiles:
-        """Returns the photographs of which nothing is written any more."""
+        """Returns the photographs whose files are complete."""
         files, skipped = chosen_images(self.images, self.options.exclude)
         return [file for file in files if complete is None or file.name in complete], skipped
 

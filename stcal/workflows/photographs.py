@@ -60,7 +60,7 @@ class Trigger:
         self._last: float | None = None
 
     def ready(self, number: int) -> bool:
-        """Waits for photograph ``number``. Returns False where there will be none."""
+        """Waits for photograph ``number``. Returns False if there will be none."""
         if self._left < 1:
             return False
         self._left -= 1

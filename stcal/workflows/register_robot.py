@@ -35,8 +35,8 @@ ROUNDS, CLEAN_SETS = 3, 0.01
 """Number of rounds in which rows are added, and the probability that a clean set exceeds, anywhere, the bound of rows
 to add."""
 SAME_MM = 0.01
-"""Largest deviation, in mm, at which positions of a and of the robot file agree; beyond it, a is of another base or
-tool."""
+"""Largest deviation, in mm, at which positions of a and of the robot file agree; beyond it, a belongs to another base
+or tool."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

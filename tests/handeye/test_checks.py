@@ -498,7 +498,7 @@ def test_corners_of_turned_views_are_put_right():
     views = Views(truth.views.camera, tuple(views))
     pairs = pairs_of_views(truth.pairs.base_from_flange, views)
     found = handeye(pairs, views=views, options=HandEyeOptions(symmetries=(HALF,)))
-    assert found.notes == ("numbered from another end of the board, and put right: pose 2, pose 7",)
+    assert found.notes == ("numbered from another end of the board, and corrected: pose 2, pose 7",)
     plain = handeye(truth.pairs, views=truth.views)
     assert found.mount_from_camera.translation == pytest.approx(plain.mount_from_camera.translation, abs=1e-5)
 

@@ -431,7 +431,7 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
     assert code == 0
     assert [row["held_out"] for row in rows] == [None] * len(rows)
     assert "\nheld out (" not in shown.split("Methods")[0]
-    assert "verdict: use with care: no errors on poses held out are known" in shown
+    assert "verdict: use with care: errors on poses held out are not known" in shown
 
 
 @pytest.mark.slow

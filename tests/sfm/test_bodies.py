@@ -248,11 +248,11 @@ def test_contributions_of_a_body_add_up_to_its_covariance():
     assert all(np.trace(found.covariance_mm2[kind]) > 0 for kind in (PRINT, SIZES, DISTANCES, INTRINSICS))
     assert size_row(found, board) == ("stated", "size_sigma_mm")
     seen = with_edge_sigma(board, images)
-    assert size_row(found, seen) == ("stated", "size_sigma_mm, and what moves the edges of all tags alike")
+    assert size_row(found, seen) == ("stated", "size_sigma_mm, and a common displacement of the edges of all tags")
     drawn = scale_reference(None, tag_cube(60))
     assert size_row(found, drawn) == ("not stated", "no size_sigma_mm; taken as exact")
     edges = with_edge_sigma(drawn, images)
-    assert size_row(found, edges) == ("assumed", "no size_sigma_mm; what moves the edges of all tags alike")
+    assert size_row(found, edges) == ("assumed", "no size_sigma_mm; a common displacement of the edges of all tags")
     for face, own, both in zip(drawn.faces, edges.faces, seen.faces, strict=True):
         stated = target.face(face.id).size_sigma
         assert both.size_sigma == pytest.approx(np.hypot(stated, own.size_sigma))

@@ -17,7 +17,7 @@ TagBody = Literal["cube", "dodecahedron"]
 
 
 CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
-"""What `design` takes if nothing is said."""
+"""Defaults of `design`."""
 
 
 @app.command()

@@ -112,12 +112,12 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             raise DegenerateError(
                 "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "but a robot of four axes turns about one only; leave --four-dof (in Python four_dof) out",
+                "but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out",
             )
     elif observability.useless:
         slides = (
-            f"; a robot of four axes cannot: with --four-dof (in Python four_dof) all but {FRAMES[setup].camera} along "
-            "that axis is found"
+            f"; a robot with four axes cannot: with --four-dof (in Python four_dof) all but "
+            f"{FRAMES[setup].camera} along that axis is determined"
         )
         raise DegenerateError(
             "E-HANDEYE-AXES", f"{where}: {observability.missing()}{slides if observability.one_axis else ''}"

@@ -122,7 +122,7 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
             first_ones = f"{len(groups[0])} with {names[0]} and {len(groups[1])} with {names[groups[1][0]]}"
             return (
                 f"the poses fall into two groups that are {gap:.2g}{word} apart, {first_ones}: was board or camera "
-                "moved in between? solve each by itself",
+                "moved in between? solve each separately",
             )
     return ()
 
@@ -152,8 +152,8 @@ def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray
         return (f"{what} drifts from the first pose to the last, by {size}: fasten it, and take the poses again",)
     likely = f" ({names[change.first]} to {names[change.last]} as likely)" if change.first < change.last else ""
     return (
-        f"{what} moved before {names[change.row]}{likely}, by {size}: solve the poses before and from there on each by "
-        "themselves",
+        f"{what} moved before {names[change.row]}{likely}, by {size}: solve the poses before it, and those from it "
+        f"on, separately",
     )
 
 

@@ -29,7 +29,7 @@ class Repair:
         names = [name for name, turn in zip(self.pairs.names, self.turned, strict=True) if turn]
         if not names:
             return ()
-        return (Aside(f"numbered from another end of the board, and put right: {', '.join(names)}"),)
+        return (Aside(f"numbered from another end of the board, and corrected: {', '.join(names)}"),)
 
 
 def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:

@@ -186,8 +186,9 @@ class HandEyeFile(ResultFile):
     left_out: list[NamedReason] = Field(description="`name`, `reason` of images and rows that did not take part")
     held_out: HeldOutMeans | None = Field(
         description="`splits`, `poses` in each, and means: `rotation_rad`, `translation_mm` of the board's origin; "
-        "with images `board_mm`: how far from each corner the ray on which the camera saw it meets the board where the "
-        "robot has put it, mean over the corners, and `pose_mm`: distance of the corners by the robot from those by "
+        "with images `board_mm`: the distance from each corner to the point where the camera's ray to it meets the "
+        "board as placed by the robot, mean over the corners, and `pose_mm`: distance of the corners by the robot "
+        "from those by "
         "the pose that the image gives alone; `agreeing`: the same means without `outliers`, null where there are none"
     )
     motions_held_out: HeldOutMotionRows | None = Field(

@@ -169,8 +169,8 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     """
     title, result, held = "Poses held out", outcome.result, outcome.held_out
     if held is None:
-        remedy = "take ten poses or more, or leave --splits as it is"
-        return Finding(title, CARE, "no errors on poses held out are known", remedy=remedy)
+        remedy = "take ten poses or more, or keep the default of --splits"
+        return Finding(title, CARE, "errors on poses held out are not known", remedy=remedy)
     good = ~result.outliers
     agreeing = good[held.rows]
     if not agreeing.any():
@@ -194,7 +194,7 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
             f"poses held out are missed by {error:.3g} mm (RMS), where the residuals of {fitted:.3g} mm promise "
             f"{fitted * np.sqrt(expected):.3g} mm"
         )
-    remedy = "take more poses, and look for some that do not belong to the others" if word != GOOD else ""
+    remedy = "take more poses, and look for poses that do not belong to the others" if word != GOOD else ""
     return Finding(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
 
 
@@ -263,10 +263,10 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     word = _word(ratio, AS_ONE, AS_THREE)
     first, second, _ = np.degrees(observability.turns_rad)
     if not np.isfinite(ratio):
-        said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along this axis is not found"
+        said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along it is not determined"
         remedy = (
             f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which a "
-            "robot of four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
+            f"robot with four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
         )
         return Finding("Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
@@ -295,7 +295,7 @@ def _of_outliers(outcome: Outcome) -> Finding:
     if len(flips) == len(bad):
         remedy = ""
     if flips:
-        undo = "solve with --undo-flips, which takes the other tilt, or give images in place of the board's poses"
+        undo = "solve with --undo-flips, which takes the other tilt, or give images instead of the board's poses"
         remedy = "; ".join(part for part in (undo if outcome.views is None else "", remedy) if part)
     return Finding("Outliers", word, said, str(len(bad)), "0", remedy)
 

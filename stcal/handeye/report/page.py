@@ -196,13 +196,13 @@ def outcome_report(outcome: Outcome) -> Document:
 
 
 EXPLAINED = (
-    "The rotation vector is axis times angle, not roll, pitch and yaw. σ are of turns about the axes, and of shifts "
-    "along the axes, of the frame named first"
+    "The rotation vector is axis times angle, not roll, pitch and yaw. σ are those of rotations about the axes, and "
+    "of translations along the axes, of the frame named first"
 )
 CHANCE = (
-    "Care is advised for what happens by chance in one calibration of a thousand, use advised against for what "
-    "happens in one of a hundred thousand, and where the transform has more than half, or nine tenths, of the "
-    "variance of a prediction. Whether the millimetres above are few enough, the task tells"
+    "Care is advised for what happens by chance in one calibration of a thousand, and use is advised against for what "
+    "happens in one of a hundred thousand. The same holds if the transform has more than half, or nine tenths, of the "
+    "variance of a prediction. Whether the errors in mm above are small enough depends on the task"
 )
 
 
@@ -248,10 +248,10 @@ def _tried(choice: Choice | None) -> list[Block]:
     return [
         Table(["<solved by", "held out mm", "splits", "<"], rows, css="text"),
         page_only(
-            "Each way solves with the other poses and predicts where the board is in those held out. The best is "
-            "taken, unless one that trusts the files more, or knows its σ, is behind it by no more than chance. The "
-            "errors above are those of the choice as a whole: in each split of the way that the errors on all other "
-            "poses name"
+            "Each way solves with the other poses, and predicts the board in the poses held out. The best is "
+            "taken, unless one that trusts the files more, or states σ, is behind it by no more than chance. The "
+            "errors above are those of the whole procedure: in each split, the way is chosen by the errors on all "
+            "other poses"
         ),
     ]
 
@@ -271,9 +271,9 @@ def _arm(arm: ArmFound | None) -> list[Block]:
     return [
         Table([f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], rows, css="text"),
         page_only(
-            "By how much each axis is off the robot's file, and σ: turns (rx, ry) and shifts (x, y) of the joint's "
-            "frame, one after the other from the base. What poses do not tell stays near 0 by the σ of all axes, which "
-            "is estimated"
+            "Difference of each axis from the robot's file, and σ: rotations (rx, ry) and translations (x, y) of the "
+            "joint's frame, one after the other from the base. What the poses do not determine stays near 0, held by "
+            "the estimated σ of all axes"
         ),
     ]
 
@@ -292,8 +292,8 @@ def _methods(outcome: Outcome) -> list[Block]:
     if not any(row[-1] for row in rows):
         heads, rows = heads[:-1], [row[:-1] for row in rows]
     board = (
-        " 3-D at the board: how far from each corner the ray on which the camera saw it meets the board where the "
-        "robot has put it; by pose: distance from the corners by the pose that the image gives alone."
+        " 3-D at the board: the distance from each corner to the point where the camera's ray to it meets the board "
+        "as placed by the robot; by pose: distance from the corners by the pose that the image gives alone."
     )
     return [
         f"means over the same {_splits_text(outcome)} held out; off: from {FRAMES[outcome.result.setup].camera} above",
@@ -385,8 +385,8 @@ def _turns(outcome: Outcome) -> list[Block]:
         else None,
         Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
         "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "
-        "transform is known well where the second turn is large; where it is 0, the camera's place slides along the "
-        "first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
+        "transform is known well if the second rotation is large. If it is 0, the camera's place is undetermined "
+        "along the first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
         f"{np.degrees(observability.sigma_rad):.3f}° and {observability.sigma_mm:.2f} mm in the worst direction",
     ]
 
@@ -400,7 +400,7 @@ def photograph_blocks(outcome: Outcome) -> list[Block]:
         shown, missing = overlays(outcome)
         explained = (
             "Circles: corners as measured. Lines lead to where they would be by the robot's pose as it was reported "
-            "and the transforms above, enlarged: what robot, transforms, camera and board miss together"
+            "and the transforms above, enlarged: the combined error of robot, transforms, camera and board"
         )
         pictures = plots(*(macro("corner_photo", photo) for photo in shown))
         return html(explained if shown else "", pictures, *missing)

@@ -57,8 +57,8 @@ def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.nda
     blocks = [
         Table(heads, rows),
         Table(["<joints", *joints], cells if joints else []),
-        "turn: against the nearest pose taken; rx, ry, rz: rotation vector. σ are of independent errors of the poses "
-        f"alone. Collisions are not looked at, only {last}",
+        "turn: relative to the nearest pose taken; rx, ry, rz: rotation vector. σ include only independent errors of "
+        f"the poses. Collisions are not checked, only {last}",
     ]
     return Document(
         "Poses to take next",

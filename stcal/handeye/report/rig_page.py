@@ -66,8 +66,8 @@ def rig_report(outcome: RigOutcome) -> Document:
     alone: list[Block] = [
         _cameras(outcome),
         page_only(
-            "σ of a camera's place and turn in their worst directions, as the adjustment of all cameras and that of "
-            "this one alone have them"
+            "σ of a camera's place and turn in their worst directions, by the adjustment of all cameras, and by that "
+            "of this camera alone"
         ),
     ]
     if outcome.held_out is not None:
@@ -76,12 +76,12 @@ def rig_report(outcome: RigOutcome) -> Document:
             _held_out(outcome.rig.names, outcome.held_out),
             page_only(
                 "Each time all cameras together, and each by itself, are solved for with the images of the other "
-                "poses, and predict where the board is in the images of those held out: how far from each corner the "
-                "ray on which the camera saw it meets the board where the robot has put it. Gain: by how much that is "
-                "less together"
+                "poses, and predict where the board is in the images of those held out: the distance from each corner "
+                "to the point where the camera's ray to it meets the board as placed by the robot. Gain: by how much "
+                "the error is smaller with all cameras together"
             ),
         ]
-    told = page_only("From the joint covariance: what board and robot do to both cameras alike does not count")
+    told = page_only("From the joint covariance: errors of board and robot that are common to both cameras cancel")
     return Document(
         f"Hand-eye calibration of a rig: {', '.join(rig.names)}",
         f"{outcome.where}: {_rig_headline(outcome)}",

@@ -30,16 +30,16 @@ UNDISTORTED = {
     *("none", "", "null", "false", "camera", "pinhole", "rectified", "simplepinhole", "perspective", "opengl"),
     *("distortionnone", "nodistortion", "perspectiveprojwithdistortion", "perspectiveprojwithoutdistortion"),
 }
-"""Values of a model that say nothing of distortion."""
+"""Values of a model that mean no distortion."""
 COLOURS = frozenset(("rgb", "bgr", "gray", "grey", "mono", "monochrome", "color", "colour", "depth", "infrared"))
-"""Types of cameras that say nothing of a lens."""
+"""Types of cameras that do not specify a lens model."""
 FISHEYE = frozenset([*map(plain, EQUIDISTANT), "kannalabrandt8", "kannalabrandt4", "kb4", "opencvfisheye"])
 FISHEYE_ALSO = frozenset(["distortionkannalabrandt4", "fisheyeopencv", "pinholeequi", "equi", "equid4", "equidistant4"])
 UNIFIED = frozenset(["omni", "omnidir", "omnidirectional", "mei", "unified"])
 INVERSE = frozenset(["inversebrownconrady", "distortioninversebrownconrady", "modifiedbrownconrady"])
-"""Models of which zeros alone are read: their polynomials are other ones than OpenCV's."""
+"""Models that are read only if their coefficients are zero: their polynomials are not OpenCV's."""
 BY_COLUMNS = "intrinsicmatrix"
-"""Key of Open3D and MATLAB, whose matrices stand column by column."""
+"""Key of Open3D and MATLAB, whose matrices are stored column by column."""
 OTHER_WAY = "its coefficients are those of another formula, and under another name they make a wrong camera"
 MOST_ALIKE = 2
 """Largest number of equal cameras that are a rig; more are one camera, stated for each image, as BOP does."""
@@ -125,7 +125,7 @@ TABLES = (
     Table("a file", frozenset()),
 )
 SLAM_SETTINGS = ("camerabf", "cameranew*", "camerargb", "thdepth", "depthmapfactor", "cameraimagescale", "rgbd*")
-"""Settings of ORB-SLAM: its images are resized after reading, and its intrinsics are of the images as they are."""
+"""Settings of ORB-SLAM: its images are resized after reading, and its intrinsics are those of the original images."""
 NEUTRAL = {
     **dict.fromkeys(("binningx", "binningy", "binning"), (0, 1)),
     **dict.fromkeys(("inputhorizontalstretch", "inputverticalstretch"), (1,)),

@@ -96,7 +96,7 @@ PREFIX = re.compile(r"(camera|cam)(?=[_A-Z])")
 COUNTS = (4, 5, 8, 12, 14)
 """Numbers of OpenCV's distortion coefficients."""
 MOST_COEFFICIENT = 100.0
-"""Largest distortion coefficient by which a list is told from pixels and times."""
+"""Largest distortion coefficient; lists with larger values are pixels or times."""
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1."""
 SHOWN = 6
@@ -160,9 +160,8 @@ def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
 
 
 def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), undistorted: bool = False) -> None:
-    """Name the keys of a camera file that its reader did not take.
-
-    Harmless ones pass in silence, others with an :class:`InputNote`.
+    """Report the keys of a camera file that its reader did not use. Harmless keys are ignored silently, others with an
+    :class:`InputNote`.
 
     ``unread`` : keys and values; values may hold further keys; ``source`` : camera file, for messages; ``harmless`` :
     further harmless keys of the format, or beginnings of them that end in ``*``; as :func:`plain` writes them;

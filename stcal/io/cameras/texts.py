@@ -87,7 +87,7 @@ def _toml_values(text: str) -> dict:
 
 
 def _once(pairs: list) -> dict:
-    """Return an object of JSON; refuse a repeated key, of which readers take the last one without a word."""
+    """Return an object of JSON; refuse a repeated key, as readers silently take the last one."""
     made = dict(pairs)
     if len(made) < len(pairs):
         keys = [key for key, _ in pairs]

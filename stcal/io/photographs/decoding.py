@@ -154,7 +154,7 @@ def require_heic(name: str) -> ModuleType:
 
 
 def heic_grey(data: bytes, name: str) -> np.ndarray:
-    """Return the grey pixels of a HEIC photograph as they are stored, without the turn that its container states.
+    """Return the grey pixels of a HEIC photograph as they are stored, without the rotation that its container states.
 
     Raises InputError: the package is missing, or the data are damaged or mirrored.
     """
@@ -193,7 +193,7 @@ def is_dng(data: bytes) -> bool:
 
 
 def raw_grey(data: bytes, name: str) -> np.ndarray:
-    """Return the grey pixels of a raw photograph, uint16, proportional to the light, without turn or correction.
+    """Return the grey pixels of a raw photograph, uint16, proportional to the light, without rotation or correction.
 
     Raises InputError: the package is missing, or cannot read the file.
     """

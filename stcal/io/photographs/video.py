@@ -22,8 +22,8 @@ a lens of medium focal length."""
 MOVING = 90
 """Percentile of the moves of pixels: a body before a resting background has few pixels."""
 SHARP_BLUR_PX = 2.0
-"""σ of the blur with which a frame is compared to tell its sharpness: detail of a frame that is blurred as much already
-is hardly lost by it."""
+"""σ, px, of the blur that measures the sharpness of a frame: a frame that is already blurred as much hardly loses
+detail by it."""
 EDGE_SHARE = 0.05
 """Share of the pixels that are taken for edges."""
 ALL, NEXT, BEFORE = slice(None), slice(1, None), slice(None, -1)
@@ -103,7 +103,7 @@ def chosen_frames(frames: Iterator[np.ndarray], every: str | int = AUTO) -> Iter
 
 
 def _move(first: _Frame, second: _Frame) -> float:
-    """Return how far the parts that move most have moved between two frames, as a share of their longer side."""
+    """Return the motion of the fastest parts between two frames, as a share of the frames' longer side."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(first.small, second.small, None)  # type: ignore[call-overload]
     return float(np.percentile(np.linalg.norm(flow, axis=2), MOVING)) / SMALL_PX
 

@@ -37,11 +37,11 @@ class MatrixColumns:
     unit: str = ""
 
     def rotations(self, table: Table) -> np.ndarray:
-        """Return the rotations (m, 3, 3) as they stand in the table."""
+        """Return the rotations (m, 3, 3) as given in the table."""
         return _numbers(table, self.rotation).reshape(-1, 3, 3)
 
     def matrices(self, table: Table) -> np.ndarray:
-        """Return the matrices (m, 4, 4) as they stand in the table; a row 0 0 0 1 that is missing is added."""
+        """Return the matrices (m, 4, 4) as given in the table; a missing row 0 0 0 1 is added."""
         found = np.tile(np.eye(4), (len(table), 1, 1))
         found[:, :3, :3], found[:, :3, 3] = self.rotations(table), _numbers(table, self.translation)
         if self.last:
@@ -96,7 +96,7 @@ def _matrix(stem: str, by_place: dict[tuple[int, int], str]) -> MatrixColumns | 
 def _with_vector(
     stem: str, by_place: dict[tuple[int, int], str], vectors: dict[str, dict[int, str]]
 ) -> MatrixColumns | None:
-    """Return a matrix 3×3 with its translation; without one where that is not named after it."""
+    """Return a 3×3 matrix with its translation, or without one if no translation has a matching name."""
     wanted = [(i, j) for i in range(3) for j in range(3)]
     if set(by_place) != set(wanted):
         return None

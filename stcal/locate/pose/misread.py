@@ -33,7 +33,7 @@ PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs o
 def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
-    """Returns the mistake in a layout without which all tags would fit; None where there is no such mistake.
+    """Returns the mistake in a layout whose correction makes all tags fit; None if there is no such mistake.
 
     Parameters
     ----------

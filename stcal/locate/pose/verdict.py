@@ -1,4 +1,4 @@
-"""Verdict on a pose: each value beside its limit, and accept, ambiguous or reject."""
+"""Verdict on a pose: each value with its limit, and accept, ambiguous or reject."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -82,10 +82,10 @@ def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> li
         messages.append(f"tags that no image shows, left out of the layout: {tags}")
     few = [tag[1] for tag, count in zip(result.layout.tags, result.counts, strict=True) if count < FEW_IMAGES]
     if few:
-        messages.append(f"tags in fewer than {FEW_IMAGES} images, a misread one would not be noticed: {few}")
+        messages.append(f"tags in fewer than {FEW_IMAGES} images, so that a misread one would not be noticed: {few}")
     if result.adjusted.downweighted > 0.1:
         messages.append(
-            f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; is target and board one plane?"
+            f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; are target and board in one plane?"
         )
     if not result.adjusted.settled:
         messages.append("the σ of board and tags still change at the end of the adjustment; add images")

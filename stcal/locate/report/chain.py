@@ -121,7 +121,7 @@ class GoalChain(Brief):
             return chain
         if scene not in self.flange:
             raise InputError(
-                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or take its exposures away"
+                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or remove its exposures"
             )
         return self.flange[scene] @ chain
 
@@ -134,7 +134,7 @@ class GoalChain(Brief):
         if missing := self.without_pose(scenes):
             raise InputError(
                 "E-ROBOT-POSES-SCENE",
-                f"{self.poses_source}: none of scene {missing[0]}; add a row, or take the scene away",
+                f"{self.poses_source}: none of scene {missing[0]}; add a row, or remove the scene",
             )
 
 
@@ -146,7 +146,7 @@ def read_chain(
     key: str = "scene",
     columns: str | Path | None = None,
 ) -> GoalChain:
-    """Reads what of the hand-eye transform, the robot's poses by scene, and the offset is a file.
+    """Reads the hand-eye transform, the robot's poses by scene, and the offset, as far as they are given as files.
 
     ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
     ``key`` : column of the robot's poses that names the scenes; ``columns`` : map of their columns.
@@ -179,7 +179,8 @@ def read_chain(
 def _mounted(
     hand_eye: HandEyeResult | Rigid | str | Path, robot_poses: Mapping[str, Rigid] | str | Path | None
 ) -> tuple[str, UncertainRigid]:
-    """Returns the name of the camera's pose and the pose. Robot poses tell what a transform alone is."""
+    """Returns the name of the camera's pose, and the pose. For a transform without a name, the presence of robot poses
+    decides."""
     if isinstance(hand_eye, Rigid):
         return FIXED if robot_poses is None else MOVING, UncertainRigid.exact(hand_eye)
     if isinstance(hand_eye, str | Path):

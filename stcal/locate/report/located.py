@@ -77,7 +77,7 @@ class SceneRow(Part):
     shifts: list[ShiftRow] = Field(
         description="`between` two exposures, `tags` in common, `shift_px` the median shift of their middles"
     )
-    camera_from_obj: Pose | None = Field(description="pose, rejected and ambiguous ones too")
+    camera_from_obj: Pose | None = Field(description="pose, also of rejected and ambiguous scenes")
     covariance: Matrix6 | None = Field(None, description="its covariance; not with `--method patent`")
     twin: Pose | None = Field(None, description="the other pose that fits, null where there is none")
     errors_px: list[Finite] | None = Field(None, description="only with `--method patent`: of the two poses")

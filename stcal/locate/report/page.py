@@ -42,8 +42,8 @@ def _patent_blocks(located: Located) -> list[Block]:
     return [
         "both poses are one, no ratio" if located.patent.same else "",
         page_only(
-            "By the published rules: exposures with most tags, of these the ones of more than S_dis of the largest "
-            "area; of these the pose of the smallest error"
+            "By the published rules: exposures with most tags; among these, the ones with more than S_dis of the "
+            "largest area; among these, the pose with the smallest error"
         ),
         Table(["<exposure", "<", "tags", "area px²", "error px", "of the other", "det J 1/mm²"], rows),
         f"patent: {ASSUMED}",

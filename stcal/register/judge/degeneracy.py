@@ -65,7 +65,8 @@ def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
 
 
 def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:
-    """Returns the points without each of which the others would be refused by :func:`check_extent`, as indices."""
+    """Returns the indices of points that are indispensable: if one of them is left out, :func:`check_extent` refuses
+    the others."""
     n = len(xyz_a)
     centred = xyz_a - xyz_a.mean(0)
     scatter = centred.T @ centred

@@ -124,8 +124,8 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
     residuals = inside.residuals(transform)
     if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
         notes.append(
-            "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
-            "a transform holds only where its points are; see the residual field"
+            "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
+            "other, and a transform is valid only where its points are; see the residual field"
         )
     if other is None and subject.method != "liu2017":
         change = moved_meanwhile(subject.problem, transform)
@@ -134,13 +134,13 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
         notes.append(_two_groups(subject, subject.shifted))
     if subject.factor is not None and subject.covariance.scaled:
         notes.append(
-            f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
-            "is scaled by it"
+            f"residuals exceed the σ given {subject.factor:.3g} times, which is beyond chance; the covariance is "
+            f"scaled by this factor"
         )
     enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
     if len(inside) <= enough and subject.covariance.scaled:
         more = enough + 2 - len(inside)
-        notes.append(f"of {len(inside)} points one that is wrong cannot be told from the others: measure {more} more")
+        notes.append(f"of {len(inside)} points a wrong one cannot be identified: measure {more} more")
     redundancy = subject.covariance.redundancy
     if redundancy < LOW_REDUNDANCY:
         notes.append(f"σ rests on {redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
@@ -160,8 +160,8 @@ def _two_groups(subject: Subject, shifted: Shifted) -> str:
     where = ", and lie together" if shifted.together else ""
     return (
         f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
-        f"{shifted.count - len(shifted.rows)}{where} ({shown}{more}): two groups, and which is right cannot be told "
-        "from the data (or noise far from normal); σ of the transform hold either; did an instrument move between them?"
+        f"{shifted.count - len(shifted.rows)}{where} ({shown}{more}): two groups, and the data do not show which is "
+        f"right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
     )
 
 
@@ -180,7 +180,7 @@ def _layout(subject: Subject, sigma: float) -> list[str]:
     if model.name != "affine" and spreads(inside)[2] < WIDER_THAN * sigma:
         notes.append("the points lie in a plane: a mirrored frame would not be noticed")
     if isinstance(transform, Affine) and np.linalg.det(transform.linear) < 0:
-        notes.append("the transform mirrors: one of the frames is left-handed")
+        notes.append("the transform is a reflection: one of the frames is left-handed")
     if isinstance(transform, Similarity):
         scale = transform.scale
         for factor, (name, _) in UNITS.items():

@@ -122,7 +122,7 @@ class HeldOutBoth(Part):
 
 
 class RobotPart(Part):
-    """Base and kinematics solved beside the transform."""
+    """Base and kinematics, solved in addition to the transform."""
 
     name: str
     b_from_base: Pose

@@ -54,7 +54,7 @@ def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> Sec
     told = (
         "Samples of every size, as in figure 6 of Liu et al. (2017): the share of the other points within "
         f"{options.limit_mm:g} mm of what the sample says. A sample is acceptable with more than "
-        f"{100 * options.share:g} %; those whose 3×3 part is not orthogonal are out"
+        f"{100 * options.share:g} %; samples whose 3×3 part is not orthogonal are not used"
     )
     figure = plot(
         lambda: sample_size_figure(sizes, options.share),
@@ -230,15 +230,16 @@ def _where_it_holds(findings: Findings) -> list[Block]:
                     "systematic error over the workspace",
                     "Systematic error to expect of the transform (RMS: of what the residuals show and of what they "
                     "leave open), in planes through the middle of the points, frame a. Dots: the points within an "
-                    "eighth of the plane; dashed: the box of all. Beyond it the model knows less and says more",
+                    "eighth of the plane; dashed: the box of all. Beyond it the model is less certain, and its errors "
+                    "are larger",
                 )
             )
     if reach is not None:
         middle = " ".join(f"{v:.1f}" for v in reach.middle)
         explained = (
             f"Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube "
-            "and tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed "
-            "about where errors come from"
+            "and tried on those of all; the points that it is fitted to are held out in turn. This makes no "
+            "assumption about the cause of errors"
         )
         place = plot(lambda: errors_figure(findings, reach), "errors by place", "Lengths of the residuals by place")
         blocks += [page_only(explained), *holds(reach), _cubes(reach), place]

@@ -160,7 +160,7 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
         if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # on one line theta is arbitrary
             notes.append(
                 f"joint {i + 1}: theta is {np.degrees(row.theta):.2f}°, {np.degrees(wanted.theta):.2f}° in the robot "
-                "file: its zero position is elsewhere"
+                "file: its zero position differs"
             )
     return notes
 
@@ -185,7 +185,7 @@ def _alone(data: Measurements, fits: list[AxisFit]) -> list[str]:
             what = called(name) if name else "rows without a target, beside rows with one"
             notes.append(
                 f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on "
-                "the flange rests on these alone; name it as the others, or leave it out"
+                f"the flange rests on these rows alone; name it like the others, or leave it out"
             )
     return notes
 

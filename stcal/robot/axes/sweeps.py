@@ -82,7 +82,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
 
 
 def called(target: str) -> str:
-    """Returns the name of a reflector in messages."""
+    """Returns the name by which messages refer to a reflector."""
     return f"reflector {target}" if target else "the reflector"
 
 

@@ -15,7 +15,7 @@ MAX_STEPS = 100
 SETTLED = 1e-10
 """Relative decrease of the cost below which the descent has converged."""
 HUBER_LEVEL = 0.999
-"""Probability that an honest observation has full weight: one in a thousand weighs less than one."""
+"""Probability that an observation without a gross error has full weight; one in a thousand has less."""
 USELESS_MM = 50.0
 """Largest σ of a determined direction (1 mm, or the rotation that moves the tool by 1 mm). Beyond it the nominal value
 is better. All parameters are held to their start by this σ, which determined directions do not feel."""

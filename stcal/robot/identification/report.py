@@ -287,7 +287,11 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
             "Held out: rows that took no part in the fit that they judge. σ: of the tool's position, by the "
             "covariance of the parameters"
         ),
-        plot(lambda: _figure(result), "Errors by row", "Error by observation; held out: mean over the divisions"),
+        plot(
+            lambda: _figure(result),
+            "Errors by row",
+            "Error by observation; held out: mean over the divisions into folds",
+        ),
         Notes(result.notes),
     ]
     rows = [
@@ -299,16 +303,16 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
     ]
     determined = [
         f"{result.rank} of {len(result.names)} parameters; these joint values determine: {kinds}",
-        listed("kept nominal, as the data leave it open", result.undetermined),
+        listed("kept nominal, as the data do not determine it", result.undetermined),
         fold("σ of the minimal parameters", Table(["<Parameter", "σ"], sigma)),
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
     good = result.weights >= OUTLIER_WEIGHT
     drawn = Drawn(result.state, result.robot.world_from_base, result.seen, result.residuals, good)
     nothing = (
-        "too few observations to tell what the residuals go with"
+        "too few observations to find what the residuals depend on"
         if result.left is None
-        else "nothing is seen that the residuals go with (joints, gravity, place)"
+        else "the residuals depend on nothing that was tested (joints, gravity, place)"
     )
     left = [residuals.sentence() for residuals in result.left or ()] or [nothing]
     return Document(
@@ -382,7 +386,7 @@ def _elastic_blocks(result: Identified) -> list[Block]:
     return [
         subheading("Elasticity"),
         page_only(
-            "What links give way by at the torques of the measured rows (RMS), and amplitudes of the gears and their "
+            "Deflection of the links at the torques of the measured rows (RMS), and amplitudes of the gears and their "
             "hysteresis"
         ),
         Table([*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])], rows),

@@ -56,7 +56,7 @@ from stcal.robot.kinematics.model import Elasticity, Robot
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 """Lower limit of the σ at the start; σ that are not given start at the misfit of the nominal robot."""
 TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
-"""σ of typical instruments; what joint values determine is told for these."""
+"""σ of typical instruments, for which it is decided what the joint values determine."""
 VARIANCE_ROUNDS = 10
 """Largest number of rounds of estimating σ. Two to four suffice for most data; a robot without noise needs the most."""
 VARIANCE_SETTLED, VARIANCE_UNSETTLED = 1e-3, 1e-2
@@ -237,8 +237,8 @@ def _enough(measured: Observed, state: State, rows: NominalRows) -> None:
 def _weighting(state: State, measured: Observed, options: IdentifyOptions) -> Weighting:
     """Returns the weighting at the start, and which σ are estimated from the residuals.
 
-    Where σ of all coordinates are given, they are weights, times σ₀. Where one of two σ is given, it is taken as it is.
-    The others start at the misfit, so that no observation is an outlier at the start.
+    If the σ of all coordinates are given, they are weights, and σ₀ multiplies them. If one of two σ is given, it is
+    taken as exact. σ that are not given start at the misfit, so that no observation is an outlier at first.
     """
     sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
     needed = ("rad", "mm") if measured.kind == "pose" else ("mm",)
@@ -286,7 +286,7 @@ def _without_errors(
     """Solves, removes gross errors, and solves again until the set of gross errors stays the same.
 
     ``good`` : (r,) mask of the observations that are no gross errors at the start. Huber weights bound an outlier's
-    pull, but each outlier pulls as hard as the worst honest observation, and no covariance shows it.
+    pull, but each outlier pulls as hard as the worst observation without a gross error, and no covariance shows it.
     """
     for _ in range(OUTLIER_ROUNDS + 1):
         adjustment = _settled(state, measured if good.all() else only_of(measured, good), options, known, rounds)
@@ -430,8 +430,8 @@ def _cross_validated(
 ) -> HeldOutRows | None:
     """Returns errors of rows that took no part in the parameters; None if the rows are too few.
 
-    Where rows are few, held-out rows take no part in the σ and in the search for gross errors either. Descents start at
-    the solution of all rows: the minimum is the same from everywhere, and near.
+    If there are few rows, held-out rows are not used for the σ and for the search for gross errors either. Each
+    iteration starts at the solution of all rows, which is near; the minimum does not depend on the start.
     """
     rows = len(measured)
     if min(options.folds, rows) < LEAST_FOLDS:

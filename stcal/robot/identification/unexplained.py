@@ -129,7 +129,7 @@ class _Found:
 class _Rest:
     """The part of whitened residuals (N,) that the fitted parameters do not explain.
 
-    ``errors`` : (r, w) as they are; ``before`` : (N,) whitened; ``fitted`` : (N, k) basis; ``remaining`` : (N,);
+    ``errors`` : (r, w), not whitened; ``before`` : (N,) whitened; ``fitted`` : (N, k) basis; ``remaining`` : (N,);
     ``square`` : squared length of the remaining residuals at first; ``freedom`` : degrees of freedom; ``rows`` : number
     of rows used; ``effects`` : candidates with their whitened motions (N, c).
     """

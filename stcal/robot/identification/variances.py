@@ -200,7 +200,7 @@ def estimated(
 def _kept(kind: Kind) -> float:
     """Returns the share of the square of normal residuals that is left when they are cut off at Huber's limit.
 
-    With this share (Huber's Proposal 2) outliers hardly move σ, and σ of honest observations is not too small.
+    With this share (Huber's Proposal 2) outliers hardly move σ, and without outliers σ is not too small.
     """
     width, limit = WIDTH[kind], huber_limit(kind) ** 2
     return float(chdtr(width + 2, limit) + limit / width * chdtrc(width, limit))

@@ -74,7 +74,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         return place if standard else place @ across(rows[i]).inverse()
 
     def end(i: int) -> Rigid:
-        """Returns the frame of joint i of ``chain`` in the frame at the end of its row."""
+        """Returns the pose of joint i of ``chain`` relative to the frame at the end of its row."""
         nominal_end = along(rows[i]) @ across(rows[i]) if standard else along(rows[i])
         return nominal_end.inverse() @ passed[i]
 

@@ -18,7 +18,7 @@ from stcal.robot.kinematics.conditions import loaded
 Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
 MOST_RAD = 2 * np.pi + 1e-6
-"""Largest angle of a row, beside the joint's: one that is larger is taken to be in degrees."""
+"""Largest angle of a row, except the joint's own, rad. A larger one is taken to be in degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +332,7 @@ class Robot(Brief):
         return np.array([[joint.lower, joint.upper] for joint in self.joints])
 
     def tool(self, name: str = "") -> Rigid:
-        """flange_from_tool of the tool ``name``; InputError where there is none."""
+        """Returns flange_from_tool of the tool ``name``; raises InputError if there is no such tool."""
         if name not in self.tools:
             known = ", ".join(repr(t) for t in self.tools)
             raise InputError("E-ROBOT-NO-TOOL", f"robot {self.name}: no tool {name!r}; there are {known}")

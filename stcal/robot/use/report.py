@@ -78,7 +78,7 @@ def verification_report(result: Verification) -> Document:
     answer = [
         alarms(result.warnings()),
         Table(["<set"] + ["mm", "less by"] * 4, rows, over),
-        "mean, std and max are of absolute errors, which all carry the error of the first position; the RMS over all "
+        "mean, std and max are of absolute errors, which all include the error of the first position; the RMS over all "
         "pairs depends less on any one",
         plot(
             lambda: verification_figure(result),
@@ -108,7 +108,7 @@ def compensation_report(result: Compensated, robot: Robot) -> Document:
     before = plot(
         lambda: _before_figure(result),
         "error of the nominal joint values",
-        "Position error of the nominal joint values by the identified robot: what compensation takes away",
+        "Position error of the nominal joint values by the identified robot: the error that compensation removes",
     )
     return Document(
         f"Compensation of {robot.name}",
@@ -172,7 +172,7 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
     sigma_sentence = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
     if np.isfinite(result.random_sigma_mm):
         sigma_sentence += (
-            f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good these would have to be "
+            f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good, these would have to be "
             f"{(result.random_sigma_mm / result.sigma_mm) ** 2:.2f} times as many"
         )
     unseen = result.parameters - result.seen
@@ -201,7 +201,7 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
                         "Larger is better. Of the Jacobian over the σ of the instrument, parameters in mm, an angle "
                         "being the arc that it makes at the arm's whole reach"
                     ),
-                    "collisions are not looked at: only joint limits and the box of the tool",
+                    "collisions are not checked: only joint limits and the box of the tool",
                     plots(
                         plot(
                             lambda: _index_figure(result),
@@ -358,22 +358,23 @@ def _wrong(result: Evaluation) -> list[str]:
     more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
     fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
     return [
-        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; wrong, or all models lack it"
+        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; the rows are "
+        "wrong, or all models lack something"
     ]
 
 
 def left_lines(each: Evaluated) -> list[str]:
     """Returns lines on the causes of a robot's residuals."""
     if each.left is None:
-        return ["too few rows to tell what the residuals go with"]
+        return ["too few rows to find what the residuals depend on"]
     if not each.left:
-        return ["nothing is seen that the residuals go with (joints, gravity, place)"]
+        return ["the residuals depend on nothing that was tested (joints, gravity, place)"]
     lines = [finding.sentence() for finding in each.left]
     if each.beyond is not None and not each.beyond:
-        lines.append("parameters identified from these rows would leave nothing of that to be seen")
+        lines.append("parameters identified from these rows would explain all of it")
     elif each.beyond:
         beyond = "; ".join(finding.what for finding in each.beyond)
-        lines.append(f"no parameters of the kinematics take up all of it; left is what goes with {beyond}")
+        lines.append(f"parameters of the kinematics do not explain all of it; what remains depends on {beyond}")
     return lines
 
 
@@ -482,8 +483,8 @@ def evaluation_report(result: Evaluation) -> Document:
         *_wrong(result),
         *_rigid(result),
         page_only(
-            "95 %: what 95 of 100 rows stay below. The median, and the lines without rows that no robot explains, are "
-            "not moved by a few bad rows"
+            "95 %: limit that 95 of 100 rows do not exceed. A few bad rows do not change the median, and the lines "
+            "without rows that no robot explains"
         ),
     ]
     place = plot(lambda: _place_figure(result), "Error by distance from the base's axis, and by height")

@@ -165,9 +165,9 @@ def adjusted(
     known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts;
     ``settled`` : largest predicted decrease of the last step, as a share of χ².
 
-    If ``common`` is None, the dots tell whether the board kept its shape between the groups (one plate) or not
-    (a film, a screen). First every group has its own deviations from the design. If these deviations agree, a common
-    shape is estimated next.
+    If ``common`` is None, the dots show whether the board kept its shape between the groups (one plate) or not (a film,
+    a screen). First every group has its own deviations from the design. If these deviations agree, a common shape is
+    estimated next.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def adjust_part(
 SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
 """Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
-"""Degrees of freedom that the stated σ of such faces stand for beside their deviations."""
+"""Degrees of freedom that the stated σ of such faces are worth, in addition to their deviations."""
 LEAST_FACTOR = 0.1
 """Smallest such factor: print may be better than stated, but is never exact."""
 

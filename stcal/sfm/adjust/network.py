@@ -1,7 +1,7 @@
 """The free network of one group with its cofactors: random variation of residuals, circles and further parameters.
 
 A fault is modelled by further parameters that the adjustment lacks: another camera, a face that moved in one image. The
-residuals alone tell whether these parameters are needed, to first order and without another adjustment (score test, Rao
+residuals alone show whether these parameters are needed, to first order and without another adjustment (score test, Rao
 1948; for one observation Baarda's data snooping, 1968).
 """
 

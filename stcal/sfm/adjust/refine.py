@@ -1,4 +1,4 @@
-"""Adjustment of one group: weighted bundle adjustment in turn with the circles' eccentricity."""
+"""Adjustment of one group: weighted bundle adjustment, alternating with the circles' eccentricity."""
 
 from dataclasses import dataclass, replace
 

@@ -12,7 +12,8 @@ from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, ImageObservations
 
 MAX_TAN = 2.75
-"""Largest tangent of the tilt (70°) of views that tell of a rim: beyond it the ellipse's short axis is a few pixels."""
+"""Largest tangent of the tilt (70°) of views that are used for a rim: beyond it, the short axis of the ellipse is a few
+pixels."""
 SECOND_ORDER = 0.085
 """Second-order share of the loss of radius, (h tan τ)²/r: of the ellipse that fits the lens-shaped area best."""
 MIN_VIEWS, MIN_SPREAD = 30, 0.15

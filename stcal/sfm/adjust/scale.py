@@ -18,7 +18,7 @@ MIN_DOTS = 4
 EDGE_SIGMA_PX = 0.1
 """σ of the shift that all edges of all tags share."""
 MIN_CORNERS = 3
-"""Smallest number of corners of a face of known shape that tell anything of it."""
+"""Smallest number of corners that determine the scale of a face of known shape."""
 ScaleSource = Literal["board", "faces", "distances", "drawing"]
 
 

@@ -181,7 +181,7 @@ def budget(
 
 
 def _placed(own: Derivatives) -> Source:
-    words = "not mapped; their places are the design's, off by as much as the mapped ones are"
+    words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
     size = own.circles.shape[-1]
     sigma = 1e3 * own.designed_sigma_mm
     return Source(

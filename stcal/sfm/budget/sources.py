@@ -59,8 +59,7 @@ class Statement:
 def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
     """Returns the statement of a run. The file overrides ``board.toml``, and ``given`` overrides fields of the file.
 
-    ``own`` : sizes that the run's ``board.toml`` states; ``path`` : file of ``--statement``; ``given`` : fields by
-    name.
+    ``own`` : values stated in the run's ``board.toml``; ``path`` : file of ``--statement``; ``given`` : fields by name.
 
     Raises InputError if the file is not a statement, or a field is too long.
     """
@@ -140,7 +139,7 @@ def sources_of(
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out.
 
     ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
-    intrinsics were adjusted; ``camera_given`` : False if the photographs alone told it.
+    intrinsics were adjusted; ``camera_given`` : False if the camera was found from the photographs.
     """
     zero = np.zeros_like(contributions.joint.covariance_mm2)
     common = contributions.joint.board_common
@@ -187,9 +186,10 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
         stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
-        words = "no size_sigma_mm" + ("; what moves the edges of all tags alike" if sigma else "; taken as exact")
+        edges = "a common displacement of the edges of all tags"
+        words = f"no size_sigma_mm; {edges if sigma else 'taken as exact'}"
         if by_statement:
-            words = "size_sigma_mm" + (", and what moves the edges of all tags alike" if largest.edge_share else "")
+            words = "size_sigma_mm" + (f", and {edges}" if largest.edge_share else "")
         ppm = 1e6 * sigma if sigma else None
         yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES])
     if known := known_distances(board):
@@ -271,7 +271,7 @@ def warmer_k(stated: StatedSize) -> float | None:
 
 
 def reference_temperature_c(stated: StatedSize) -> float:
-    """Returns the temperature for which a body's size is wanted: the one that is stated, or 20 °C."""
+    """Returns the temperature at which the size of a body is to be stated: the given one, or 20 °C."""
     return REFERENCE_C if stated.reference_temperature_c is None else stated.reference_temperature_c
 
 

@@ -155,7 +155,7 @@ CANDIDATES = (
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 AUTO = "auto"
-"""Name that stands for the model selected by :func:`choose_model`."""
+"""Name of the option value for which :func:`choose_model` selects the model."""
 LIKELY = 2.0
 """Number of standard errors by which a model with fewer parameters may be worse than the best and still be selected;
 after the one-standard-error rule, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""

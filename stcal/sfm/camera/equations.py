@@ -87,9 +87,9 @@ class BoardShape:
 
 MAX_STEPS = 200
 EXACTLY = 1e-15
-"""Largest relative decrease of χ² predicted for a step at convergence …"""
+"""Largest relative decrease of χ² that is predicted for a step at convergence."""
 SETTLED_PX = 1e-6
-"""… or largest move of a projection. Along a valley χ² may decrease forever without a visible change."""
+"""Largest move of a projection at convergence, px. Along a valley, χ² may decrease forever without a visible change."""
 TINY_PX = 1e-3
 """Focal length that stands for invalid parameters."""
 CREEPING_PX = 1e-3

@@ -156,9 +156,9 @@ MAX_ROUNDS = 20
 FLAT_AFTER = 2
 """Number of rounds after which σ are known well enough to test which boards are flat."""
 SETTLED_FACTOR = 0.005
-"""Rounds end when no variance component moves by more than this …"""
+"""Largest relative change of a variance component in the last round."""
 SETTLED_SHIFT_PX = 1e-5
-"""… and no eccentricity by more than this."""
+"""Largest change of an eccentricity in the last round, px."""
 LEAST_ROBUST = 1e-6
 """Smallest robust σ of normalised residuals, for exact data."""
 LEAST_DOTS = 0.1

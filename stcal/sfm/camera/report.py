@@ -284,8 +284,8 @@ def rig_report(rig: RigCalibration, where: str) -> Document:
                 [
                     *poses,
                     page_only(
-                        "The pose of the first camera in the other. σ are of turns about the axes, and of shifts "
-                        "along the axes, of the frame named first"
+                        "The pose of the first camera in the other. σ are those of rotations about the axes, and of "
+                        "translations along the axes, of the frame named first"
                     ),
                     plot(
                         lambda: _arrangement(rig),

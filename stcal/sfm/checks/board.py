@@ -25,7 +25,7 @@ EDGE_DIFFERENCE_PX = 0.01
 RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5
-"""Smallest number of circles of one design radius among which one can stand out."""
+"""Smallest number of circles of one design radius that are compared with each other."""
 MAD_EFFICIENCY = 0.37
 """Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
 
@@ -123,7 +123,7 @@ def radius_checks(radii: Radii) -> list[Check]:
         "one, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
-        judge("radius", "Radius of each circle against those made alike", single, "circles", single_remedy),
+        judge("radius", "Radius of each circle against others of its design radius", single, "circles", single_remedy),
         judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
     ]
 
@@ -150,7 +150,7 @@ def rim_check(
     if not has_circles:
         return impossible(key, title, "corners alone, which have no rim", "")
     if not rims:
-        return impossible(key, title, "too few tilts of circles to tell", "photograph faces from several angles")
+        return impossible(key, title, "too few different tilts of circles", "photograph faces from several angles")
     measured, names, reasons, settled = [], [], [], []
     for kind, rim in rims.items():
         limit = max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
@@ -171,7 +171,7 @@ def rim_check(
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
         return Check(key, title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
     remedy = (
-        "faces are where their circles seem to lie; for the luminous surface run with --rim, or state rim_mm in "
+        "faces are where their circles appear; for the luminous surface, run with --rim, or state rim_mm in "
         "target.toml, of dots in board.toml"
     )
     return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
@@ -280,8 +280,8 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
 
     Positions: a similarity maps the design to the circles of each face, and its residuals give the σ of their
     placement. Radii: the slope of measured over designed radii, which a constant bias of the edges does not change. The
-    weighted mean of both is tested, with 100 ppm as σ of the target's own size beside that of the result. Without a
-    board (``has_board``) the result has its size from printed faces or known distances.
+    weighted mean of both is tested, with 100 ppm as σ of the target's own size, in addition to that of the result.
+    Without a board (``has_board``) the result has its size from printed faces or known distances.
     """
     if target.up_to_scale:
         return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
@@ -295,8 +295,8 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
     freedom = sum(m.freedom for m in measures)
     remedy = (
-        "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and all distances of "
-        "the result with it: measure the board over its full length with a calliper"
+        "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and so are all "
+        "distances of the result: measure the board over its full length with a calliper"
         if has_board
         else "printed sizes or known distances in target.toml do not fit the circles there, and all distances of the "
         "result may be wrong with them: measure a side of each print with a calliper"

@@ -21,7 +21,7 @@ from stcal.sfm.checks.verdict import FAILED, Check, Measured
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8
-"""Least share, of what the best hypothesis explains, of one that is preferred for its fewer parameters."""
+"""A hypothesis with fewer parameters is preferred if it explains at least this share of what the best one explains."""
 MOST_IMAGES = 60
 """Largest number of images of a group in which parameters of single images are fitted; more take minutes."""
 FIXED_WITHIN = 0.2
@@ -32,7 +32,7 @@ ALONE = 0.93
 """Share of what all images explain at which a few explain it alone; of random changes in all of them they have 0.5 to
 0.87."""
 LEAST_SHIFT_PX = 3.0
-"""Smallest change of the principal point at which photographs that were turned by 180° can be told."""
+"""Smallest change of the principal point that reveals photographs turned by 180°."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +209,7 @@ def _listed(names: Sequence[str]) -> Callable[[np.ndarray, np.ndarray], str]:
     return lambda value, _: ", ".join(f"{name} {v:+.2g}" for name, v in zip(names, value, strict=True))
 
 
-ANEW = "calibrate the camera anew with this lens, zoom and focus, or run with --refine-camera"
+ANEW = "calibrate the camera again with this lens, zoom and focus, or run with --refine-camera"
 
 
 def _hypotheses(camera: Camera) -> list[_Cause]:
@@ -226,19 +226,19 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
 
     causes = [
         _Cause("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
-               f"file is of another lens: {ANEW}", _percent("focal length"), by(focal)),
-        _Cause("the photographs are scaled against the camera file", "give the photographs in the size of the "
-               "calibration, or scale focal length and principal point in the camera file alike", _percent("size"),
-               by(scaled)),
-        _Cause("width and height are scaled unlike", "the photographs were resized without keeping their proportions, "
-               "or fx and fy of the camera file are wrong: give the original photographs", _percent("fx over fy"),
-               by(fx * unit[:, [0]])),
-        _Cause("the principal point is not that of the camera file", "the photographs are cropped, or of another "
-               f"sensor: give them whole, or correct cx and cy in the camera file; or {ANEW}",
+               f"file belongs to another lens: {ANEW}", _percent("focal length"), by(focal)),
+        _Cause("the photographs are scaled relative to the camera file", "use the photographs at the size of the "
+               "calibration, or scale focal length and principal point in the camera file by the same factor",
+               _percent("size"), by(scaled)),
+        _Cause("width and height are scaled differently", "the photographs were resized without keeping their "
+               "proportions, or fx and fy of the camera file are wrong: use the original photographs",
+               _percent("fx over fy"), by(fx * unit[:, [0]])),
+        _Cause("the principal point is not that of the camera file", "the photographs are cropped, or from another "
+               f"sensor: use them uncropped, or correct cx and cy in the camera file; or {ANEW}",
                _listed(("cx", "cy")), by(unit[:, 2:4])),
         _Cause("the distortion is not that of the camera file", f"another lens or focus, or its signs or order are "
                f"wrong in the file: {ANEW}", _listed(("k1", "k2", "p1", "p2")), by(unit[:, 4:8])),
-        _Cause("the intrinsics are not those of the camera file", f"the camera file is of another camera: {ANEW}",
+        _Cause("the intrinsics are not those of the camera file", f"the camera file belongs to another camera: {ANEW}",
                _listed(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")), by(unit[:, :8])),
         _Cause("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom and "
                "focus, and take the photographs again; or run each group with a camera file of its own",
@@ -248,13 +248,13 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                "image"),
         _Cause("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, or "
                "stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
-        _Cause("the target moved against the board", "sort the images into groups between which nothing moved, or take "
-               "them again", lambda value, _: "in more than one image", _by_motion, "image"),
+        _Cause("the target moved relative to the board", "sort the images into groups in which nothing moved, or "
+               "take them again", lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
         causes.append(
             _Cause("the photographs are already undistorted", "the camera file has a distortion that they no longer "
-                   "have: give the original photographs, or set the distortion in the camera file to 0",
+                   "have: use the original photographs, or set the distortion in the camera file to 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    "not in them", by(removed), whole=True)
         )  # fmt: skip
@@ -266,8 +266,8 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                    by(np.hstack([removed, unit[:, :4]])), whole=True)
         )  # fmt: skip
         causes.append(
-            _Cause("the distortion of the camera file has its sign reversed", "its program undistorts where this one "
-                   "distorts: change the signs of all coefficients in the camera file",
+            _Cause("the distortion of the camera file has its sign reversed", "the program that wrote it undistorts "
+                   "where this one distorts: change the signs of all coefficients in the camera file",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way",
                    by(2 * removed), whole=True)
         )  # fmt: skip
@@ -275,8 +275,8 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
         turned = _turned(camera, quarters)[:, None] - camera.parameters()[:, None]
         if np.abs(turned[2:4]).max() > LEAST_SHIFT_PX:
             causes.append(
-                _Cause(f"the photographs are turned by {90 * quarters}° against the camera file", "turn them back, as "
-                       "the sensor has them, without the rotation that a viewer or converter applied",
+                _Cause(f"the photographs are turned by {90 * quarters}° relative to the camera file", "use "
+                       "them as the sensor recorded them, without the rotation that a viewer or converter applied",
                        lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
             )  # fmt: skip
     return causes

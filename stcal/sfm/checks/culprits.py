@@ -31,7 +31,7 @@ class Guilt:
         if self.culprits:
             return ""
         if self.rivals:
-            return f"{self.where}: leaving out {' or '.join(self.rivals)} cures it alike"
+            return f"{self.where}: leaving out {' or '.join(self.rivals)} cures it as well"
         return f"{self.where}: leaving out less than half of them does not cure it"
 
 

@@ -93,7 +93,7 @@ def _difference(a: Rigid, b: Rigid) -> np.ndarray:
 
 
 def halves_check(again: Again) -> Check:
-    """Compares two results from two halves of the images of every group, taken in turn.
+    """Compares the results from two halves of the images; each half has every second image of every group.
 
     The difference is tested against the sum of both covariances. The board's own deviations are common to both halves,
     which makes the test a little milder.
@@ -109,7 +109,7 @@ def halves_check(again: Again) -> Check:
     try:
         (first, joint), (second, second_joint) = (again.posed(joint, faces) for joint in joints)
     except StcalError as error:
-        return impossible(key, title, f"half of the images do not hold the result ({error})", "add images")
+        return impossible(key, title, f"half of the images do not determine the result ({error})", "add images")
     redundancy = joint.redundancy + second_joint.redundancy
     trials = []
     for face in faces[1:]:
@@ -176,7 +176,7 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
         return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
     remedy = (
         "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
-        "the faces in further groups, which tell the one that is wrong"
+        "the faces in further groups, which show which one is wrong"
     )
     return replace(check, reason=f"{check.reason}; {guilt.words()}", names=(), remedy=remedy)
 

@@ -47,15 +47,15 @@ def camera_check(
     (score test). If they were refined, their distance from the given ones is tested against the stated σ.
 
     ``prior`` : prior of the intrinsics if they were refined. The stated σ of a camera file does not excuse intrinsics
-    that were held fixed, as the σ of the faces do not include it. ``given`` : False if the photographs alone told the
-    camera, so that there is nothing to test.
+    that were held fixed, as the σ of the faces do not include it. ``given`` : False if the camera was found from the
+    photographs, so that there is nothing to test.
     """
     key, title = "camera", "Intrinsics against the images"
     if not given:
         return impossible(key, title, "no camera file: the intrinsics were found from these photographs", "")
     remedy = (
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
-        "--refine-camera, or calibrate the camera anew"
+        "--refine-camera, or calibrate the camera again"
     )
     if prior is not None and calibration.joint is not None:  # the options of a run ensure the latter
         change = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
@@ -78,7 +78,7 @@ def camera_check(
         for name, value, s in zip(names, estimate, sigma, strict=True)
     )
     values = ", ".join(f"{m.name} {m.value:+.2g}" for m in single if abs(m.value) > (m.limit or 0))
-    reason = f"{check.reason}; images ask for {values}" if check.names and values else check.reason
+    reason = f"{check.reason}; the images suggest {values}" if check.names and values else check.reason
     return Check(key, title, check.verdict, reason, check.measured + single, 1, check.names, check.remedy)
 
 
@@ -164,9 +164,7 @@ def image_check(networks: Sequence[Network]) -> Check:
                 Trial(name, float(np.sqrt(ratio)), "×", ratio * round(redundancy[i]), round(redundancy[i]), others)
             )
     check = judge("image-residuals", "Residuals of each image against its group", trials, "images", "")
-    remedy = (
-        "a blurred image, or one in which something stood elsewhere: look at its overlay, take it out and run again"
-    )
+    remedy = "a blurred image, or one in which something had moved: look at its overlay, leave it out, and run again"
     return _take_out(check, remedy)
 
 
@@ -188,7 +186,7 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
         sigma |= {name: float(np.median(away[r])) for name, r in zip(model.images, model.rows_by_image(), strict=True)}
         log_blur = {name: np.log(blur_px[name]) for name in model.images if blur_px.get(name, 0) > 0}
         blur |= {name: float(value - np.median(list(log_blur.values()))) for name, value in log_blur.items()}
-    remedy = "blurred, out of focus or dark: take the image again; its centres have little weight, no harm is done"
+    remedy = "blurred, out of focus or dark: take the image again; its centres have little weight and do no harm"
     trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
     return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
 
@@ -219,7 +217,7 @@ def evenness_check(
         chance = float(bdtrc(count - 1, len(shifts), UNEVEN_BY_CHANCE)) if count else 1.0
         trials.append(Trial(label, float(np.mean(shifts)), "µm", float(chdtri(1, chance)), 1))
     remedy = (
-        "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, look at "
+        "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, check "
         "their light; their centres are measured by a wider model, with a larger σ"
     )
     return judge(key, title, trials, "circles", remedy, "suspicious")
@@ -239,7 +237,7 @@ def _dull(values: dict[str, float], unit: str) -> list[Trial]:
 
 
 def moved_check(networks: Sequence[Network]) -> Check:
-    """Tests whether the target moved against the board, one image against all others.
+    """Tests whether the target moved relative to the board, one image against all others.
 
     In every image all faces together may be shifted and turned against the board. Whether this motion is needed is a
     test with six degrees of freedom.
@@ -274,8 +272,8 @@ def moved_check(networks: Sequence[Network]) -> Check:
         if any(network.model.images[i] in check.names for i in tested)
     ]
     remedy = (
-        "in these images the target stood elsewhere against the board than in the others of the group: sort the images "
-        "into groups between which nothing moved, or take the group again; of a single one, run without it"
+        "in these images the target stood at another place relative to the board than in the others of the group: sort "
+        "the images into groups in which nothing moved, or take the group again; leave out a single image"
     )
     causes = "target or board moved between these images, or zoom or focus changed: take the group again"
     return with_culprits(check, guilt, remedy, causes)
@@ -310,9 +308,7 @@ NEARLY_ALL = 0.7
 def _take_out(check: Check, remedy: str) -> Check:
     """Returns the check with the remedy and the option that excludes the worst image, if it names one."""
     if len(check.names) > max(NEARLY_ALL * check.tested, 1):
-        common = (
-            "nearly all images, so that none is to be taken out: look for what they have in common, first the camera"
-        )
+        common = "nearly all images, so do not leave any out: look for what they have in common, first the camera"
         return replace(check, names=(), remedy=common)
     return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check
 
@@ -355,8 +351,8 @@ def labels_check(
         words = [f"{MANY} or more of image {', '.join(lost)}"] * bool(lost) + [w for own in guilt if (w := own.words())]
         reason = f"{len(outliers)} left out, {'; '.join(words)}"
         remedy = (
-            "in these images the target stood elsewhere against the board, or they are of another group: take them "
-            f"out, the first with {without_image(lost[0])}"
+            "in these images the target stood at another place relative to the board, or they belong to another group: "
+            f"leave them out, the first with {without_image(lost[0])}"
             if lost
             else "target or board moved between the images of a group, or zoom or focus changed: take it again"
         )
@@ -376,7 +372,7 @@ def labels_check(
 
 
 def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]) -> list[Guilt]:
-    """Returns the culprits of each group of which an image lost :data:`MANY` centres or more."""
+    """Returns the culprits of each group in which an image lost :data:`MANY` centres or more."""
     count = Counter(o.image for o in outliers)
     found = []
     for network in networks:

@@ -52,9 +52,9 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
             if variance > 0:
                 trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
     if not trials:
-        return impossible(key, title, "one source of the scale alone", "state a known distance with scale")
+        return impossible(key, title, "only one source of the scale", "state a known distance with scale")
     remedy = (
-        "one print, distance or board is of another size than stated: measure a side of each print and correct "
+        "one print, distance or board has another size than stated: measure a side of each print and correct "
         "target.toml, or state size_sigma_mm"
     )
     return judge(key, title, trials, "sources of the scale", remedy)

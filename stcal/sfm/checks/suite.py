@@ -62,7 +62,7 @@ class Evidence:
     ``models`` : adjusted models of the single groups, without unit; ``outliers`` : observations left out of the models;
     ``images`` : all observations; ``camera`` : as given; ``prior`` : of the intrinsics if they were refined;
     ``blur_px`` : blur of the edges by image, may be empty; ``rim`` : whether rims are estimated for the result;
-    ``camera_given`` : whether there is a camera file, or the photographs alone told the camera.
+    ``camera_given`` : False if there is no camera file and the camera was found from the photographs.
     """
 
     models: tuple[WorldModel, ...]
@@ -202,7 +202,12 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         "values or of contours need another correction"
     )
     trial = Trial(
-        "share of the eccentricity found, less 1", float(test.estimate[0]), "", test.statistic, test.freedom, redundancy
+        "share of the eccentricity found, minus 1",
+        float(test.estimate[0]),
+        "",
+        test.statistic,
+        test.freedom,
+        redundancy,
     )
     check = judge(key, CONTROL, [trial], "corrections", remedy)
     try:

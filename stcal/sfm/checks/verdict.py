@@ -186,7 +186,7 @@ def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
     """Returns the checks in the order in which to read them, the worst first.
 
     Among equal verdicts the cause of the whole set comes first, then those that name an image: it may be the reason why
-    the others fail. Those that do not tell what is wrong come last.
+    the others fail. Those that cannot name the cause come last.
     """
     later = {verdict: not_first(check.key for check in checks if check.verdict == verdict) for verdict in ORDER}
 

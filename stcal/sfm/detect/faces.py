@@ -22,13 +22,14 @@ NEIGHBOURS_IN_IMAGE = 12
 PAIR_TOLERANCE = 0.3
 """Relative tolerance of distance and size of a pair after the map of one ellipse to a circle."""
 SUPPORT = 5
-"""Number of nearest circles that are predicted from a pair …"""
+"""Number of nearest circles that are predicted from a pair."""
 MIN_SUPPORT = 2
-"""… and the number of them that must be present before the hypothesis is grown."""
+"""Number of the predicted circles that must be present before the hypothesis is grown."""
 FIRST_HYPOTHESES = 300
-"""Number of the best supported hypotheses of an image that are all grown, so that rivals compete; of the others …"""
+"""Number of the best supported hypotheses of an image that are all grown, so that rivals compete."""
 MAX_TRIES = 8
-"""… this many are grown from each outline without a reading, as a dim face ranks behind all clutter."""
+"""Number of further hypotheses that are grown from each outline without a reading, as a dim face ranks behind all
+clutter."""
 AT_ONCE = 32
 """Number of hypotheses that are grown side by side, ahead of their turn."""
 MAX_CONTRAST_RATIO = 4.0

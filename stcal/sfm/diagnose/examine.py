@@ -56,10 +56,10 @@ PROGRESS = (
     "outline_deviation",
     "",
 )
-"""Gates of an outline in their order. Of several outlines of a circle, the one that passed most gates decides, …"""
+"""Gates of an outline in their order. Among several outlines of a circle, the one that passed most gates decides; among
+several of these, the one that is closest to its limit."""
 NEEDED = ("min_axis_ratio", "min_diameter")
-"""… and among these the one closest to its limit. The limit is the least needed for these gates, the most allowed for
-others."""
+"""Gates whose limit is a lower bound; that of the other gates is an upper bound."""
 
 
 @dataclass(frozen=True, slots=True)

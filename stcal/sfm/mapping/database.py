@@ -103,7 +103,7 @@ def remove_database(path: Path) -> None:
 
 
 def _write(database, camera, observations, pairs, keypoints_px) -> None:
-    """Writes row by row. A transaction of COLMAP ends the process where the disk is full."""
+    """Writes row by row, since a transaction of COLMAP ends the process if the disk is full."""
     native = colmap_camera(camera)
     database.write_camera(native, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=RIG_ID)

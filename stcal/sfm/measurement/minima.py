@@ -16,8 +16,8 @@ from stcal.sfm.data.patterns import CircleImages, project_circles
 from stcal.sfm.measurement.target import TargetCircles
 
 SETTLED = 1e-4
-"""Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and the
-two steps that weigh the centres anew are still to come. A second solution with a large χ² needs no better accuracy."""
+"""Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and two
+steps with new weights of the centres follow. A second solution with a large χ² needs no better accuracy."""
 HOPELESS = 500.0
 """Excess in χ² that no weights can make up for."""
 

@@ -29,7 +29,7 @@ from stcal.sfm.measurement.service import Setting as Setting
 LOCALHOST, PORT = "127.0.0.1", 8765
 MAX_MEGABYTES = 64.0
 PATIENCE_S = 30.0
-"""Time for the head of a request, in which a client may be silent, s; and for its body beside its length."""
+"""Time for the head of a request, during which a client may be silent, and fixed part of the time for its body, s."""
 SLOWEST = 100_000
 """Least rate at which a body comes, bytes a second."""
 CONNECTIONS, CONNECTIONS_EACH = 256, 64
@@ -243,7 +243,7 @@ class _Connection:
         self.writer.transport.abort()
 
     def refuse_at_once(self, reason: str) -> None:
-        """Answers that the service is busy, as far as the client can be told, and ends the connection."""
+        """Answers that the service is busy, if the client can still receive an answer, and ends the connection."""
         self.server.counts[BUSY] += 1
         with suppress(h11.LocalProtocolError, OSError):
             self._write(refusal(BUSY, "E-SERVICE-BUSY", reason), closing=True)

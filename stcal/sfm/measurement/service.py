@@ -25,9 +25,10 @@ from stcal.sfm.measurement.tracker import Tracker
 SEQUENCES = 1024
 """Number of sequences followed at a time. With more, the least recent is forgotten, and searched as a whole again."""
 WAITING = 8
-"""Number of images that may wait for each process, those of a sequence included. More are refused."""
+"""Number of images that may wait for each process, including those of a sequence. Further ones are refused."""
 OTHERS_S = 10.0
-"""Time for which a client that has sent an image counts as another one beside whom none may have all processes, s."""
+"""Time, s, for which a client counts as active after it has sent an image. While another client is active, none may
+occupy all processes."""
 LONGEST_NAME = 255
 DONE, NO_POSE, REFUSED, FAILED, BUSY = 200, 422, 400, 500, 503
 """Status codes of HTTP."""
@@ -105,7 +106,7 @@ class MeasureService:
         name : name of the image, for the answer
         sequence : name of the sequence whose next image it is; empty for a single image
         left : returns whether the client has gone, so that an image that still waits need not be measured
-        client : who sends it; beside others none has all processes
+        client : the sender; while others are active, it cannot occupy all processes
 
         Returns
         -------

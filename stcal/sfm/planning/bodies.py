@@ -211,8 +211,8 @@ ROLLS_DEG = (0.0, 90.0)
 def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
     """Returns candidates for further photographs of a body: each shows two faces that one view can show together.
 
-    A view is told from the nearest photograph, as the way of the camera about the middle of the body. To turn the body
-    the other way is the same.
+    A view is described relative to the nearest photograph, as the motion of the camera about the middle of the body. To
+    turn the body the other way is the same.
     """
     target_from_face = setup.start.target_from_face
     faces = [face for face in setup.target.faces if face.id in target_from_face]

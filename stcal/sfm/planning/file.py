@@ -276,7 +276,7 @@ def plan_text(plan: Plan, noise: str) -> str:
             "(--margin-mm, or outline_mm in target.toml)"
         )
     if plan.setup.board.rows:
-        lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
+        lines.append("the random places of board and cameras (--seed) change it by about ±3 %")
     else:
         lines.append(
             "which faces the photographs happen to show (--seed) makes about ±20 % of many photographs, and up to a "
@@ -311,7 +311,7 @@ _HOW_TO_GO = (
 )
 _HOW_TO_TURN = (
     "go right and up as seen in the photograph named, about the middle of the body, or turn the body the other way;",
-    "it is to be in the middle of the image, mm away; degrees of faces are from their normal",
+    "it must be in the middle of the image, mm away; degrees of faces are from their normal",
 )
 
 
@@ -321,8 +321,8 @@ def advice_text(advice: Advice) -> str:
     lines = [*forecast_table(advice.now, advice.shares), f"worst is face {worst}, {MICRO * sigma:.2f} µm"]
     if advice.board_dominates:
         lines.append(
-            f"{100 * advice.shares[worst]['board']:.0f} % of its variance is the board's: further views will help "
-            f"little; with a board of half the σ: {MICRO * advice.better_board.worst()[1]:.2f} µm"
+            f"{100 * advice.shares[worst]['board']:.0f} % of its variance comes from the board: further views will "
+            f"help little; with a board of half the σ: {MICRO * advice.better_board.worst()[1]:.2f} µm"
         )
     lines += ["", f"further views, one after the other, the best of {advice.tried}:"]
     lines.append(f"{'group':>6}  {'from':<20} {'go':<22} {'mm':>5}  worst face, µm")
@@ -341,7 +341,7 @@ def advice_text(advice: Advice) -> str:
         lines.append("none: no other view within ±50° shows the whole board and a face")
     lines += _HOW_TO_GO if advice.has_board else _HOW_TO_TURN
     if advice.new_groups:
-        lines += ["", "faces not photographed together yet, with the board beside them, as a new group:"]
+        lines += ["", "faces not yet photographed together, with the board next to them, as a new group:"]
         for pair in advice.new_groups:
             lines.append(
                 f"  faces {pair.faces[0]} and {pair.faces[1]}, {pair.images} images: worst is face {pair.face}, "

@@ -50,8 +50,8 @@ def crosscheck_section(check: dict) -> list[Block]:
         alarms([f"They differ: {'; '.join(check['differences'])}."]) if check["differences"] else "They agree",
         Table(["<Model", "Images", "Residual RMS (px)"], models),
         subheading("Faces"),
-        "Differences in the target frame: the two programs' models as COLMAP adjusts them; the native models after "
-        "our own adjustment against this result; and without it. σ is the difference in the run's own standard "
+        "Differences in the target frame: the two programs' models as COLMAP adjusts them; the native models against "
+        "this result, after our own adjustment and without it. σ is the difference in the run's own standard "
         f"deviations. Allowed in the first two: {', '.join(allowed)}; the third shows what weights and the joint "
         "adjustment are worth",
         Table(
@@ -64,7 +64,7 @@ def crosscheck_section(check: dict) -> list[Block]:
         Table(["<Face", "Circles", "Mean (µm)", "Max (µm)", "<Worst"], circles),
         fold("Circle by circle", Table(["<Circle", "Difference (µm)", "σ"], single)),
         subheading("Cameras"),
-        "Native against pycolmap, against the target, and in σ of the camera in its group. They matter where faces "
+        "Native against pycolmap, against the target, and in σ of the camera in its group. They matter only if faces "
         f"move with them, which the table of faces shows{largest}",
         fold("Camera by camera", Table(["<Image", "Position (µm)", "Rotation (mdeg)", "σ"], cameras)),
         *check["notes"],
@@ -104,8 +104,8 @@ def checks_section(checks: list[dict]) -> list[Block]:
     counts = count_verdicts([check["verdict"] for check in checks])
     columns_measured = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
     return [
-        f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds of one check, however "
-        "many images or points it tested",
+        f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds for one check, however "
+        f"many images or points it tested",
         Table(heads, open_, css="text"),
         fold(f"{len(others)} checks that passed or were not possible", Table(heads, others, css="text")),
         fold("What was measured", Table(columns_measured, measured, css="text")),
@@ -144,9 +144,9 @@ def published_section(comparison: dict) -> list[Block]:
     """Returns the gain of each step from the published method to this result."""
     heads, rows = comparison_cells(comparison)
     return [
-        "The same photographs by the method of Zhang & Wei (2017) as published, and with one step of this package "
-        "more in each row: the last is this result, all with three-point frames. Faces: how far the origin is off the "
-        "last row's. Beside σ of the last row that tells what each step is worth here",
+        "The same photographs by the method of Zhang & Wei (2017) as published, and with one more step of this "
+        "package in each row. The last row is this result. All have three-point frames. Faces: distance of the origin "
+        "from that of the last row. Compared with σ of the last row, it shows what each step is worth here",
         Table(heads, rows),
         alarms([f"{row['method']}: {row['reason']}." for row in comparison["rows"] if row["reason"]]),
     ]

@@ -23,7 +23,7 @@ TAIL = 2.0
 PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0
-"""Relative σ from which on it is stated in %."""
+"""Relative σ, in ppm, from which it is stated in %."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 QUESTIONS = {
@@ -36,7 +36,7 @@ Use = Literal["yes", "with care", "no"]
 CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
 GENERAL = ("centres", "agreement", "halves")
-"""Keys of the checks that tell that something is wrong and not what. Other checks are said before them."""
+"""Keys of the checks that show that something is wrong, but not what. Other checks are named before them."""
 EXPLAINED_BY = {
     "radius-design": ("rim",),
     "groups": ("board", "board-lines", "flatness"),
@@ -80,7 +80,7 @@ class Judgement(Part):
     """Section ``judgement`` of ``report.json``."""
 
     verdict: Use = Field(description="`yes`; `with care`; `no`")
-    use: str = Field(description="may I use it, in words")
+    use: str = Field(description="whether the result may be used, in words")
     quality: str = Field(description="how good is it: largest σ of position and rotation, and of the size")
     limit: str = Field(description="what limits it")
     next: str = Field(description="what to do next")
@@ -88,11 +88,11 @@ class Judgement(Part):
         description="largest σ of a face's position along an axis; null without covariances and after *no*, as the "
         "next three"
     )
-    position_face: str | None = Field(description="face that it is of")
+    position_face: str | None = Field(description="name of that face")
     rotation_sigma_mdeg: float | None = Field(description="largest σ of a face's rotation about an axis")
-    rotation_face: str | None = Field(description="face that it is of")
-    invalid: list[str] = Field(default=[], description="what does not hold, as checks failed that it rests on")
-    missing: list[str] = Field(default=[], description="faces that were to be there, and groups, that are not in it")
+    rotation_face: str | None = Field(description="name of that face")
+    invalid: list[str] = Field(default=[], description="what is invalid, because checks failed on which it rests")
+    missing: list[str] = Field(default=[], description="expected faces, and groups, that are not in the result")
 
     def answers(self) -> list[tuple[str, str]]:
         """Returns the questions with their answers, in order."""
@@ -192,7 +192,7 @@ def _by_result(report: dict) -> tuple[Use, str]:
     checks = [check for check in report.get("checks", []) if check["key"] != CAUSE]
     counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
     if not report["faces"]:
-        return "no", "No: there is no face in it, λ and residuals of the board alone."
+        return "no", "No: there is no face in it, only λ and residuals of the board."
     if _control(report):
         return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
     made = len(checks) - counts["not possible"]
@@ -214,7 +214,7 @@ def _by_result(report: dict) -> tuple[Use, str]:
     if report["summary"]["sigma0"] is None:
         return (
             "with care",
-            "With care: groups were solved one by one; there are no σ, and fewer checks.",
+            "With care: groups were solved one by one; there are no σ, and there are fewer checks.",
         )
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     n = counts["not possible"]
@@ -280,7 +280,7 @@ def _gaps(report: dict) -> list[str]:
     single = [name for name, face in report["faces"].items() if face["images"] == 1]
     if single:
         words.append(f"face {join(single)} rests on one image")
-    words += [f"{group} was left out whole" for group in _lost_groups(report)]
+    words += [f"{group} was left out completely" for group in _lost_groups(report)]
     return words
 
 
@@ -303,10 +303,10 @@ def _unknown(report: dict, invalid: list[str]) -> str:
     if not report["faces"]:
         return _quality(report, None, None)
     if invalid:
-        return f"That cannot be told: {join(invalid)} do not hold before what failed is put right."
+        return f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
     if _control(report):
-        return "That cannot be told: biased faces have no σ that holds."
-    return "That is not told of a part: what was to be measured is not all there."
+        return "That is unknown: biased faces have no valid σ."
+    return "No σ are given for a part: what was to be measured is not all there."
 
 
 def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
@@ -318,10 +318,10 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
     if position is None or rotation is None:
         ways = [chain for chains in report["chains"].values() if len(chains) > 1 for chain in chains]
         if not ways:
-            return "There are no σ, and no face is reached in two ways that could be compared."
+            return "There are no σ, and no face is reached by two chains that could be compared."
         apart, turned = (max(way[key] for way in ways) for key in ("translation_um", "rotation_mdeg"))
         return (
-            f"There are no σ; ways to the same face through different groups are up to {number(apart, 1)} µm and "
+            f"There are no σ; chains to the same face through different groups are up to {number(apart, 1)} µm and "
             f"{number(turned, 2)} mdeg off their mean."
         )
     size = report["summary"]["scale_sigma_ppm"]
@@ -368,10 +368,10 @@ def _control(report: dict) -> _Cause | None:
             "Look at the overlays; where a face is in view, give its design with --target.",
         )
     if options["solve"] == "paper":
-        return _Cause("The published method: contours, alike in weight, without the eccentricity of circles.",
+        return _Cause("The published method: contours with equal weights, without the eccentricity of circles.",
                       "Run it without --solve paper.")  # fmt: skip
     if not options["eccentricity"]:
-        return _Cause("The eccentricity of circles is left in.", "Run it without --no-eccentricity.")
+        return _Cause("The eccentricity of circles is not corrected.", "Run it without --no-eccentricity.")
     return None
 
 
@@ -389,7 +389,8 @@ def _by_checks(report: dict) -> _Cause | None:
             limits = _by_gaps(report) or _by_size(report) or _by_sigma(report)
             return _Cause(limits.limit, f"{found} {remedy}")  # what is suspicious is to be looked at; σ still tell
     if different := report.get("crosscheck", {}).get("differences"):
-        return _Cause(f"The native COLMAP differs: {different[0]}.", "Look at the cross-check: which of both is right?")
+        remedy = "Look at the cross-check to see which of the two is right."
+        return _Cause(f"The native COLMAP differs: {different[0]}.", remedy)
     return None
 
 
@@ -397,7 +398,7 @@ def _by_gaps(report: dict) -> _Cause | None:
     """Returns the cause where faces are missing that were to be there; None if all are."""
     if missing := _missing_faces(report):
         return _Cause(
-            f"Face {join(missing)} was to be photographed and is not in the result.",
+            f"Face {join(missing)} should have been photographed, and is not in the result.",
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
     return None
@@ -417,10 +418,11 @@ def _by_size(report: dict) -> _Cause | None:
 def _by_sigma(report: dict) -> _Cause:
     """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
     if len(report["faces"]) == 1:
-        return _Cause("There is one face only, which nothing links.", "Photograph it together with others.")
+        remedy = "Photograph it together with other faces."
+        return _Cause("There is only one face, and nothing links it to others.", remedy)
     found = _largest(report, "translation_sigma_um")
     if found is None:
-        return _Cause("What limits it cannot be told without σ.", "Run it with --solve joint.")
+        return _Cause("What limits it is unknown without σ.", "Run it with --solve joint.")
     sigma, worst = found
     face = report["faces"][worst]
     axis = face["translation_sigma_um"].index(sigma)
@@ -450,7 +452,7 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
     not known."""
     summary, advice = report["summary"], "`stcal-sfm advise RUN` says which do most."
     if not variance:
-        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` tells it, and {advice}")
+        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")
     centre = summary.get("circle_sigma_px")
     of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
@@ -470,8 +472,8 @@ def _source(report: dict, kind: str) -> tuple[str, str]:
         given = "distances" in summary.get("scale_from", [])
         distance = f"state {'a longer or better known' if given else 'the'} distance of two points of the target"
         if (summary.get("edge_share") or 0.0) > 0.5:
-            remedy = f"all edges may be off alike, which no residual shows; {distance} with [[scale]] in target.toml."
-            return "The size, by the edges of tags", few + remedy
+            common = "all edges may have the same error, which no residual shows"
+            return "The size, by the edges of tags", f"{few}{common}; {distance} with [[scale]] in target.toml."
         remedy = f"measure it better than size_sigma_mm says, or {distance} with [[scale]] in target.toml."
         return "The size of the print", few + remedy
     remedies = {

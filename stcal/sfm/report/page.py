@@ -122,7 +122,7 @@ def _warning(report: dict) -> Block:
     if report["options"]["solve"] == "paper":
         return alarms(
             [
-                "As published, for comparison: centres of contours, alike in weight, without the eccentricity. Faces "
+                "As published, for comparison: centres of contours with equal weights, without the eccentricity. Faces "
                 "are biased by tens of µm; residuals do not show it. Do not use these faces."
             ]
         )

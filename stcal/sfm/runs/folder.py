@@ -264,7 +264,7 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
 
 @contextlib.contextmanager
 def _as_written(path: Path) -> Iterator[None]:
-    """Raises InputError for a report of which no page can be made, or for a file that it needs."""
+    """Raises InputError if no page can be made of a report, or if a file that it needs is missing."""
     try:
         yield
     except OSError as error:

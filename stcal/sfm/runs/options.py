@@ -142,8 +142,8 @@ class RunOptions:
 def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]:
     """Returns what seem to be faces that the target does not have, with the group that each is named in.
 
-    Where one group is named after two faces, another name of two words or letters, of which one is a face, names
-    another one beside it.
+    If the name of one group consists of two faces, another group's name of two words or letters also consists of faces
+    if one of them is a face; the other one is then a face that the target lacks.
     """
     ids, groups = [face.id for face in target.faces], list(groups)
     found: dict[str, str] = {}
@@ -157,7 +157,7 @@ def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]
 
 
 def _faces_in_name(group: str, ids: Sequence[str]) -> set[str]:
-    """Returns the faces of which the name of a group is made, two at least; empty if it is made of anything else."""
+    """Returns the faces, at least two, of which a group's name consists; empty if it consists of anything else."""
     for parts in (re.split("[-_+ ]", group), list(group)):
         if len(parts) > 1 and len(set(parts)) == len(parts) and set(parts) <= set(ids):
             return set(parts)

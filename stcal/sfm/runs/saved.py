@@ -106,7 +106,7 @@ class SavedRun(Brief):
 
     def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
         """Returns the heights of the rims behind which the faces lie, by circle, and σ of all of them together, mm: 0
-        if they are stated. Without a circle the faces are as seen."""
+        if they are stated. If no circle is listed, the faces are as seen."""
         heights = dict(zip(circle_labels(self.faces.rim_mm), self.faces.rim_mm.values(), strict=True))
         return heights, self.report["summary"].get("rim_sigma_mm") or 0.0
 

@@ -58,7 +58,7 @@ def usable_groups(
 ) -> tuple[dict[str, list[ImageObservations]], list[str]]:
     """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped.
 
-    The others include groups of which every image was skipped. With ``board_alone``, groups need no face; without
+    The others include groups whose images were all skipped. With ``board_alone``, groups need no face; without
     ``needs_board``, no board.
 
     Raises

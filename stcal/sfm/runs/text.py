@@ -38,8 +38,8 @@ def run_text(result: RunResult) -> str:
     lines += [*_defocus(result.labelled), *_rims(result)]
     if result.options.solve == "paper":
         lines.append(
-            "as published, for comparison: centres of contours, alike in weight, without the eccentricity; faces are "
-            "off by tens of µm, and no residual shows it"
+            "as published, for comparison: centres of contours with equal weights, without the eccentricity; faces "
+            "are off by tens of µm, and no residual shows it"
         )
     elif not result.options.eccentricity:
         lines.append(
@@ -73,7 +73,8 @@ def _camera_taken_as_exact(camera: Camera) -> str:
     focal = float(np.sqrt(camera.covariance[0, 0]))
     return (
         f"the camera file states σ of its parameters ({focal:.2g} px of the focal length), and this run takes them as "
-        "exact: no σ below holds them; --refine-camera adjusts the intrinsics within them and carries them into all σ"
+        f"exact: no σ below includes them; --refine-camera adjusts the intrinsics within them and includes them in "
+        f"all σ"
     )
 
 
@@ -115,8 +116,8 @@ def _found_camera(result: RunResult) -> Iterator[str]:
     )
     if sigma[0] > WEAK_FOCAL * focal[0]:
         yield (
-            f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: take views from "
-            "nearer, and of faces at 30° to 60°, or give a camera file"
+            f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: take views from a shorter "
+            f"distance, and of faces tilted by 30° to 60°, or give a camera file"
         )
 
 
@@ -140,7 +141,7 @@ def _rims(result: RunResult) -> Iterator[str]:
     if calibration.rim_mm:
         height, sigma = float(np.mean(list(calibration.rim_mm.values()))), calibration.rim_sigma_mm
         source = f" ± {sigma:.3f} mm, as estimated" if sigma else " mm, as stated"
-        yield f"rims: faces are of the luminous surface, behind rims of {height:.3f}{source}"
+        yield f"rims: faces are those of the luminous surface, behind rims of {height:.3f}{source}"
     if of_dots:
         yield (
             f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated, and no face depends "
@@ -284,7 +285,7 @@ def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
 
 
 def _compared(comparison: Comparison) -> Iterator[str]:
-    yield "compared with Zhang & Wei (2017): faces off the last row's, three-point frames; steps add up"
+    yield "compared with Zhang & Wei (2017): distance of faces from the last row's, three-point frames; steps add up"
     heads, rows = comparison_cells(comparison.model_dump())
     yield from (f"  {line}" for line in text_table([heads, *rows]))
     yield from (f"  {row.method}: {row.reason}" for row in comparison.rows if row.reason)

@@ -578,7 +578,7 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
     Raises
     ------
     InputError
-        The input is of images, which tell the poses by themselves.
+        The input consists of images, which determine the poses by themselves.
     """
     inputs, setup, options = given, given.setup or "eye-in-hand", options or HandEyeOptions()
     if inputs.views is not None:

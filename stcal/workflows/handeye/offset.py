@@ -21,15 +21,16 @@ from stcal.parallel import one_thread
 from stcal.workflows.handeye.inputs import HandEyeInput
 
 HINT_T, SURE_SIGMAS = 3.0, 4.0
-"""Student's t of a first test from which an offset is solved for, and number of its σ from which it is told: one sound
-set in 16,000 is beyond the latter."""
+"""Student's t of a first test from which an offset is solved for, and number of its σ from which it is reported: one
+sound set in 16,000 is beyond the latter."""
 FALLS = 0.98
-"""Largest ratio of the mean squares of residuals with and without an offset that is told though it does no harm."""
+"""Largest ratio of the mean squares of residuals with and without an offset at which the offset is reported although it
+does no harm."""
 HARMFUL = 1.0
 """Change of the transform by the offset, in σ of the transform, from which the transform is called wrong."""
 ROW_S = 0.05
-"""Time that stands for one row where poses have no times but follow one another smoothly: a scan of 1 s about 0 is one
-of 20 rows."""
+"""Time assumed between rows if poses have no times but follow one another smoothly: a scan of ±1 s then covers ±20
+rows."""
 SMOOTH, LEAST_ROWS = 0.2, 20
 """Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
 their order counts as that of a motion; and least number of such poses."""
@@ -41,7 +42,7 @@ def at_offset(
 ) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
     """Returns the same input with the robot's poses at the estimated offset.
 
-    Numberings of a symmetric board are put right.
+    Numberings of a symmetric board are corrected.
 
     Raises InputError: there are no times, or the robot has four axes. Raises StcalError: for the reasons given in
     :func:`~stcal.handeye.time_offset.estimate_offset`.
@@ -164,7 +165,8 @@ def _close(timed: Timed) -> bool:
 
 
 def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
-    """Returns Student's t of an offset beside X and Z, to first order, by the poses that are no outliers."""
+    """Returns Student's t of an offset that is solved for with X and Z, to first order, from the poses that are not
+    outliers."""
     good = np.flatnonzero(~result.outliers)
     loop, x = Loop.of(pairs[good], setup), result.mount_from_camera
     residuals = loop.residuals(x, result.stand_from_board, result.scale)

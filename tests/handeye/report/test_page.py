@@ -163,7 +163,7 @@ def test_a_page_without_poses_and_views_is_whole(of_views):
     """Of an outcome that a program made of a result alone."""
     page = read(outcome_report(replace(of_views, pairs=None, views=None, held_out=None)).page())
     assert page.images == 0
-    assert "no errors on poses held out are known" in " ".join(page.text)
+    assert "errors on poses held out are not known" in " ".join(page.text)
 
 
 def test_the_verdict_stands_in_text_page_and_file(of_views):

@@ -82,7 +82,7 @@ def test_a_fit_that_predicts_worse_than_it_promises():
 
 def test_nothing_held_out_asks_for_care():
     outcome = replace(outcome_of(16, 5), held_out=None)
-    assert judged(outcome).sentence() == "use with care: no errors on poses held out are known"
+    assert judged(outcome).sentence() == "use with care: errors on poses held out are not known"
 
 
 def test_outliers():

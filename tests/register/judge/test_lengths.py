@@ -83,9 +83,9 @@ def test_one_wrong_among_four_is_refused_or_said_to_be_beyond_telling(seed):
     except DegenerateError as error:
         assert "needed to tell which are wrong" in str(error)  # noqa: PT017
     else:
-        assert any("cannot be told from the others: measure 2 more" in note for note in notes)
+        assert any("a wrong one cannot be identified: measure 2 more" in note for note in notes)
 
 
 def test_six_points_tell():
     a, b, noise = points(6)
-    assert not any("cannot be told" in note for note in register(a, b + noise).notes)
+    assert not any("cannot be identified" in note for note in register(a, b + noise).notes)

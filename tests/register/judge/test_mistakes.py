@@ -77,7 +77,7 @@ def test_a_thin_bent_sheet_is_not_called_mirrored():
 def test_an_affine_fit_tells_that_it_mirrors():
     s = scene(6, 30)
     found = register(s.xyz_a * [1, 1, -1], s.xyz_b, model="affine", folds=0)
-    assert any("mirrors" in note for note in found.notes)
+    assert any("is a reflection" in note for note in found.notes)
 
 
 def test_exchanged_rows_are_named():

@@ -46,7 +46,7 @@ def test_a_large_move_is_located_too():
 
 def test_two_transforms_are_refused_with_the_row_between_them():
     a, b = points(2)
-    with fails_with("E-REGISTER-TWO-TRANSFORMS … from row 26 on … each by themselves"):
+    with fails_with("E-REGISTER-TWO-TRANSFORMS … from row 26 on … separately"):
         register(a, moved_from(25, b, MOVE), folds=0)
 
 

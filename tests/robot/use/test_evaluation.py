@@ -162,7 +162,7 @@ def test_what_a_file_leaves_is_said_and_whether_identification_takes_it_up():
     assert found.beyond == ()
     text = evaluation_report(evaluate({"a": shifted}, seen(true, 5, 60))).text()
     assert "a: residuals go with the zero of joint 3: " in text
-    assert "a: parameters identified from these rows would leave nothing of that to be seen" in text
+    assert "a: parameters identified from these rows would explain all of it" in text
     [clean] = evaluate({"a": true}, seen(true, 5, 60)).robots
     assert clean.left == ()
 

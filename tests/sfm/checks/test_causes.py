@@ -60,7 +60,7 @@ RANDOM = np.random.default_rng(0).normal(size=(12, 2))
 PLANTED = {
     "focal length long": (of_file(focal=lambda f, _: 1.01 * f), "the focal length is not"),
     "focal length short": (of_file(focal=lambda f, _: 0.998 * f), "the focal length is not"),
-    "unlike": (of_file(focal=lambda f, _: f * [1.003, 1]), "width and height are scaled unlike"),
+    "unlike": (of_file(focal=lambda f, _: f * [1.003, 1]), "width and height are scaled differently"),
     "principal point": (of_file(centre=lambda c, _: c + np.array([8, -5])), "the principal point is not"),
     "undistorted": (
         of_photographs(lambda i, camera, _: i.centre * camera.focal + camera.centre),
@@ -71,7 +71,7 @@ PLANTED = {
         "already undistorted, with another camera matrix",
     ),
     "signs reversed": (of_file(distortion=lambda d, _: -d), "sign reversed"),
-    "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled against the camera file"),
+    "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled relative to the camera file"),
     "turned": (
         of_file(centre=lambda c, camera: np.array([camera.width - 1, camera.height - 1]) - c),
         "turned by 180°",
@@ -121,7 +121,7 @@ def test_of_two_halves_of_a_group_none_is_named(few, lab):
     checks = lab.check(few, images)
     best = ranked(list(checks.values()), frozenset(image.name for image in images))[0]
     assert (best.key, best.names) == (CAUSE, ())
-    assert "the target moved against the board" in best.title
+    assert "the target moved relative to the board" in best.title
     assert checks["moved"].names == ()
     assert f"group {images[0].group}: leaving out less than half of them" in checks["moved"].reason
 

@@ -191,7 +191,7 @@ def test_without_sigma():
     found = judgement_of(own)
     assert found.verdict == "with care"
     assert (found.position_sigma_um, found.position_face) == (None, None)
-    assert found.quality == "There are no σ, and no face is reached in two ways that could be compared."
+    assert found.quality == "There are no σ, and no face is reached by two chains that could be compared."
     assert found.next == "Run it with --solve joint."
     (way,) = own["chains"]["2"]
     own["chains"]["2"] = [way, way | {"translation_um": 20.04}]
@@ -206,7 +206,7 @@ def test_the_board_alone_and_one_face():
     assert found.quality == "The board's dots are within 3.6 µm RMS of their design."
     assert found.next.startswith("Look at the overlays;")
     own["faces"] = {"1": report()["faces"]["1"]}
-    assert judgement_of(own).limit == "There is one face only, which nothing links."
+    assert judgement_of(own).limit == "There is only one face, and nothing links it to others."
 
 
 def test_a_difference_from_the_native_program_calls_for_care():
@@ -256,7 +256,7 @@ def test_a_face_that_was_read_and_left_out_and_a_lost_group_call_for_care():
     own["notes"] = [LEFT_OUT_WHOLE + "group 25: no board recognised in 4 images; keep it in view"]
     told = judgement_of(own)
     assert (told.verdict, told.missing) == ("with care", ["group 25"])
-    assert told.use.endswith("; group 25 was left out whole.")
+    assert told.use.endswith("; group 25 was left out completely.")
     own["checks"][0] = check("a", "suspicious")
     assert judgement_of(own).use.count("With care: ") == 1
 

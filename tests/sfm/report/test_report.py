@@ -294,7 +294,7 @@ def test_trust_names_the_worst(joint):
     assert trust["Disagreement of chains, position (µm)"] == ["–", "–"]
     assert trust["λ by rows against least squares (ppm)"] == ["0.5", "group a"]
     assert "σ hold for the given intrinsics" in joint
-    assert "no second way confirms them: face 2." in joint
+    assert "no second chain confirms them: face 2." in joint
 
 
 def test_two_ways_to_a_face_are_a_check():

@@ -133,7 +133,7 @@ def _pairs(
 
 
 def _three_rows(values: np.ndarray) -> bool:
-    """True if most rows of twelve numbers (m, 12) are matrices 3×4, so that one that is none can be named."""
+    """True if most rows of twelve numbers (m, 12) are 3×4 matrices; a row that is not can then be named."""
     turn = values.reshape(-1, 3, 4)[:, :, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(turn @ np.swapaxes(turn, 1, 2) - np.eye(3)).max(axis=(1, 2))
@@ -143,8 +143,8 @@ def _three_rows(values: np.ndarray) -> bool:
 def _of_kitti(matrices: np.ndarray, places: tuple[str, ...], names: tuple[str, ...], where: str) -> Content:
     """Returns poses from matrices (m, 3, 4), a row each.
 
-    A first matrix of the identity tells KITTI's odometry: poses of the camera in its first frame, in metres. No board
-    stands in its camera's centre.
+    If the first matrix is the identity, the file is odometry as in KITTI: poses of the camera in its first frame, in
+    metres. It has no poses of a board, which cannot be at the camera's centre.
     """
     rotation, translation = of_matrices(matrices, places, where)
     first = bool(np.abs(matrices[0] - np.eye(4)[:3]).max() < IDENTITY)
@@ -453,8 +453,8 @@ def _of_matrix(table: Table, matrix: MatrixColumns, frames: Frames | None, names
 
 
 def _named_matrices(table: Table, names: tuple[str, ...]) -> list[Side]:
-    """Returns the matrices of both sides whose columns begin with names of the transforms or of the sides; none where
-    there are not two of them, or their names do not tell."""
+    """Returns the matrices of both sides, identified by the names at the beginning of their columns. Returns none if
+    there are not exactly two matrices, or if their names do not identify both sides."""
     full = [matrix for matrix in find_matrices(table) if matrix.translation]
     frames = [_frames_of_stem(matrix.stem) for matrix in full]
     if len(full) != len(ROLES) or {frame.role for frame in frames if frame is not None} != set(ROLES):

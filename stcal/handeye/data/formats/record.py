@@ -87,8 +87,9 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """``form`` : of the file, in words; ``sides`` : one side whose role is not known, or one side of each role;
-    ``setup`` : where the file states it; ``passed_over`` : other content of the file that is not used."""
+    """Content of a file of poses. ``form`` : format of the file, in words; ``sides`` : one side whose role is not
+    known, or one side of each role; ``setup`` : setup that the file states, if any; ``passed_over`` : other content of
+    the file that is not used."""
 
     form: str
     sides: tuple[Side, ...]

@@ -21,7 +21,7 @@ from stcal.io.poses.rotations import (
 PLACE_KEYS = ("translation", "position", "t", "tvec", "trans", "xyz")
 TURN_KEYS = ("rotation", "orientation", "quaternion", "R", "rvec", "rot", "q")
 WRAPPED = ("pose", "transform", "matrix", "T", "H", "homogeneous", "transformation", "pose_matrix", "robot_pose")
-"""Keys under which a pose stands beside its name or header."""
+"""Keys that may hold a pose in an object that also has its name or header."""
 NAME_KEYS = (
     *("image", "img", "image_name", "image_file", "image_path", "filename", "file", "name"),
     *("timestamp", "stamp", "time", "id", "index"),
@@ -101,7 +101,7 @@ def _named(found: One, value: Mapping, unit: Unit | None = None, form: str = "")
 
 
 def name_in(value: Mapping) -> str:
-    """Returns the image, timestamp or number that stands beside a pose; for a message of ROS, its stamp."""
+    """Returns the image, timestamp or number that belongs to a pose; for a message of ROS, its stamp."""
     for key in NAME_KEYS:
         value_of_key = value.get(key)
         if isinstance(value_of_key, str | int | float) and not isinstance(value_of_key, bool):
@@ -168,7 +168,7 @@ def _of_parts(value: Mapping, statements: Said, place: str, where: str) -> One |
 
 
 def _of_scalars(value: Mapping, place: str, where: str) -> One | None:
-    """Returns the pose from x, y, z, qw, qx, qy, qz beside each other; lengths in metres, as in data of
+    """Returns the pose of an object with keys x, y, z, qw, qx, qy, qz; lengths in metres, as in data of
     ROS-Industrial."""
     keys = ("x", "y", "z", "qw", "qx", "qy", "qz")
     if not set(keys) <= value.keys():

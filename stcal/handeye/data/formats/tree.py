@@ -27,9 +27,9 @@ from stcal.handeye.data.formats.single import ROS, One, name_in, numbers, one
 from stcal.io.poses.rotations import ROTATION_VECTOR, Convention, proper, require_finite, rotations, turned_values
 
 HOLDERS = ("poses", "data", "samples", "pairs", "frames", "transforms", "measurements", "captures", "robot_poses")
-"""Keys under which the list of poses may stand."""
+"""Keys that may hold the list of poses."""
 LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timestamps", "stamps")
-"""Keys of lists that name the poses of the stacks beside them."""
+"""Keys of lists that name the poses of a stack in the same object."""
 MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
 _CAMODOCAL = re.compile(r"T([12])_(\d+)")
 OPENCV = "OpenCV's hand-eye arrays"
@@ -294,7 +294,7 @@ def _renamed(side: Side, names: tuple[str, ...], where: str) -> Side:
 
 
 def _side_of(value: Any, statements: Said, where: str, frames: Frames | None) -> Side | None:
-    """Returns one side from a list, a stack or a mapping by name; None where it holds no poses."""
+    """Returns one side from a list, a stack or a mapping by name; None if it has no poses."""
     if isinstance(value, Mapping):
         single = one(value, statements, "the pose", where)
         if single is not None:

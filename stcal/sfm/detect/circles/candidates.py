@@ -313,9 +313,9 @@ def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 MAX_POSITION_ERROR = 0.15
-"""Largest distance between a pattern's prediction and a candidate, in radii of the circle …"""
+"""Largest distance between a pattern's prediction and a candidate, in radii of the circle."""
 MAX_POSITION_ERROR_PX = 1.5
-"""… and at least this many pixels: candidates before centring are good to a few tenths."""
+"""Lower bound of that distance, px: candidates before centring are good to a few tenths."""
 MAX_AXIS_RATIO = 1.45
 """Largest ratio between the predicted and the found ellipse along any direction."""
 MIN_HOMOGRAPHY_POINTS = 4

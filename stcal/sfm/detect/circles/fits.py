@@ -12,10 +12,10 @@ START_BLUR_PX = 0.8
 BLUR_LIMITS_PX = (0.25, 12.0)
 STEPS = 12
 RESELECTIONS = 4
-"""Number of first steps in which the band of pixels is selected again …"""
+"""Number of first steps in which the band of pixels may be selected again."""
 RESELECT_PX = 0.3
 RESELECT_BAND = 0.15
-"""… if the centre or the width of the band changed by more than this."""
+"""Change of the centre, and of the width of the band, beyond which the band is selected again."""
 PARAMETERS = 12
 MIN_PIXELS = 30
 CONVERGED_PX = 2e-3
@@ -29,9 +29,11 @@ MIN_SIGMA = 0.4
 WAVES = (1, 2, 3)
 """Harmonics around the rim of brightness that the planes do not describe."""
 UNEVEN = 0.004
-"""Amplitude of that harmonic, as a share of the contrast, that moves a centre by about 2 µm in 100 …"""
+"""Amplitude of the third harmonic from which it is relevant, as a share of the contrast: it moves a centre by about 2
+µm in 100."""
 UNEVEN_CHI2 = 23.0
-"""… and its χ² with two degrees of freedom: a false-alarm probability of one in 100 000 circles."""
+"""χ² of the third harmonic, two degrees of freedom, from which it is significant: a false alarm in one of 100 000
+circles."""
 WAVE_STEPS = 8
 CUSP = 0.3
 """The edge's distance has a cusp in the middle of the ellipse; slopes and waves are kept to what they are at this share
@@ -108,7 +110,8 @@ class Fits:
         self.uneven = np.where((inside | outside)[:, None], before - self.centre, 0.0)
 
     def _is_uneven(self, inside: bool) -> np.ndarray:
-        """Returns whether the residuals' third harmonic on one side of the rim is significant and relevant; (n,)."""
+        """Returns a mask (n,) of the circles whose residuals have a significant and relevant third harmonic on one side
+        of the rim."""
         own = ((-self.reduced if inside else self.reduced) > 1.0) & (self.weight > 0.5)
         many = own.sum(1) >= MIN_PIXELS
         c, s = np.moveaxis(self.direction(), 1, 0)
