@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from stcal.design import TargetDesign, reference_target
-from stcal.drawing.dimensions import framed
 from stcal.drawing.draw import OWN, draw, drawn_text, sheets_of
 from stcal.drawing.net import _overlap, net_parts
 from stcal.drawing.shapes import Disc, Text
-from stcal.drawing.sheets import OVERLAP, paper_sheets
+from stcal.drawing.sheets import OVERLAP, framed, paper_sheets
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions

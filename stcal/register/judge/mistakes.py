@@ -289,5 +289,5 @@ def order_note(change: Change, name: Namer) -> str:
     likely = f" ({name(change.first)} to {name(change.last)} as likely)" if change.first < change.last else ""
     return (
         f"from {name(change.row)} on{likely} an instrument stands elsewhere, by {size} ({share}): register the rows "
-        "before and from there on each by themselves"
+        "before it, and those from it on, separately"
     )

@@ -58,14 +58,11 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     stated = ". The σ stated of the size are in them" if others else ""
     if options["solve"] != "joint":
         scope = (
-            "No σ were computed, because the solve was group by group; look at the chains. All holds for the given "
-            "intrinsics: an error of the camera calibration goes into the faces"
+            "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
+            "the given intrinsics: an error of the camera calibration goes into the faces"
         )
     elif judgement.verdict == "no":
-        scope = (
-            "No σ are shown, as they would not hold. What failed makes the result wrong by an amount that they do not "
-            "have in them"
-        )
+        scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
     elif options.get("refine_camera", False):
         scope = f"σ hold for {size}; the intrinsics were adjusted, and their σ are in them{stated}" + (
             f". An error of {pitch} is not in them" if words.board else ""
@@ -85,7 +82,7 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
             f"latter as {max(1.0, summary['sigma0']):.3f}"
         )
     single = [face for face, chains in report["chains"].items() if len(chains) == 1]
-    one_way = "reached by one way only, so that no second way confirms them: face"
+    one_way = "reached by only one chain, so that no second chain confirms them: face"
     return [
         f"{scope}, and residuals hardly show it" if scope.endswith("not in them") else scope,
         factor,

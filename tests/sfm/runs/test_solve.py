@@ -65,7 +65,7 @@ def test_a_run_that_takes_a_camera_with_sigma_as_exact_says_so(small_result):
     stated = Camera.of(camera, camera.colmap_model, np.diag([1.44] * len(camera.colmap_params())))
     said = (
         "the camera file states σ of its parameters (1.2 px of the focal length), and this run takes them as exact: no "
-        "σ below holds them; --refine-camera adjusts the intrinsics within them"
+        "σ below includes them; --refine-camera adjusts the intrinsics within them and includes them in all σ"
     )
     assert said in " ".join(run_text(replace(small_result, camera=stated)).split())
     refined = replace(small_result, camera=stated, options=replace(small_result.options, refine_camera=True))
@@ -81,5 +81,5 @@ def test_a_run_says_behind_which_rims_circles_and_dots_lie(small_result):
         board_design=replace(small_result.board_design, rim_mm=0.3),
     )
     said = " ".join(run_text(behind).split())
-    assert "faces are of the luminous surface, behind rims of 0.200 ± 0.004 mm, as estimated" in said
+    assert "faces are those of the luminous surface, behind rims of 0.200 ± 0.004 mm, as estimated" in said
     assert "dots of the board are seen 0.150 mm before its surface, as stated" in said
