@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.target import load_body
+from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, StcalError
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
@@ -96,7 +96,7 @@ def measure(
     images: str | Path,
     camera: Camera | CameraModel | str | Path,
     target: TargetCircles | str | Path,
-    design: TargetDesign | str | Path,
+    design: TargetDesign | str | Path | None = None,
     board: BoardDesign | None = None,
     options: MeasureOptions | None = None,
     progress: Progress | None = None,
@@ -115,8 +115,9 @@ def measure(
         covariance, if any, is part of the poses' covariances.
     target : TargetCircles or path
         Circles of the target, target frame, mm; see :func:`read_target`; or the ``faces.json`` of a run.
-    design : TargetDesign or path
-        Design with radii and polarity, for detection and labels, or its ``target.toml``.
+    design : TargetDesign or path, optional
+        Design with radii and polarity, for detection and labels, or its ``target.toml``; that of the circles, or the
+        reference design, if None.
     board : BoardDesign, optional
         A dot board that may be in view, so that its dots are not taken for circles of the target.
     options : MeasureOptions, optional
@@ -138,7 +139,9 @@ def measure(
         If no image shows a face.
     """
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
-    design = load_body(design) if isinstance(design, str | Path) else design
+    if design is None and isinstance(target, TargetCircles):
+        design = target.design
+    design = body_of(design)
     target = read_target(target, design) if isinstance(target, str | Path) else target
     camera = read_camera(camera) if isinstance(camera, str | Path) else camera_model(camera)
     files, unreadable = find_images(images)

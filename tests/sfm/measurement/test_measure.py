@@ -385,6 +385,16 @@ def test_rendered_images_are_measured_as_predicted(measured, small_dataset):
     assert 0.2 < mean_squared_error(measured, json.loads((small_dataset / "truth.json").read_text())) < 2.8
 
 
+@pytest.mark.slow
+def test_circles_bring_their_design(measured, small_run, small_dataset, tmp_path):
+    (tmp_path / "12").mkdir()
+    own_copy(small_dataset / "images/12/IMG_1000.jpg", tmp_path / "12")
+    circles = read_target(small_run / "faces.json", small_dataset / "target.toml")
+    found = measure(tmp_path, small_dataset / "cameras.txt", circles, options=MeasureOptions(workers=1))
+    same = (result.images[0].pose.camera_from_target.matrix() for result in (found, measured))
+    assert np.array_equal(*same)
+
+
 @pytest.mark.full
 def test_the_shared_rendered_set(shared_data, tmp_path):
     """The whole chain on images of another program: calibrated, then measured. Its README says that one face in eight
