@@ -12,10 +12,12 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
+from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.checks import faces
 from stcal.sfm.checks.culprits import culprits
+from stcal.sfm.checks.images import moved_check
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.pipeline import run
@@ -171,6 +173,18 @@ def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdi
     check = lab.check(full_scene, images)["centres"]
     assert check.verdict == verdict
     assert check.measured[0].value == pytest.approx(over, rel=0.05)  # 3000 degrees of freedom: 1.3 %
+
+
+@pytest.mark.slow
+def test_a_noisy_image_has_not_moved(full_scene, lab):
+    """Its target lies off its board by twenty times σ, as all of its centres do."""
+    for seed in range(4):
+        images = lab.observe(full_scene)
+        noise = np.random.default_rng(seed).normal(0, 20 * NOISE_PX, images[4].centre_px.shape)
+        images[4] = replace(images[4], centre_px=images[4].centre_px + noise)
+        refined, calibration, _ = lab.calibrate(full_scene, images)
+        networks = [free_network(each.model, calibration.camera) for each in refined]
+        assert moved_check(networks).verdict == "passed"
 
 
 @pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.full)])
