@@ -83,7 +83,7 @@ def test_words_of_tabs_stand_on_them(target):
 def test_the_paper_for_a_whole_net_is_named(target, tmp_path):
     (tmp_path / "target.toml").write_text(target_toml(target))
     text = drawn_text(draw(tmp_path / "target.toml", tmp_path / "net.pdf", net=True))
-    assert text.endswith("state it in sigma_mm, or print with --paper A2")  # 400 × 200 mm and more
+    assert "state it in sigma_mm, or print with --paper A2, or one by one" in text  # 400 × 200 mm and more
     whole = draw(tmp_path / "target.toml", tmp_path / "a2.pdf", paper="A2", net=True)
     assert len(whole.sheets) == 1
     assert len(draw(tmp_path / "target.toml", tmp_path / "a3.pdf", paper="A3", net=True).sheets) > 1

@@ -208,7 +208,7 @@ def test_identify_says_it_in_notes_file_and_page():
     clean = identify(mh80(), simulated(3, 40)[1], QUICK)
     assert clean.left == ()
     assert not any("residuals go with" in note for note in clean.notes)
-    assert "Nothing is seen that the residuals go with" in identified_report(clean, mh80()).page()
+    assert "The residuals depend on nothing that was tested" in identified_report(clean, mh80()).page()
 
 
 @pytest.mark.full

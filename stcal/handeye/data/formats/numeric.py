@@ -441,8 +441,8 @@ def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ..
     if turned is None:
         return None
     covariance = table.pose_covariances(prefix)
-    known = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
-    return Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names, **known)
+    side = Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names)
+    return replace(side, covariance=covariance, common=table.common_errors(covariance, prefix))
 
 
 def _of_matrix(table: Table, matrix: MatrixColumns, frames: Frames | None, names: tuple[str, ...]) -> Side:
