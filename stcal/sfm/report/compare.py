@@ -3,7 +3,7 @@
 import csv
 import io
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
-from stcal.io.table import LENGTHS
+from stcal.io.table import FARTHEST, LENGTHS
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import NONE, number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
@@ -115,6 +115,8 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     run = Path(run)
     answer = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
     known = read_result(truth, TruthFile, "truth", REMEDY)
+    for where, circles in ((run, answer.circles), (truth, known.circles)):
+        _require_near(str(where), circles)
     if answer.reference_face != known.reference_face:
         raise InputError(
             "E-COMPARE-REFERENCE",
@@ -143,6 +145,16 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         worst=LargestErrors(**worst),
         **({"labels": labels} if labels else {}),
     )
+
+
+def _require_near(where: str, circles: Mapping[str, Vector3]) -> None:
+    """Refuses places so far away that their squares would overflow."""
+    for label, place in circles.items():
+        if (far := max(map(abs, place))) > FARTHEST:
+            raise InputError(
+                "E-VALUE-TOO-FAR",
+                f"{where}: circles.{label}: a length of {far:.3g}, up to {FARTHEST:g} possible; correct it",
+            )
 
 
 def _require_one_unit(where: str, found: Answer, known: TruthFile) -> None:

@@ -110,3 +110,14 @@ def test_images_without_labels_are_counted(small_run, small_dataset, tmp_path):
     assert (found.labels.images, found.labels.images_of_truth) == (known.labels.images - 1, known.labels.images)
     assert f"in the {found.labels.images} of {known.labels.images} images that have labels" in comparison_table(found)
     assert "images that have labels" not in comparison_table(known)
+
+
+def test_a_place_beyond_all_reach_is_named(small_run, small_dataset, tmp_path):
+    """Its square overflows, which ended the fit in NumPy's error."""
+    content = json.loads((small_dataset / "truth.json").read_text())
+    label = next(iter(content["circles"]))
+    content["circles"][label][0] *= 1e300
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps(content))
+    with fails_with(f"E-VALUE-TOO-FAR … truth.json: circles.{label}"):
+        compare(small_run, path)
