@@ -439,17 +439,17 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
         progress("faces", 1, 1)
     else:
 
-        def adjust_all() -> Calibration:
-            models = [s.model for s in solutions]
+        def adjust_all(of: Sequence[GroupSolution]) -> Calibration:
+            models = [s.model for s in of]
             return calibrate(models, calibrated_camera, target, board, adjust_options, prior, progress)
 
-        calibration = adjust_all()
+        calibration = adjust_all(solutions)
         if doubted := {s.model.group for s in solutions if s.outliers and options.refine_camera}:
             # What disagrees with the others by the first camera may agree by the refined one.
             with suppress(StcalError):
                 again = {s.model.group: s for s in solve(calibration.camera, doubted)[0]}
-                solutions = [again.get(s.model.group, s) for s in solutions]
-                calibration = adjust_all()
+                refined = [again.get(s.model.group, s) for s in solutions]
+                calibration, solutions = adjust_all(refined), refined
     return RunResult(
         out=folder.out,
         camera=calibrated_camera,

@@ -98,6 +98,8 @@ def report_html(
 
 def _with_named_groups(report: dict) -> dict:
     """Returns the report with a word in place of the dot for the group of the folder itself."""
+    if all(group["name"] != TOP_GROUP for group in report["groups"]):
+        return report
     word = "all" if len(report["groups"]) == 1 else "top folder"
 
     def named(value: Any, key: str) -> Any:
