@@ -227,7 +227,7 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
     word: Word = CARE if sigma > shift else GOOD
     said = (
         f"of the σ of {FRAMES[outcome.result.setup].camera}, {sigma:.2g} mm where the board was ({distance:.0f} mm "
-        "away) are from errors that all poses of the board have in common"
+        "away) come from errors that all poses of the board have in common"
     )
     remedy = "calibrate the camera better, or solve from the images: more poses do not help" if word != GOOD else ""
     return Finding("Common errors of the board's poses", word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
