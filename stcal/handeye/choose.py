@@ -144,9 +144,6 @@ def _solved(
         solution = solved(pairs, setup, method, views, options)
         partial = tuple(solution.without(out) for out in rows)
         result = solution.result
-        if result.covariance is None:
-            result = with_jackknife(result, [solution.without(np.array([i])) for i in range(len(pairs))])
-            result = with_common_errors(result, pairs, setup, options)
     except StcalError as error:
         return error
     errors = [
@@ -156,6 +153,20 @@ def _solved(
     share = 1 - rows.shape[1] / len(pairs)
     shown_without = np.array([_shown(part, options, views, share) for part in partial])
     return _Outcome(result, partial, np.array(errors), _shown(result, options, views), shown_without)
+
+
+def _with_sigma(
+    result: HandEye, pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions
+) -> HandEye:
+    """Returns the result of a closed form with covariances, or any other as it is.
+
+    Raises StcalError: the closed form fails without one of the poses.
+    """
+    if result.covariance is not None:
+        return result
+    solution = solved(pairs, setup, result.method, views, options)
+    result = with_jackknife(result, [solution.without(np.array([i])) for i in range(len(pairs))])
+    return with_common_errors(result, pairs, setup, options)
 
 
 def _shown(result: HandEye, options: HandEyeOptions, views: Views | None, share: float = 1.0) -> bool:
@@ -286,6 +297,13 @@ def choose(
     succeeded = {candidate: outcome for candidate, outcome in outcomes.items() if isinstance(outcome, _Outcome)}
     trial = _Trial(succeeded, rows)
     chosen = trial.best()
+    try:  # of a closed form the σ cost a solution for each pose: they are made for the chosen one alone
+        result = _with_sigma(trial.outcomes[chosen].result, pairs, setup, views, chosen.options(options, prior))
+    except StcalError as error:
+        outcomes[chosen] = error
+        trial = _Trial({candidate: own for candidate, own in succeeded.items() if candidate not in CLOSED_FORMS}, rows)
+        chosen = trial.best()
+        result = trial.outcomes[chosen].result
     errors_of_split = []
     for k, out in enumerate(rows):
         part = trial.outcomes[trial.best(k)].partial[k]
@@ -307,7 +325,7 @@ def choose(
     }
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
     of_splits = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
-    result = widened_by_scatter(trial.outcomes[chosen].result, replace(held_out, mount_from_camera=of_splits))
+    result = widened_by_scatter(result, replace(held_out, mount_from_camera=of_splits))
     result, notes = _widened(result, chosen, rivals)
     measure = "translation_mm" if views is None else "board_mm"
     return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, measure), notes)
