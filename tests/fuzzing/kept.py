@@ -7,6 +7,8 @@ import os
 import re
 import shutil
 import time
+import zipfile
+import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -142,8 +144,11 @@ def _edited(path: Path, _, rng: np.random.Generator) -> str:
     """Values of an array changed by little, so that the file is still a valid one."""
     if path.suffix != ".npz":
         return flipped(path, rng)
-    with np.load(path, allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error):  # an earlier change spoiled it
+        return flipped(path, rng)
     names = [name for name, values in arrays.items() if values.dtype.kind == "f" and values.size]
     if not names:
         return flipped(path, rng)

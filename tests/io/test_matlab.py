@@ -183,3 +183,14 @@ def test_the_same_camera_gives_the_same_bytes():
     first, second = (written(camera_of("OPENCV"), "matlab", "cam0").content for _ in range(2))
     assert first == second
     assert first.startswith(b"MATLAB 5.0 MAT-file, written by stcal")
+
+
+def test_a_damaged_type_of_data_is_refused(tmp_path):
+    """SciPy's reader would take the whole process with it."""
+    path = saved(tmp_path / "camera.mat", {"s": {**STRUCTURE, "K": np.eye(3)}})
+    double, none = np.array([9, 72], "<i4").tobytes(), np.array([0, 72], "<i4").tobytes()
+    content = path.read_bytes()
+    assert double in content
+    path.write_bytes(content.replace(double, none))
+    with fails_with("E-CAMERA-UNREADABLE"):
+        read_camera(path)

@@ -6,6 +6,8 @@ In MATLAB's toolbox the centre of the first pixel is at (1, 1); in Bouguet's it 
 import contextlib
 import io
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -46,6 +48,14 @@ BOUGUET_HARMLESS = (
     *("desactivated*", "save*", "string*", "sol*", "jj*", "pp*", "aspect*", "title*", "manual*", "rosette*", "fp*"),
 )
 """Variables of Bouguet's toolbox: its settings, points and poses; ``KK`` repeats the intrinsics."""
+TRIAL = """
+import sys
+sys.path = [folder for folder in sys.path if folder]  # not the user's folder, in which any name may be a module's
+import io
+from scipy.io import loadmat
+loadmat(io.BytesIO(sys.stdin.buffer.read()))
+"""
+"""Program that reads a file and is lost with it."""
 HEAD_BYTES = 116
 """Length of the text at the beginning of a file; scipy writes the time into it."""
 
@@ -64,6 +74,7 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
+        _require_survived(content)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)
             values = loadmat(io.BytesIO(content), simplify_cells=True)
@@ -82,6 +93,16 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
             "its objects",
         )
     return from_structure(structures[one_of(list(structures), choice, source)], source)
+
+
+def _require_survived(content: bytes) -> None:
+    """Raise ValueError if reading the file ends the process: SciPy follows a damaged type of data into foreign memory.
+
+    Another interpreter reads it first.
+    """
+    trial = subprocess.run([sys.executable, "-c", TRIAL], input=content, capture_output=True)
+    if trial.returncode < 0:
+        raise ValueError("damaged")
 
 
 def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
