@@ -45,13 +45,26 @@ def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarr
     return step / wide, (below[0] - below[1]) / wide, widening / wide
 
 
+def reach_of(reach: np.ndarray, rise: np.ndarray) -> int:
+    """Return how many pixels to either side of the middle one lie within ``reach`` (m,) of any of m edges, px.
+
+    ``rise`` : (m,) change of the distance from one pixel to the next; the middle pixel is half a pixel off the edge.
+    """
+    across = reach.ravel() / np.abs(rise)
+    return int(np.ceil(np.max(across, initial=1.0, where=np.isfinite(across)) + 0.5))
+
+
+def products(left: np.ndarray, weight: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the sums (m, q, k) over the pixels (p, s) of weight · left · rightᵀ, of (m, p, s, q) and (m, p, s, k)."""
+    m, pixels = len(weight), int(np.prod(weight.shape[1:]))
+    rows, others = (values.reshape(m, pixels, values.shape[-1]) for values in (left, right))
+    return np.swapaxes(rows, 1, 2) @ (weight.reshape(m, pixels, 1) * others)
+
+
 def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least-squares solutions (m, q) and inverse normal matrices (m, q, q)."""
-    m, q = len(design), design.shape[-1]
-    rows, w = design.reshape(m, -1, q), weight.reshape(m, -1, 1)
-    normal = np.swapaxes(rows, 1, 2) @ (w * rows) + 1e-9 * np.eye(q)
-    inverse = np.linalg.inv(normal)
-    return (inverse @ (np.swapaxes(rows, 1, 2) @ (w * right.reshape(m, -1, 1))))[..., 0], inverse
+    inverse = np.linalg.inv(products(design, weight, design) + 1e-9 * np.eye(design.shape[-1]))
+    return (inverse @ products(design, weight, right[..., None]))[..., 0], inverse
 
 
 def of_sampling(phase: np.ndarray, gradient: np.ndarray) -> np.ndarray:
@@ -214,9 +227,7 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
         design = np.stack([-own[:, 2] * sign * slope, np.ones_like(step), step], axis=-1)
         residual = level - own[:, 1] - own[:, 2] * step
         sampling = of_sampling(-away / rise[:, None, None], design[..., 0])
-        rows = np.einsum(
-            "spa,spai,spaj->sij", used, design, np.concatenate([design, sampling, residual[..., None]], -1)
-        )
+        rows = products(design, used, np.concatenate([design, sampling, residual[..., None]], -1))
         total = np.zeros((len(value), 3, 6))
         np.add.at(total, group, rows)
         seen = total[:, 1, 1] > 0
@@ -246,7 +257,7 @@ def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.nd
     first, last = np.ceil(ends[0]), np.floor(ends[1])
     reach = np.minimum(pieces.cell - CLEAR_BLURS * sigma, MOST_BLURS * sigma)
     most = int(max(np.max(last - first, initial=0.0), 0.0)) + 1
-    half = int(np.ceil(np.max(reach, initial=1.0) * np.sqrt(2)))
+    half = reach_of(reach, pieces.normal[each, 1 - major])
     column = first[:, None] + np.arange(most)
     slope = along[each, 1 - major] / along[each, major]
     middle = np.rint(pieces.start[each, 1 - major, None] + slope[:, None] * (column - pieces.start[each, major, None]))

@@ -14,6 +14,8 @@ from stcal.boards.area import (
     displacement_variance,
     integrated_step,
     of_sampling,
+    products,
+    reach_of,
     solved,
     told_by_lines,
 )
@@ -252,7 +254,7 @@ def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
     keep[:, 1:] &= np.diff(column, axis=1) != 0
     rise = (along[each, 1 - major] / along[each, major])[:, None]
     start = np.rint(point[each, :, 1 - major] + rise * (column - point[each, :, major]))
-    half = int(np.ceil(reach.max() * np.sqrt(2)))
+    half = reach_of(reach, normal[each, 1 - major])
     across = start[..., None] + np.arange(-half, half + 1)
     by_column = (major == 0)[:, None, None]
     x, y = np.where(by_column, column[..., None], across), np.where(by_column, across, column[..., None])
@@ -318,7 +320,7 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
         if not k:  # the levels follow linearly
             value[:, 3:] = solved(levels, weight, pixels.level)[0]
         rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
-        residual = pixels.level - np.einsum("mpsi,mi->mps", levels, value[:, 3:])
+        residual = pixels.level - (levels @ value[:, None, 3:, None])[..., 0]
         design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
         change, inverse = solved(design, weight, residual)
         if k < STEPS:
@@ -329,7 +331,7 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
     noise = _noise_of(residual, distance, weight)
     factor = noise * _growth_of_tags(residual, design[..., 0], weight, noise, good, shape)
     sampling = of_sampling(-distance / pixels.rise[:, None, None], design[..., 0])  # whole pixels do not count
-    pull = np.einsum("mps,mpsi,mpsk->mik", weight, design, sampling)
+    pull = products(design, weight, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
     by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
     value[:, :2] -= shift
@@ -379,8 +381,8 @@ def _told_along(residual, design, by_sampling, weight, noise, good) -> Displacem
         ],
         axis=-1,
     )
-    pulled = np.einsum("mps,mpsi,mps->mi", weight, harmonic, residual)
-    gram = np.einsum("mps,mpsi,mpsj->mij", weight, harmonic, harmonic)
+    pulled = products(harmonic, weight, residual[..., None])[..., 0]
+    gram = products(harmonic, weight, harmonic)
     by_noise, by_displacement = noise * np.trace(gram, axis1=1, axis2=2), np.maximum((gram**2).sum((1, 2)), 1e-12)
     square = ((pulled**2).sum(1) - by_noise) / by_displacement
     return Displacement(np.where(good, square, np.nan), by_noise / by_displacement, np.full(len(square), 2.0))
