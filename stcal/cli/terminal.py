@@ -198,9 +198,15 @@ def warn(line: object) -> None:
     sys.stderr.write(f"{printable(f'warning: {line}')}\n")
 
 
+def warn_if_quiet(verdict: str) -> None:
+    """Writes the sentence of a verdict that is not good to standard error if the command is quiet, which hid it."""
+    if _quiet.get():
+        warn(verdict)
+
+
 def print_each(said: str, lines: Iterable[object]) -> None:
     """Prints each item on a line of its own, after the word ``said``; a warning also if the command is quiet."""
     for line in lines:
-        if _quiet.get() and said.startswith("warning"):
-            sys.stderr.write(f"{printable(f'{said}: {line}')}\n")
+        if said.startswith("warning"):
+            warn_if_quiet(f"{said}: {line}".removeprefix("warning: "))
         say(f"{said}: {line}")

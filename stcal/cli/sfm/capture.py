@@ -108,7 +108,7 @@ def advise(
 
     saved = load_run(run)
     if doubt := doubts(saved):
-        say(f"warning: {doubt}")
+        print_each("warning", [doubt])
     geometry = known_of(saved)
     with StageProgress() as progress:
         advice = advice_for(geometry, count, progress)
