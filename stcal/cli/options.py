@@ -53,6 +53,8 @@ PlateMargin = Annotated[
     "Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
     Opt("--margin-mm", min=0, max=1e4),
 ]
+Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)]
+"""Distance of the camera in `design`, `plan` and `simulate`: photographs that are forecast can be simulated."""
 FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."]
 RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
 LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]

@@ -40,6 +40,8 @@ LEAST_FACES = 2
 LEAST_VIEWS = 2
 """Number of photographs that show each face, as far as there are enough of them."""
 TRIALS = 2000
+BORDER = 0.01
+"""Free border of the image, in image widths: faces are not quite where the design has them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,8 @@ def body_camera(width: int) -> Camera:
 def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions | None = None) -> BodyScene:
     """Returns a body with faces near their rough poses, in random poses in which it shows two faces at least.
 
-    The last photographs show the faces that fewer than two of the others do.
+    The poses follow from the design alone, so that a forecast and a simulation of the same options have the same. The
+    last photographs show the faces that fewer than two of the others do.
 
     Parameters
     ----------
@@ -161,7 +164,7 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     Raises
     ------
     InputError
-        A face has no rough pose.
+        A face has no rough pose, or the camera is too near for the image to hold the body.
     """
     options, rough = options or BodyOptions(), target.rough_poses()
     for face in target.faces:
@@ -171,16 +174,17 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
                 f"face {face.id}: no rough_pose; photographs of a body need one of each face in target.toml",
             )
     rng = np.random.default_rng(options.seed)
-    reference = rough[target.faces[0].id]
     moved = {}
     for face_id, pose in rough.items():
         turn = Rotation.from_rotvec(np.radians(options.pose_sigma_deg) * rng.normal(size=3)).as_matrix()
         shift = options.pose_sigma_mm * rng.normal(size=3)
         moved[face_id] = Rigid(pose.rotation @ turn, pose.translation + shift)
-    reference = moved[target.faces[0].id]
-    target_from_face = {face_id: reference.inverse() @ pose for face_id, pose in moved.items()}
-    scene = BodyScene(target, target_from_face, camera, (), options, _print_errors(target, camera, options))
-    views, poses = dict.fromkeys(target_from_face, 0), []
+    design, true = (
+        {face_id: poses[target.faces[0].id].inverse() @ pose for face_id, pose in poses.items()}
+        for poses in (rough, moved)
+    )
+    scene = BodyScene(target, design, camera, (), options)
+    views, poses = dict.fromkeys(design, 0), []
     for left in range(options.images, 0, -1):
         lacking = {face: LEAST_VIEWS - count for face, count in views.items() if count < LEAST_VIEWS}
         due = left <= sum(lacking.values()) / LEAST_FACES + 1
@@ -189,7 +193,8 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
         poses.append(pose)
         for face_id in shown:
             views[face_id] += 1
-    return replace(scene, camera_from_target=tuple(poses))
+    off_mm = _print_errors(target, camera, options)
+    return replace(scene, target_from_face=true, camera_from_target=tuple(poses), off_mm=off_mm)
 
 
 def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) -> dict[str, np.ndarray]:
@@ -226,7 +231,7 @@ def _pose(scene: BodyScene, wanted: str, rng: np.random.Generator) -> tuple[Rigi
     points = np.array(list(scene.circles_target().values()))
     middle = (points.min(0) + points.max(0)) / 2
     options, camera = scene.options, scene.camera
-    size = np.array([camera.width, camera.height])
+    size, border_px = np.array([camera.width, camera.height]), BORDER * camera.width
     for _ in range(TRIALS):
         quaternion = rng.normal(size=4)  # of a turn that favours no direction
         turn = Rotation.from_quat(quaternion / np.linalg.norm(quaternion)).as_matrix()
@@ -237,15 +242,18 @@ def _pose(scene: BodyScene, wanted: str, rng: np.random.Generator) -> tuple[Rigi
         if (xyz[:, 2] < 0.1 * depth).any():
             continue
         pixels = camera.project(xyz)
-        if (pixels < 0).any() or (pixels > size - 1).any():
+        if (pixels < border_px).any() or (pixels > size - 1 - border_px).any():
             continue
         shown = [face.id for face in scene.target.faces if _looks_here(scene, face, pose)]
         if len(shown) >= LEAST_FACES and (not wanted or wanted in shown):
             return pose, shown
+    half_field_rad = float(np.arctan((size / 2 - border_px) / camera.focal).min())
+    reach_mm = float(np.linalg.norm(points - middle, axis=1).max())
+    enough_mm = reach_mm / np.sin(half_field_rad) / (1 - options.depth_share)
     raise InputError(
         "E-SIMULATE-BODY",
         f"target {scene.target.name}: no pose at {options.distance_mm:g} mm in which it is in the image and shows two "
-        "faces; give another --distance",
+        f"faces; give another --distance: from {enough_mm:.0f} mm on it is in the image",
     )
 
 

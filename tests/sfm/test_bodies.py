@@ -31,7 +31,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.tracker import Tracker
-from stcal.sfm.planning.bodies import plan_body
+from stcal.sfm.planning.bodies import plan_body, planned_photographs
 from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
@@ -274,6 +274,40 @@ def test_few_photographs_show_each_face_twice(seed):
     scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(images=10, distance_mm=300, seed=seed))
     shown = [face.id for image in range(10) for face in scene.faces_in_view(image)]
     assert all(shown.count(face.id) >= 2 for face in scene.target.faces)
+
+
+def test_what_is_forecast_is_what_is_simulated():
+    """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
+    target, near = tag_cube(60), 130.0
+    plan = PlanOptions(images=4, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    forecast, _, _ = planned_photographs(plan, target)
+    simulated = make_body_scene(target, body_camera(900), BodyOptions(4, near, seed=3, print_errors=1.0))
+    pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
+    assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
+    assert not np.array_equal(forecast.target_from_face["2"].matrix(), simulated.target_from_face["2"].matrix())
+    for scene in (forecast, simulated):
+        points = np.array(list(scene.circles_target().values()))
+        seen = np.array([scene.camera.project(pose @ points) for pose in scene.camera_from_target])
+        assert (seen > 0).all()
+        assert (seen < [900, 600]).all()
+
+
+def test_the_distance_that_a_body_needs_is_named():
+    with fails_with("E-SIMULATE-BODY … 60 mm … 182 mm"):
+        make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 60.0))
+    make_body_scene(tag_cube(60), body_camera(900), BodyOptions(1, 182.5))
+
+
+@pytest.mark.slow
+def test_photographs_from_the_shortest_distance_of_a_design_can_be_simulated(tmp_path, stcal_sfm):
+    size, distance = 12, 50
+    camera = ("--distance", distance, "--images", 6)
+    words = ("design", tmp_path / "cube", "--tags", "cube", "--size", size, "--width", 640, *camera)
+    assert stcal_sfm(*words)[0] == 0
+    words = ("simulate", tmp_path / "data", "--target", tmp_path / "cube/target.toml", "--width", 320, *camera)
+    assert stcal_sfm(*words)[0] == 0
+    poses = json.loads((tmp_path / "data/truth.json").read_text())["camera_from_target"].values()
+    assert all(40 < np.linalg.norm(np.array(pose)[:3, 3]) < 75 for pose in poses)
 
 
 def test_more_images_and_a_known_distance_help_a_planned_body():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.declare import Arg, Opt
-from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, PlateMargin, TargetFile, Workers, designs_told
+from stcal.cli.options import MOST_SEED, BoardFile, Distance, JsonFile, PlateMargin, TargetFile, Workers, designs_told
 from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, json_text, real_place, save
@@ -44,9 +44,7 @@ def simulate(
     folder: Annotated[Path, "Write the data set to this new folder.", Arg()],
     width: Annotated[int, "Render images of this width, px, in the ratio 3:2.", Opt(min=320, max=50_000)] = 2592,
     images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
-    distance: Annotated[
-        float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=200, max=1e5)
-    ] = 1000.0,
+    distance: Distance = 1000.0,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
         float | None,
