@@ -32,6 +32,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.tracker import Tracker
 from stcal.sfm.planning.bodies import plan_body, planned_photographs
+from stcal.sfm.planning.file import plan_text
 from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
@@ -274,6 +275,32 @@ def test_few_photographs_show_each_face_twice(seed):
     scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(images=10, distance_mm=300, seed=seed))
     shown = [face.id for image in range(10) for face in scene.faces_in_view(image)]
     assert all(shown.count(face.id) >= 2 for face in scene.target.faces)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("target", "images"), [(tag_cube(60), 20), (tag_dodecahedron(60), 40)])
+def test_each_face_is_seen_often_and_squarely(target, images, seed):
+    """Five times, and twice within 45° of the normal; at random, a face of a cube is in two to four of 20 images."""
+    scene = make_body_scene(target, body_camera(900), BodyOptions(images, 300.0, seed=seed))
+    for face in target.faces:
+        normal = face.outward * scene.target_from_face[face.id].rotation[:, 2]
+        middle = scene.target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0)
+        rays = np.array([pose.inverse().translation for pose in scene.camera_from_target]) - middle
+        tilts = np.degrees(np.arccos(rays @ normal / np.linalg.norm(rays, axis=1)))
+        assert (tilts < 61).sum() >= 5  # faces are up to a degree off their design
+        assert (tilts < 46).sum() >= 2
+    assert scene.hardly_seen() == ""
+
+
+def test_faces_that_are_hardly_seen_are_named():
+    scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(2, 300.0))
+    shown = [face.id for image in range(2) for face in scene.faces_in_view(image)]
+    for face in scene.target.faces:
+        assert f"{face.id} ({shown.count(face.id)} of 2 images" in scene.hardly_seen()
+    target = tag_cube(60)
+    plans = [plan_body(PlanOptions(n, distance_mm=300, width=900), target, target.rough_poses()) for n in (10, 20)]
+    said = [plan_text(plan, "") for plan in plans]
+    assert [("hardly seen: face" in text) for text in said] == [True, False]
 
 
 def test_what_is_forecast_is_what_is_simulated():

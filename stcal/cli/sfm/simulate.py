@@ -10,7 +10,7 @@ import typer
 
 from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import MOST_SEED, BoardFile, Distance, JsonFile, PlateMargin, TargetFile, Workers, designs_told
-from stcal.cli.terminal import StageProgress, say, write_if
+from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, json_text, real_place, save
 
@@ -171,15 +171,11 @@ def _body(
         if not (file.width and file.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
         seen_by = file.calibrated(0, 0)
+    scene = make_body_scene(target, seen_by, options)
     with StageProgress() as progress:
-        paths = write_body(
-            folder,
-            make_body_scene(target, seen_by, options),
-            kind,
-            workers=workers,
-            progress=partial(progress, "render"),
-        )
+        paths = write_body(folder, scene, kind, workers=workers, progress=partial(progress, "render"))
     say(f"{len(paths)} images: {folder}")
+    print_each("note", filter(None, [scene.hardly_seen()]))
 
 
 def _lens(

@@ -135,6 +135,7 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
         expected,
         variance_shares(expected, [model], setup),
         tuple(remedies),
+        scene.hardly_seen(),
     )
 
 
