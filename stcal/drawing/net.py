@@ -18,13 +18,13 @@ TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
 """Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
 TAB_MM, TAB_SHARE = 10.0, 0.25
 """Largest width of a tab, mm, and as a share of its edge."""
-SKETCH = 1 / 8
-"""Scale of the sketch that names the faces."""
+SKETCH, SKETCH_OF_CIRCLES = 1 / 8, 1 / 5
+"""Scale of the sketch that names the faces, and of one that numbers their circles too."""
 APART = 15.0
 LETTERS, SMALL_LETTERS = 2.0, 1.2
 """Height of names, and of the numbers of circles in the sketch, mm."""
-HEIGHTS = 16
-"""Number of heights on a plate of the sketch where its name may have room between the numbers."""
+PLACES = 17
+"""Number of places, across and up, where a name in the sketch may have room between the numbers."""
 TOUCH = 1e-3
 """Overlap of plates that counts as rounding, mm."""
 
@@ -198,18 +198,24 @@ def _tab(ends: np.ndarray) -> np.ndarray:
 def _sketch(piece: list[_Plate], left: float, above: float) -> list[Shape]:
     """Return a small sketch of the plates, each with the name of its face, and the numbers of its circles."""
     every = np.concatenate([plate.corners() for plate in piece])
-    shift = np.array([left, above]) - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
-    shapes: list[Shape] = []
+    scale = SKETCH if any(plate.face.printed for plate in piece) else SKETCH_OF_CIRCLES
+    shift = np.array([left, above]) - scale * np.array([every[:, 0].min(), every[:, 1].max()])
+    words: list[Text] = []
     for plate in piece:
-        corners = SKETCH * plate.corners() + shift
-        shapes.append(Line(corners, "LABELS", closed=True))
-        circles: list[Text] = []
         if plate.face.printed is None:  # corners of tags have no numbers
-            places = SKETCH * plate.place(plate.face.xy_mm) + shift
-            circles = words_with_room(places, plate.face.ids, SMALL_LETTERS)
-        x, y = corners.mean(0).tolist()
-        heights = np.linspace(corners[:, 1].min(), corners[:, 1].max(), HEIGHTS)[1:-1]
-        places = np.array([(x, y), *((x, height) for height in sorted(heights, key=lambda height: abs(height - y)))])
-        names = words_with_room(places, [plate.face.id] * len(places), LETTERS, circles)
-        shapes += [*circles, names[0] if names else Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle")]
-    return shapes
+            places = scale * plate.place(plate.face.xy_mm) + shift
+            words += words_with_room(places, plate.face.ids, SMALL_LETTERS, words)
+    outlines = [scale * plate.corners() + shift for plate in piece]
+    for plate, corners in zip(piece, outlines, strict=True):
+        words.append(_name(plate.face.id, corners, words))
+    return [*(Line(corners, "LABELS", closed=True) for corners in outlines), *words]
+
+
+def _name(face: str, corners: np.ndarray, words: list[Text]) -> Text:
+    """Return the name of a face within a plate of the sketch, near its middle, if there is room between ``words``."""
+    middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
+    inner = np.maximum(half - Text(0, 0, face, LETTERS, "middle").box()[1], 0)
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, PLACES)]), axis=-1).reshape(-1, 2) * inner
+    grid = np.concatenate([np.zeros((1, 2)), grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")]])
+    free = words_with_room(middle + grid, [face] * len(grid), LETTERS, words)
+    return free[0] if free else Text(*(middle - [0, LETTERS / 2]).tolist(), face, LETTERS, "middle")

@@ -304,7 +304,9 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     lengths = tmp_path / "lengths.csv"
     lengths.write_text("from,to,length_mm\n1:1,1:2,1000\n")
     words = ("--check-lengths", lengths, "--report", page, "--json", out, "--no-strict", "--quiet")
-    assert stcal_sfm("budget", copy, *words) == (0, "", "")
+    code, text, error = stcal_sfm("budget", copy, *words)
+    assert (code, text, error.count("\n")) == (0, "", 1)
+    assert error.startswith("warning: may run ")
     html, file = page.read_text(), json.loads(out.read_text())
     assert "do not hold before it is put right" in html
     assert "Lengths and positions hold" not in text + html
