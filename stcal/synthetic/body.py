@@ -42,7 +42,7 @@ SHOWN_DEG, SQUARE_DEG = 60.0, 45.0
 shows the face squarely."""
 ENOUGH_VIEWS, ENOUGH_SQUARE = 5, 2
 """Number of photographs that show each face, and of those that show it squarely, as far as there are enough of them."""
-TRIALS, CHOICES = 2000, 12
+TRIALS, CHOICES = 2000, 24
 """Number of poses that are tried for a photograph, and number of suitable ones of which the best is taken."""
 BORDER = 0.01
 """Free border of the image, in image widths: faces are not quite where the design has them."""
@@ -205,7 +205,7 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     poses: list[Rigid] = []
     tilts_deg: dict[str, tuple[float, ...]] = dict.fromkeys(design, ())
     for left in range(options.images, 0, -1):
-        choices = CHOICES if left <= sum(map(_lacking, tilts_deg.values())) else 1
+        choices = CHOICES if left <= 2 * sum(map(_lacking, tilts_deg.values())) else 1
         pose, tilts_deg = min(_poses(scene, choices, tilts_deg, rng), key=lambda each: _lack(each[1]))
         poses.append(pose)
     off_mm = _print_errors(target, camera, options)
