@@ -218,4 +218,5 @@ def _name(face: str, corners: np.ndarray, words: list[Text]) -> Text:
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, PLACES)]), axis=-1).reshape(-1, 2) * inner
     grid = np.concatenate([np.zeros((1, 2)), grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")]])
     free = words_with_room(middle + grid, [face] * len(grid), LETTERS, words)
-    return free[0] if free else Text(*(middle - [0, LETTERS / 2]).tolist(), face, LETTERS, "middle")
+    x, y = middle.tolist()
+    return free[0] if free else Text(x, y - LETTERS / 2, face, LETTERS, "middle")
