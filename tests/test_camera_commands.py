@@ -53,6 +53,8 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]},
 projection_matrix: {rows: 3, cols: 4, data: [900, 0, 640, -90, 0, 905, 475, 0, 0, 0, 1, 0]},
 camera_matrix_std: [0.1, 0.1, 0.2, 0.2]}
 """
+FRAMES = """{"camera_model": "OPENCV", "fl_x": 900, "fl_y": 905, "cx": 640.5, "cy": 475.5, "w": 1280, "h": 960,
+"k1": -0.1, "k2": 0.03, "p1": 0.001, "p2": -0.002, "frames": [{"file_path": "a.jpg", "transform_matrix": [[1]]}]}"""
 MRCAL = """{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [900, 905, 640, 475, -0.1, 0.03, 0.001, -0.002],
 'extrinsics': [0, 0, 0, 0.1, 0, 0], 'imagersize': [1280, 960], 'valid_intrinsics_region': [[9, 9], [99, 9], [9, 99]]}"""
 
@@ -64,6 +66,7 @@ MRCAL = """{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [900, 905, 640, 475,
         (RIG, ("--name", "cam0"), ["the other camera, cam1"]),
         (ROS, (), ["projection_matrix, camera_matrix_std"]),
         (MRCAL, (), ["extrinsics", "valid_intrinsics_region"]),
+        (FRAMES, (), ["frames"]),
         ("1 OPENCV 1280 960 900 905 640.5 475.5 -0.1 0.03 0.001 -0.002\n", (), []),
     ],
 )
@@ -76,6 +79,20 @@ def test_what_a_conversion_drops_is_named_in_one_line(tmp_path, stated, choice, 
     assert "not in" not in result.stdout
     assert result.stderr == (f"warning: not in {tmp_path / 'out.txt'}: {'; '.join(lost)}\n" if lost else "")
     assert read_camera(tmp_path / "out.txt").calibrated(0, 0).same_as(CAMERA)
+
+
+def test_the_sigma_of_a_lens_that_is_fitted_is_missed(tmp_path):
+    """Metashape's b2 has no place here: its lens is fitted, and the covariance of its parameters is of no use then."""
+    (tmp_path / "in.xml").write_text(
+        "<document><chunk><sensors><sensor id='0' label='a'><calibration class='adjusted'><resolution width='1280' "
+        "height='960'/><f>900</f><b2>0.5</b2></calibration><covariance><params>f</params><coeffs>0.01</coeffs>"
+        "</covariance></sensor></sensors><cameras><camera id='0'><transform>1</transform></camera></cameras></chunk>"
+        "</document>"
+    )
+    result = CliRunner().invoke(app, ["convert", str(tmp_path / "in.xml"), str(tmp_path / "b.txt")])
+    assert result.exit_code == 0
+    lost = "poses of the photographs; σ and correlations of the parameters"
+    assert result.stderr == f"warning: not in {tmp_path / 'b.txt'}: {lost}\n"
 
 
 def test_a_size_that_the_file_does_not_state_is_asked_for(folder):

@@ -228,7 +228,8 @@ def _with_numbers(unread: Mapping) -> list[str]:
     for keys, value in leaves(unread):
         numbers = numbers_of(value)
         is_identity = numbers.size == 9 and (numbers == np.eye(3).ravel()).all()
-        if numbers.size and numbers.any() and not is_identity and not isinstance(value, str | bool):
+        is_nested = isinstance(value, list) and any(isinstance(each, dict | list) for each in value)
+        if not isinstance(value, str | bool) and (numbers.any() if numbers.size else is_nested) and not is_identity:
             named.append(".".join(keys))
     return named
 
