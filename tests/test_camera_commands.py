@@ -32,10 +32,67 @@ def call(*words):
 
 def test_a_camera_goes_to_kalibr_and_back(folder):
     said = call("convert", folder / "a.txt", folder / "chain.yaml", "--form", "kalibr", "--name", "cam3")
-    assert "note: not in kalibr: σ and correlations of the parameters" in said
+    assert "chain.yaml: σ and correlations of the parameters" in said
     assert (folder / "chain.yaml").read_text().startswith("cam3:")
     call("convert", folder / "chain.yaml", folder / "b.txt")
     assert read_camera(folder / "b.txt").calibrated(0, 0).same_as(CAMERA)
+
+
+RIG = """
+cam0: {camera_model: pinhole, intrinsics: [900, 905, 640, 475], distortion_model: radtan,
+  distortion_coeffs: [-0.1, 0.03, 0.001, -0.002], resolution: [1280, 960], rostopic: /left}
+cam1: {camera_model: pinhole, intrinsics: [900, 905, 640, 475], distortion_model: radtan, rostopic: /right,
+  distortion_coeffs: [-0.1, 0.03, 0.001, -0.002], resolution: [1280, 960], timeshift_cam_imu: 0.0,
+  T_cn_cnm1: [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}
+"""
+ROS = """
+{image_width: 1280, image_height: 960, distortion_model: plumb_bob,
+camera_matrix: {rows: 3, cols: 3, data: [900, 0, 640, 0, 905, 475, 0, 0, 1]},
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.03, 0.001, -0.002, 0]},
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]},
+projection_matrix: {rows: 3, cols: 4, data: [900, 0, 640, -90, 0, 905, 475, 0, 0, 0, 1, 0]},
+camera_matrix_std: [0.1, 0.1, 0.2, 0.2]}
+"""
+FRAMES = """{"camera_model": "OPENCV", "fl_x": 900, "fl_y": 905, "cx": 640.5, "cy": 475.5, "w": 1280, "h": 960,
+"k1": -0.1, "k2": 0.03, "p1": 0.001, "p2": -0.002, "frames": [{"file_path": "a.jpg", "transform_matrix": [[1]]}]}"""
+MRCAL = """{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [900, 905, 640, 475, -0.1, 0.03, 0.001, -0.002],
+'extrinsics': [0, 0, 0, 0.1, 0, 0], 'imagersize': [1280, 960], 'valid_intrinsics_region': [[9, 9], [99, 9], [9, 99]]}"""
+
+
+@pytest.mark.parametrize(
+    ("stated", "choice", "lost"),
+    [
+        (RIG, ("--name", "cam1"), ["the other camera, cam0", "T_cn_cnm1"]),
+        (RIG, ("--name", "cam0"), ["the other camera, cam1"]),
+        (ROS, (), ["projection_matrix, camera_matrix_std"]),
+        (MRCAL, (), ["extrinsics", "valid_intrinsics_region"]),
+        (FRAMES, (), ["frames"]),
+        ("1 OPENCV 1280 960 900 905 640.5 475.5 -0.1 0.03 0.001 -0.002\n", (), []),
+    ],
+)
+def test_what_a_conversion_drops_is_named_in_one_line(tmp_path, stated, choice, lost):
+    """All of these are the same camera. Names, rotations by nothing and zeros are not missed."""
+    (tmp_path / "in").write_text(stated)
+    words = ["convert", tmp_path / "in", tmp_path / "out.txt", *choice]
+    result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert result.exit_code == 0
+    assert "not in" not in result.stdout
+    assert result.stderr == (f"warning: not in {tmp_path / 'out.txt'}: {'; '.join(lost)}\n" if lost else "")
+    assert read_camera(tmp_path / "out.txt").calibrated(0, 0).same_as(CAMERA)
+
+
+def test_the_sigma_of_a_lens_that_is_fitted_is_missed(tmp_path):
+    """Metashape's b2 has no place here: its lens is fitted, and the covariance of its parameters is of no use then."""
+    (tmp_path / "in.xml").write_text(
+        "<document><chunk><sensors><sensor id='0' label='a'><calibration class='adjusted'><resolution width='1280' "
+        "height='960'/><f>900</f><b2>0.5</b2></calibration><covariance><params>f</params><coeffs>0.01</coeffs>"
+        "</covariance></sensor></sensors><cameras><camera id='0'><transform>1</transform></camera></cameras></chunk>"
+        "</document>"
+    )
+    result = CliRunner().invoke(app, ["convert", str(tmp_path / "in.xml"), str(tmp_path / "b.txt")])
+    assert result.exit_code == 0
+    lost = "poses of the photographs; σ and correlations of the parameters"
+    assert result.stderr == f"warning: not in {tmp_path / 'b.txt'}: {lost}\n"
 
 
 def test_a_size_that_the_file_does_not_state_is_asked_for(folder):

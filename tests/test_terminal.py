@@ -15,7 +15,7 @@ from typer.models import OptionInfo, ParameterInfo
 from typer.testing import CliRunner
 
 import stcal
-from stcal.cli import terminal
+from stcal.cli import options, terminal
 from stcal.cli.help import PANELS
 from stcal.cli.main import app, main
 from stcal.cli.sfm import app as sfm
@@ -283,6 +283,32 @@ def test_warnings_of_a_quiet_command(capsys):
         terminal.print_each("note", ["a"])
         terminal.print_each("warning", ["b\x1b"])
     assert capsys.readouterr() == ("", "warning: b?\n")
+
+
+RULES = (options.require_passed, options.require_usable)
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(("failed", "verdict"), [(["a", "b"], "do not use: a"), ([], "with care: c")])
+def test_a_quiet_command_says_a_verdict_that_is_not_good(capsys, rule, failed, verdict):
+    """Once: as an error where it ends the command, else as a warning; not beside what a loud command printed."""
+    with terminal.manner(True, False):
+        rule(False, failed, None, verdict)
+        assert capsys.readouterr() == ("", f"warning: {verdict}\n")
+        rule(False, [], None)
+        if failed:
+            with fails_with("E-CHECKS-FAILED … a"):
+                rule(True, failed, None, verdict)
+    with terminal.manner(False, False):
+        rule(False, failed, None, verdict)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_quiet_command_without_a_sentence_says_what_failed(capsys):
+    with terminal.manner(True, False):
+        for rule in RULES:
+            rule(False, ["χ² of a.jpg"])
+    assert capsys.readouterr() == ("", "warning: failed: χ² of a.jpg\nwarning: χ² of a.jpg\n")
 
 
 def test_every_command_can_be_quiet_or_say_more():

@@ -7,7 +7,7 @@ import typer
 
 from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.terminal import print_each, say
+from stcal.cli.terminal import print_each, say, warn
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,13 +47,16 @@ def convert(
     size: SizeOption = "",
 ) -> None:
     """Convert a camera file to the form of another program, and say what that form cannot hold."""
+    from stcal.io.cameras.keys import collecting_passed_over
     from stcal.io.cameras.write import form_of, save_camera
 
     kind = form_of(out, form)
-    camera = _lens(source, name, size).camera
+    with collecting_passed_over() as passed_over:
+        camera = _lens(source, name, size).camera
     lost = save_camera(out, camera, kind, name)
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
-    print_each(f"note: not in {kind}", lost)
+    if lost or passed_over:
+        warn(f"not in {out}: {'; '.join([*lost, *passed_over])}")
     say(f"written: {out}")
 
 

@@ -8,7 +8,7 @@ import typer
 from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
+from stcal.cli.terminal import StageProgress, print_each, say, warn_if_quiet, write, write_if
 
 app = typer.Typer(
     name="stcal locate",
@@ -220,5 +220,6 @@ def run(
     write_if(json_file, lambda: LocatedFile.of(results, target, chain))
     write_if(report, document.page)
     if not accepted(results):
-        say(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
+        say(verdict := f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
+        warn_if_quiet(verdict)
         raise typer.Exit(NOTHING_ACCEPTED)

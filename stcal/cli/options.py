@@ -14,7 +14,7 @@ import typer
 
 from stcal.cli.declare import Arg, Opt, declared
 from stcal.cli.help import Command
-from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say
+from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say, warn_if_quiet
 from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
 from stcal.io.files import keep_apart
 
@@ -53,6 +53,8 @@ PlateMargin = Annotated[
     "Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
     Opt("--margin-mm", min=0, max=1e4),
 ]
+Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)]
+"""Distance of the camera in `design`, `plan` and `simulate`: photographs that are forecast can be simulated."""
 FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."]
 RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
 LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
@@ -78,7 +80,7 @@ StrictByDefault = Annotated[
 """Option of the commands that say whether a run may be used."""
 Overwrite = Annotated[bool, "Replace existing output files.", Opt("--overwrite")]
 """Option of every command that writes a file."""
-Quiet = Annotated[bool, "Print only warnings and errors.", Opt("--quiet -q")]
+Quiet = Annotated[bool, "Print only warnings and errors, and a verdict that is not good.", Opt("--quiet -q")]
 Verbose = Annotated[
     bool, "Print more: each step, the time of each stage, and what is found in the images.", Opt("--verbose -v")
 ]
@@ -223,8 +225,11 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
     return dask_cluster(scheduler, send_images)
 
 
-def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None) -> None:
-    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given."""
+def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None, verdict: str = "") -> None:
+    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given.
+
+    Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, what failed.
+    """
     if strict and failed:
         others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
         where = f"; see {report}" if report else ""
@@ -232,16 +237,23 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
             "E-CHECKS-FAILED",
             f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them{where}",
         )
+    if verdict or failed:
+        warn_if_quiet(verdict or f"failed: {', '.join(failed)}")
 
 
-def require_usable(strict: bool, reasons: Sequence[str], page: Path | None = None) -> None:
-    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given."""
+def require_usable(strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "") -> None:
+    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given.
+
+    Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, the reasons.
+    """
     if strict and reasons:
         where = f"; see {page}" if page else ""
         raise ChecksFailed(
             "E-CHECKS-FAILED",
             f"{'; '.join(reasons)}; results are written, do not use them; --no-strict ends with 0{where}",
         )
+    if verdict or reasons:
+        warn_if_quiet(verdict or "; ".join(reasons))
 
 
 def load_ahead(workers: int | None) -> None:

@@ -193,9 +193,20 @@ def _escaped(text: str, encoding: str) -> str:
     return re.sub(r"[^ -~\n]", lambda c: c[0] if is_utf8 and c[0].isprintable() else json.dumps(c[0])[1:-1], text)
 
 
+def warn(line: object) -> None:
+    """Writes a warning to standard error, also if the command is quiet."""
+    sys.stderr.write(f"{printable(f'warning: {line}')}\n")
+
+
+def warn_if_quiet(verdict: str) -> None:
+    """Writes the sentence of a verdict that is not good to standard error if the command is quiet, which hid it."""
+    if _quiet.get():
+        warn(verdict)
+
+
 def print_each(said: str, lines: Iterable[object]) -> None:
-    """Prints each item on a line of its own, after the word ``said``."""
+    """Prints each item on a line of its own, after the word ``said``; a warning also if the command is quiet."""
     for line in lines:
-        if _quiet.get() and said.startswith("warning"):
-            sys.stderr.write(f"{printable(f'{said}: {line}')}\n")
+        if said.startswith("warning"):
+            warn_if_quiet(f"{said}: {line}".removeprefix("warning: "))
         say(f"{said}: {line}")

@@ -80,7 +80,7 @@ def draw(
     name, loaded = (design, load_design(design)) if isinstance(design, str | Path) else (type(design).__name__, design)
     if net and not isinstance(loaded, TargetDesign):
         raise InputError("E-DRAW-DESIGN", f"--net: {name} is a board; nets are of targets")
-    parts = net_parts(loaded) if net and isinstance(loaded, TargetDesign) else _parts(loaded, margin_mm)
+    parts = net_for(loaded, paper) if net and isinstance(loaded, TargetDesign) else _parts(loaded, margin_mm)
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
     save(path, content_of(sheets, path))
@@ -89,6 +89,15 @@ def draw(
 
 def _parts(what: Design, margin_mm: float) -> list[Part]:
     return target_parts(what, margin_mm) if isinstance(what, TargetDesign) else board_parts(what, margin_mm)
+
+
+def net_for(target: TargetDesign, paper: str) -> list[Part]:
+    """Return the net in few pieces, or, if a seam would run through a circle or tag, in pieces of one sheet each."""
+    few = net_parts(target)
+    if paper == OWN or not any(sheet.cuts for sheet in paper_sheets(few, paper, "")):
+        return few
+    small = net_parts(target, lambda part: len(paper_sheets([part], paper, "")) == 1)
+    return few if any(sheet.cuts for sheet in paper_sheets(small, paper, "")) else small
 
 
 def load_design(path: str | Path) -> Design:
@@ -177,8 +186,9 @@ def drawn_text(drawn: Drawn) -> str:
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
         single = ", or one by one without --net" if drawn.parts[0].name.startswith("net") else ""
+        through = ", the worse as one runs through a pattern" if any(sheet.cuts for sheet in drawn.sheets) else ""
         lines.append(
-            f"parts that are glued of several sheets are off at the seams, the worse where one runs through a pattern: "
-            f"state it in sigma_mm, or {larger}{single}"
+            f"parts that are glued of several sheets are off at the seams{through}: state it in sigma_mm, or "
+            f"{larger}{single}"
         )
     return "\n".join(lines)

@@ -3,14 +3,14 @@
 The plates are the faces' ``outline_mm``, placed by their rough poses.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.drawing.parts import Part, as_seen, face_part
-from stcal.drawing.shapes import Area, Disc, Line, Shape, Text
+from stcal.drawing.shapes import Area, Disc, Line, Shape, Text, words_with_room
 from stcal.errors import InputError
 from stcal.io.design import ROUGH_KEYS
 
@@ -18,10 +18,13 @@ TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
 """Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
 TAB_MM, TAB_SHARE = 10.0, 0.25
 """Largest width of a tab, mm, and as a share of its edge."""
-SKETCH = 1 / 8
-"""Scale of the sketch that names the faces."""
+SKETCH, SKETCH_OF_CIRCLES = 1 / 8, 1 / 5
+"""Scale of the sketch that names the faces, and of one that numbers their circles too."""
 APART = 15.0
-LETTERS = 2.0
+LETTERS, SMALL_LETTERS = 2.0, 1.2
+"""Height of names, and of the numbers of circles in the sketch, mm."""
+PLACES = 17
+"""Number of places, across and up, where a name in the sketch may have room between the numbers."""
 TOUCH = 1e-3
 """Overlap of plates that counts as rounding, mm."""
 
@@ -43,8 +46,10 @@ class _Plate:
         return self.place(self.face.outline_mm)
 
 
-def net_parts(target: TargetDesign) -> list[Part]:
+def net_parts(target: TargetDesign, fits: Callable[[Part], bool] = lambda _: True) -> list[Part]:
     """Return the net in few pieces, in each of which no plates overlap.
+
+    ``fits`` : whether a piece of several plates may be as large as this; by default it may always.
 
     Raises InputError: a face has no outline or rough pose, or no two plates share an edge.
     """
@@ -74,10 +79,13 @@ def net_parts(target: TargetDesign) -> list[Part]:
                 if partner is None or partner[0] not in free:
                     continue
                 unfolded = _unfolded(plate, edge, target.face(partner[0]), partner[1])
-                if _is_clear(unfolded.corners(), piece):
+                if not _is_clear(unfolded.corners(), piece):
+                    continue
+                more = folds | {((plate.face.id, edge), partner), (partner, (plate.face.id, edge))}
+                if fits(_part("net", [*piece, unfolded], target, shared, more)):
                     piece.append(unfolded)
                     free.remove(partner[0])
-                    folds |= {((plate.face.id, edge), partner), (partner, (plate.face.id, edge))}
+                    folds = more
         pieces.append(piece)
         remaining = [face for face in remaining if face.id in free]
     names = [f"net {n} of {len(pieces)}" for n in range(1, len(pieces) + 1)] if len(pieces) > 1 else ["net"]
@@ -188,13 +196,27 @@ def _tab(ends: np.ndarray) -> np.ndarray:
 
 
 def _sketch(piece: list[_Plate], left: float, above: float) -> list[Shape]:
-    """Return a small sketch of the plates, each with the name of its face."""
+    """Return a small sketch of the plates, each with the name of its face, and the numbers of its circles."""
     every = np.concatenate([plate.corners() for plate in piece])
-    shift = np.array([left, above]) - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
-    shapes: list[Shape] = []
+    scale = SKETCH if any(plate.face.printed for plate in piece) else SKETCH_OF_CIRCLES
+    shift = np.array([left, above]) - scale * np.array([every[:, 0].min(), every[:, 1].max()])
+    words: list[Text] = []
     for plate in piece:
-        corners = SKETCH * plate.corners() + shift
-        x, y = corners.mean(0).tolist()
-        shapes.append(Line(corners, "LABELS", closed=True))
-        shapes.append(Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle"))
-    return shapes
+        if plate.face.printed is None:  # corners of tags have no numbers
+            places = scale * plate.place(plate.face.xy_mm) + shift
+            words += words_with_room(places, plate.face.ids, SMALL_LETTERS, words)
+    outlines = [scale * plate.corners() + shift for plate in piece]
+    for plate, corners in zip(piece, outlines, strict=True):
+        words.append(_name(plate.face.id, corners, words))
+    return [*(Line(corners, "LABELS", closed=True) for corners in outlines), *words]
+
+
+def _name(face: str, corners: np.ndarray, words: list[Text]) -> Text:
+    """Return the name of a face within a plate of the sketch, near its middle, if there is room between ``words``."""
+    middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
+    inner = np.maximum(half - Text(0, 0, face, LETTERS, "middle").box()[1], 0)
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, PLACES)]), axis=-1).reshape(-1, 2) * inner
+    grid = np.concatenate([np.zeros((1, 2)), grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")]])
+    free = words_with_room(middle + grid, [face] * len(grid), LETTERS, words)
+    x, y = middle.tolist()
+    return free[0] if free else Text(x, y - LETTERS / 2, face, LETTERS, "middle")

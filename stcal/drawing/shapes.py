@@ -1,5 +1,6 @@
 """Elements of drawings: discs, areas, lines, words; mm, X to the right, Y upwards."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -102,6 +103,18 @@ def moved(shape: Shape, x: float, y: float) -> Shape:
 
 def _box(points: np.ndarray) -> np.ndarray:
     return np.array([points.min(0), points.max(0)])
+
+
+def words_with_room(places: np.ndarray, words: Iterable[str], height: float, taken: Iterable[Text] = ()) -> list[Text]:
+    """Return words about their places (n, 2), without those that would overlap others before, or the ``taken`` ones."""
+    found, boxes = [], [text.box() for text in taken]
+    for (x, y), word in zip(places.tolist(), words, strict=True):
+        text = Text(x, y - height / 2, word, height, "middle")
+        low, high = text.box()
+        if all((low >= box[1]).any() or (high <= box[0]).any() for box in boxes):
+            found.append(text)
+            boxes.append(text.box())
+    return found
 
 
 def said_mm(value: float) -> str:

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from stcal.drawing.parts import Part
-from stcal.drawing.shapes import WIDTH_PER_HEIGHT, Line, Shape, Text, extent, moved, said_mm
+from stcal.drawing.shapes import WIDTH_PER_HEIGHT, Disc, Line, Shape, Text, extent, moved, said_mm, words_with_room
 from stcal.errors import InputError
 
 APART = 6.0
@@ -18,6 +18,8 @@ CUT_FROM, CUT_TO = 1.5, 5.0
 LETTERS = 2.0
 ROW = 4.0
 COLUMN_GAP = 3.0
+PLAN, PLAN_LETTERS = 45.0, 1.5
+"""Longer side of the plan of a plate, and height of its numbers, mm."""
 BAR, SHORT_BAR = 100.0, 50.0
 """Lengths of scale bars, mm."""
 
@@ -37,7 +39,7 @@ def framed(part: Part) -> list[Shape]:
 
 
 def table(part: Part, below: bool) -> list[Shape]:
-    """Return the part's table, beside or below the shapes of :func:`framed`."""
+    """Return the part's table and plan, beside or below the shapes of :func:`framed`."""
     if not part.table:
         return []
     box = extent(framed(part))
@@ -54,7 +56,24 @@ def table(part: Part, below: bool) -> list[Shape]:
     for number, row in enumerate(rows, 1):
         places = zip(row, ends.tolist(), strict=True)
         shapes += [Text(end - COLUMN_GAP, y - ROW * number, word, LETTERS, "end") for word, end in places]
-    return shapes
+    corner = (float(ends[-1]), y + LETTERS) if below else (x, y - ROW * len(part.table))
+    return [*shapes, *_plan(part, np.array(corner))]
+
+
+def _plan(part: Part, corner: np.ndarray) -> list[Shape]:
+    """Return a small plan of a plate, with the number of each circle in its place; ``corner`` : its upper left corner.
+
+    The plate itself has no numbers, since a detector may take letters for circles.
+    """
+    low, high = part.outline.min(0), part.outline.max(0)
+    scale, left_above = min(PLAN / float((high - low).max()), 1.0), np.array([low[0], high[1]])
+    discs = [shape for shape in part.pattern() if isinstance(shape, Disc)]
+    places = corner + scale * (np.array([(disc.x, disc.y) for disc in discs]) - left_above)
+    ids = [row[0] for row in part.table[2:]]
+    return [
+        Line(corner + scale * (part.outline - left_above), "LABELS", closed=True),
+        *words_with_room(places, ids, PLAN_LETTERS),
+    ]
 
 
 def scale_bars(width: float, height: float) -> list[Shape]:
@@ -147,12 +166,13 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A page with its origin at the bottom left."""
+    """A page with its origin at the bottom left; ``cuts`` : whether a seam runs through the pattern of its part."""
 
     title: str
     width: float
     height: float
     placed: tuple[Placed, ...]
+    cuts: bool = False
 
     def shapes(self) -> list[Shape]:
         """Return all shapes of the page."""
@@ -179,11 +199,11 @@ def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
 
 
 def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
-    """Return the sheets of a paper for all parts, as few as possible for each part.
+    """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
 
     Raises InputError: there would be more than :data:`MOST_SHEETS`.
     """
-    split = [min(_ways(part, paper), key=lambda way: way.count()) for part in parts]
+    split = [min(_ways(part, paper), key=lambda way: (way.cuts(), way.count())) for part in parts]
     total = sum(way.count() for way in split)
     if total > MOST_SHEETS:
         raise InputError(
@@ -204,6 +224,15 @@ class _Way:
     box: np.ndarray
     size: tuple[float, float]
     seams: tuple[list[float], list[float]]
+    pattern: np.ndarray
+
+    def cuts(self) -> bool:
+        """Return True if a seam runs through a circle, square or tag; ``pattern`` : their boxes, (n, 2, 2)."""
+        return any(
+            ((self.pattern[:, 0, k] < seam) & (self.pattern[:, 1, k] > seam)).any()
+            for k in (0, 1)
+            for seam in self.seams[k]
+        )
 
     def count(self) -> int:
         """Return the number of sheets."""
@@ -225,7 +254,7 @@ def _ways(part: Part, paper: str) -> list[_Way]:
             seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k], words[:, :, k])
             for k in (0, 1)
         )
-        ways.append(_Way(shapes, box, size, (across, down)))
+        ways.append(_Way(shapes, box, size, (across, down), boxes))
     return ways
 
 
@@ -234,14 +263,15 @@ def seams_between(
 ) -> list[float]:
     """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
 
-    Seams avoid the intervals ``taken`` (n, 2), and those of ``words`` (m, 2) too where they can, if the second half
-    of a piece has a free place.
+    Seams avoid the intervals ``taken`` (n, 2) if a piece has a free place, and those of ``words`` (m, 2) too if its
+    second half has one.
     """
     both = taken if words is None else np.concatenate([taken, words])
     seams, start = [], low
     while high - start > room:
         last = start + room - OVERLAP / 2
-        places = (_free(last, start + room / 2, avoided) for avoided in (both, taken))
+        choices = ((start + room / 2, both), (start + room / 2, taken), (start + OVERLAP, taken))
+        places = (_free(last, first, avoided) for first, avoided in choices)
         seams.append(next((place for place in places if place is not None), last))
         start = seams[-1] - OVERLAP / 2
     return seams
@@ -275,7 +305,7 @@ def _tiles(way: _Way, title: str) -> list[Sheet]:
             ]
             shapes_of_sheet = tuple(moved(shape, *shift) for shape in inside)
             place = f"sheet {len(sheets) + 1} of {way.count()}: row {row}, column {column}"
-            sheets.append(_sheet(f"{title}; {place}", *way.size, shapes_of_sheet, clip + shift))
+            sheets.append(_sheet(f"{title}; {place}", *way.size, shapes_of_sheet, clip + shift, way.cuts()))
     return sheets
 
 
@@ -300,11 +330,11 @@ def _registration(way: _Way) -> list[Shape]:
     return marks
 
 
-def _sheet(title: str, width: float, height: float, shapes: tuple[Shape, ...], clip=None) -> Sheet:
+def _sheet(title: str, width: float, height: float, shapes: tuple[Shape, ...], clip=None, cuts: bool = False) -> Sheet:
     """Return a sheet with its scale bars and its title."""
     bars = [moved(shape, EDGE, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
     instruction = "1:1: print at 100 %, not fitted to the page, and measure the bars"
     if clip is not None:
         instruction += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
     words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, instruction, 1.6)]
-    return Sheet(title, width, height, (Placed(shapes, clip), Placed((*bars, *words))))
+    return Sheet(title, width, height, (Placed(shapes, clip), Placed((*bars, *words))), cuts)

@@ -180,20 +180,25 @@ def checked_name(name: str, what: str) -> str:
 
 @contextmanager
 def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
-    """Open a camera, a stream or a video file, and return its pictures, grey.
+    """Open a camera, a stream, a video file or a folder of images, and return its pictures, grey.
 
-    Pictures of a camera or a stream that come while one is measured are left out; of a video file none is.
+    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is.
 
     Parameters
     ----------
     source : int or str
-        Number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), or a video file.
+        Number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), a video file, or a folder,
+        whose images come in order of name.
 
     Raises
     ------
     InputError
         If it cannot be opened or gives no picture; in between, if no picture comes for ``PATIENCE_S``.
     """
+    if isinstance(source, str) and Path(source).is_dir():
+        paths = [file.path for file in find_images(source)[0]]
+        yield (grey_8bit(decode(read_bytes(path, IMAGE_BYTES), str(path))) for path in paths)
+        return
     what = f"--camera-index {source}" if isinstance(source, int) else f"--live {source}"
     device = _device(source)
     is_file = isinstance(source, str) and Path(source).is_file()
@@ -201,7 +206,8 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
     try:
         if not device.isOpened():
             raise InputError(
-                "E-LIVE-SOURCE", f"{what}: cannot be opened; give a camera's number, a stream's URL or a video file"
+                "E-LIVE-SOURCE",
+                f"{what}: cannot be opened; give a camera's number, a stream's URL, a video file or a folder of images",
             )
         first = next(pictures, None)
         if first is None:

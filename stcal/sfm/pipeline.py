@@ -56,6 +56,7 @@ from stcal.sfm.runs.detection import (
 )
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import (
@@ -245,11 +246,13 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
         detection, labelled = labelled_images(task, model)
     if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
         _require_seen(task, labelled)
-    with overlays_beside(detection, labelled, target, task.folder, task.progress):
+    with overlays_beside(detection, labelled, target, task.folder, task.progress) as left_out:
         if is_board_assumed and not options.board_only and not _shows_dots(labelled):
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
             task = replace(task, target=target, board=scale_reference(None, target))
-        return _solved(task, detection, labelled, model)
+        result = _solved(task, detection, labelled, model)
+        left_out.update(unadjusted(result))
+    return result
 
 
 def _with_found_camera(task: Task) -> tuple[DetectionResult, list[LabelledImage], CameraModel]:

@@ -1,7 +1,7 @@
 """Photographs of a body held before a camera in changing poses, with its truth: printed faces, and faces of circles."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -37,9 +37,15 @@ BEND_MM = 0.02
 """σ of a point of a printed face about its plane."""
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
-LEAST_VIEWS = 2
-"""Number of photographs that show each face, as far as there are enough of them."""
-TRIALS = 2000
+SHOWN_DEG, SQUARE_DEG = 60.0, 45.0
+"""Largest angles between the normal of a face and the line of sight: where a photograph shows the face, and where it
+shows the face squarely."""
+ENOUGH_VIEWS, ENOUGH_SQUARE = 5, 2
+"""Number of photographs that show each face, and of those that show it squarely, as far as there are enough of them."""
+TRIALS, CHOICES = 2000, 24
+"""Number of poses that are tried for a photograph, and number of suitable ones of which the best is taken."""
+BORDER = 0.01
+"""Free border of the image, in image widths: faces are not quite where the design has them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +121,23 @@ class BodyScene:
 
     def faces_in_view(self, image: int) -> list[FaceDesign]:
         """Returns the faces that a photograph shows well."""
-        return [face for face in self.target.faces if _looks_here(self, face, self.camera_from_target[image])]
+        shown = _shown_deg(self, self.camera_from_target[image])
+        return [face for face in self.target.faces if face.id in shown]
+
+    def hardly_seen(self) -> str:
+        """Returns a sentence on the faces that, as designed, too few photographs show; empty if there is none."""
+        design = replace(self, target_from_face=_in_first_face(self.target.rough_poses()))
+        shown = [_shown_deg(design, pose) for pose in self.camera_from_target]
+        named = []
+        for face in self.target.faces:
+            tilts = [tilt_deg for tilts_deg in shown for tilt_deg in tilts_deg.get(face.id, ())]
+            if _lacking(tilts):
+                best = f", at best {min(tilts):.0f}° from its normal" if tilts else ""
+                named.append(f"{face.id} ({len(tilts)} of {len(shown)} images{best})")
+        enough = (
+            f"better {ENOUGH_VIEWS} of each, {ENOUGH_SQUARE} of them within {SQUARE_DEG:.0f}°: more --images needed"
+        )
+        return f"hardly seen: face {', '.join(named)}; {enough}" if named else ""
 
 
 @require_arguments
@@ -142,7 +164,9 @@ def body_camera(width: int) -> Camera:
 def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions | None = None) -> BodyScene:
     """Returns a body with faces near their rough poses, in random poses in which it shows two faces at least.
 
-    The last photographs show the faces that fewer than two of the others do.
+    The poses follow from the design alone, so that a forecast and a simulation of the same options have the same. As
+    soon as the photographs left may just be enough, they show what lacks most: each face is to be in five photographs,
+    and within 45° of its normal in two of them. :meth:`BodyScene.hardly_seen` says which faces are not.
 
     Parameters
     ----------
@@ -161,7 +185,7 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     Raises
     ------
     InputError
-        A face has no rough pose.
+        A face has no rough pose, or the camera is too near for the image to hold the body.
     """
     options, rough = options or BodyOptions(), target.rough_poses()
     for face in target.faces:
@@ -171,25 +195,27 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
                 f"face {face.id}: no rough_pose; photographs of a body need one of each face in target.toml",
             )
     rng = np.random.default_rng(options.seed)
-    reference = rough[target.faces[0].id]
     moved = {}
     for face_id, pose in rough.items():
         turn = Rotation.from_rotvec(np.radians(options.pose_sigma_deg) * rng.normal(size=3)).as_matrix()
         shift = options.pose_sigma_mm * rng.normal(size=3)
         moved[face_id] = Rigid(pose.rotation @ turn, pose.translation + shift)
-    reference = moved[target.faces[0].id]
-    target_from_face = {face_id: reference.inverse() @ pose for face_id, pose in moved.items()}
-    scene = BodyScene(target, target_from_face, camera, (), options, _print_errors(target, camera, options))
-    views, poses = dict.fromkeys(target_from_face, 0), []
+    design = _in_first_face(rough)
+    scene = BodyScene(target, design, camera, (), options)
+    poses: list[Rigid] = []
+    tilts_deg: dict[str, tuple[float, ...]] = dict.fromkeys(design, ())
     for left in range(options.images, 0, -1):
-        lacking = {face: LEAST_VIEWS - count for face, count in views.items() if count < LEAST_VIEWS}
-        due = left <= sum(lacking.values()) / LEAST_FACES + 1
-        wanted = max(lacking, key=lacking.__getitem__) if lacking and due else ""
-        pose, shown = _pose(scene, wanted, rng)
+        choices = CHOICES if left <= 2 * sum(map(_lacking, tilts_deg.values())) else 1
+        pose, tilts_deg = min(_poses(scene, choices, tilts_deg, rng), key=lambda each: _lack(each[1]))
         poses.append(pose)
-        for face_id in shown:
-            views[face_id] += 1
-    return replace(scene, camera_from_target=tuple(poses))
+    off_mm = _print_errors(target, camera, options)
+    return replace(scene, target_from_face=_in_first_face(moved), camera_from_target=tuple(poses), off_mm=off_mm)
+
+
+def _in_first_face(poses: Mapping[str, Rigid]) -> dict[str, Rigid]:
+    """Returns poses of faces, by face id, in the frame of the first one."""
+    first = next(iter(poses.values())).inverse()
+    return {face_id: first @ pose for face_id, pose in poses.items()}
 
 
 def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) -> dict[str, np.ndarray]:
@@ -220,13 +246,16 @@ def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) ->
     return off
 
 
-def _pose(scene: BodyScene, wanted: str, rng: np.random.Generator) -> tuple[Rigid, list[str]]:
-    """Returns a random pose in which two faces and more, among them the ``wanted`` one, look at the camera, within the
-    image; and these faces' names."""
+def _poses(
+    scene: BodyScene, count: int, tilts_deg: Mapping[str, tuple[float, ...]], rng: np.random.Generator
+) -> list[tuple[Rigid, dict[str, tuple[float, ...]]]]:
+    """Returns up to ``count`` random poses within the image in which two faces and more look at the camera, each with
+    the angles at which it and the photographs before, ``tilts_deg``, show each face."""
+    found: list[tuple[Rigid, dict[str, tuple[float, ...]]]] = []
     points = np.array(list(scene.circles_target().values()))
     middle = (points.min(0) + points.max(0)) / 2
     options, camera = scene.options, scene.camera
-    size = np.array([camera.width, camera.height])
+    size, border_px = np.array([camera.width, camera.height]), BORDER * camera.width
     for _ in range(TRIALS):
         quaternion = rng.normal(size=4)  # of a turn that favours no direction
         turn = Rotation.from_quat(quaternion / np.linalg.norm(quaternion)).as_matrix()
@@ -237,23 +266,45 @@ def _pose(scene: BodyScene, wanted: str, rng: np.random.Generator) -> tuple[Rigi
         if (xyz[:, 2] < 0.1 * depth).any():
             continue
         pixels = camera.project(xyz)
-        if (pixels < 0).any() or (pixels > size - 1).any():
+        if (pixels < border_px).any() or (pixels > size - 1 - border_px).any():
             continue
-        shown = [face.id for face in scene.target.faces if _looks_here(scene, face, pose)]
-        if len(shown) >= LEAST_FACES and (not wanted or wanted in shown):
-            return pose, shown
+        shown = _shown_deg(scene, pose)
+        if len(shown) >= LEAST_FACES:
+            found.append((pose, {each: (*tilts, *shown.get(each, ())) for each, tilts in tilts_deg.items()}))
+        if len(found) == count:
+            break
+    if found:
+        return found
+    half_field_rad = float(np.arctan((size / 2 - border_px) / camera.focal).min())
+    reach_mm = float(np.linalg.norm(points - middle, axis=1).max())
+    enough_mm = reach_mm / np.sin(half_field_rad) / (1 - options.depth_share)
     raise InputError(
         "E-SIMULATE-BODY",
         f"target {scene.target.name}: no pose at {options.distance_mm:g} mm in which it is in the image and shows two "
-        "faces; give another --distance",
+        f"faces; give another --distance: from {enough_mm:.0f} mm on it is in the image",
     )
 
 
-def _looks_here(scene: BodyScene, face: FaceDesign, pose: Rigid) -> bool:
-    """Returns whether a face is seen at less than 60° from its normal."""
-    camera_from_face = pose @ scene.target_from_face[face.id]
-    middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
-    return float(_inward(face, camera_from_face) @ middle / np.linalg.norm(middle)) > 0.5
+def _shown_deg(scene: BodyScene, pose: Rigid) -> dict[str, tuple[float, ...]]:
+    """Returns the angle between normal and line of sight, (1,) degrees, of each face that a photograph shows."""
+    tilts = {}
+    for face in scene.target.faces:
+        camera_from_face = pose @ scene.target_from_face[face.id]
+        middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
+        cosine = float(_inward(face, camera_from_face) @ middle / np.linalg.norm(middle))
+        tilts[face.id] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return {face_id: (tilt_deg,) for face_id, tilt_deg in tilts.items() if tilt_deg < SHOWN_DEG}
+
+
+def _lacking(tilts_deg: Sequence[float]) -> int:
+    """Returns how many more photographs are to show a face that is seen at these angles; 0 if there are enough."""
+    squarely = sum(tilt_deg <= SQUARE_DEG for tilt_deg in tilts_deg)
+    return max(ENOUGH_VIEWS - len(tilts_deg), 0) + max(ENOUGH_SQUARE - squarely, 0)
+
+
+def _lack(tilts_deg: Mapping[str, Sequence[float]]) -> int:
+    """Returns a measure of what all faces lack, in which the face that lacks most counts most."""
+    return sum(_lacking(tilts) ** 2 for tilts in tilts_deg.values())
 
 
 def _inward(face: FaceDesign, camera_from_face: Rigid) -> np.ndarray:

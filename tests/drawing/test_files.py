@@ -16,7 +16,7 @@ from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import SUFFIXES, draw
 from stcal.drawing.formats import POINT_MM, pdf
-from stcal.drawing.parts import board_parts
+from stcal.drawing.parts import board_parts, target_parts
 from stcal.drawing.shapes import Disc, Line, Text, extent
 from stcal.drawing.sheets import (
     EDGE,
@@ -24,11 +24,13 @@ from stcal.drawing.sheets import (
     FURNITURE,
     OVERLAP,
     PAPERS,
+    PLAN_LETTERS,
     SIDE,
     framed,
     one_sheet,
     paper_sheets,
     seams_between,
+    table,
 )
 from stcal.io.design import board_toml, target_toml
 from tests.outcome import fails_with
@@ -243,6 +245,26 @@ def test_what_cannot_be_drawn_is_refused(files, name, paper, said):
 def test_a_design_that_is_not_there_is_said(files):
     with fails_with("E-DRAW-DESIGN … nothing.toml … target.toml"):
         draw(files / "nothing.toml", files / "a.svg")
+
+
+def test_the_plan_beside_a_plate_has_the_numbers_of_its_circles():
+    """Each in the place of its circle, on a smaller scale; no word is on the plate."""
+    target = reference_target()
+    for face, part in zip(target.faces, target_parts(target, 10.0), strict=True):
+        for below in (True, False):
+            shapes = table(part, below)
+            (plan,) = (s for s in shapes if isinstance(s, Line))
+            scale = np.ptp(plan.points, axis=0)[0] / np.ptp(part.outline, axis=0)[0]
+            assert scale < 0.5
+            numbers = {s.words: s for s in shapes if isinstance(s, Text) and s.height == PLAN_LETTERS}
+            assert set(numbers) == set(face.ids)
+            for circle, xy in zip(face.ids, face.xy_mm, strict=True):
+                place = plan.points[0] + scale * (xy - part.outline[0])
+                words = numbers[circle]
+                np.testing.assert_allclose([words.x, words.y + words.height / 2], place, atol=1e-9)
+            low, high = part.outline.min(0), part.outline.max(0)
+            words = [s.box() for s in (*framed(part), *shapes) if isinstance(s, Text)]
+            assert not any((box[0] < high).all() and (box[1] > low).all() for box in words)
 
 
 def test_far_too_many_sheets_are_refused(files):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stcal.design import TargetDesign, reference_target
-from stcal.drawing.draw import OWN, draw, drawn_text, sheets_of
+from stcal.drawing.draw import OWN, Drawn, draw, drawn_text, net_for, sheets_of
 from stcal.drawing.net import _overlap, net_parts
 from stcal.drawing.shapes import Disc, Text
 from stcal.drawing.sheets import OVERLAP, framed, paper_sheets
@@ -62,6 +62,24 @@ def test_a_box_is_one_net(target):
         assert all(end.any() for end in ends)
     lengths = sorted(float(np.linalg.norm(np.diff(line.points, axis=0))) for line in folds)
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
+
+
+def test_the_sketch_has_the_numbers_of_all_circles(target):
+    """Where they are on the face, at a fifth; the letters do not overlap."""
+    (part,) = net_parts(target)
+    words = [s for s in part.shapes if isinstance(s, Text) and not s.words.startswith("under ")]
+    numbers = [s for s in words if s.height < 2]
+    ids = [circle for face in target.faces for circle in face.ids]
+    assert sorted(s.words for s in numbers) == sorted(ids)
+    assert sorted(s.words for s in words if s not in numbers) == sorted(face.id for face in target.faces)
+    circles = circles_of(part)
+    xy = np.array([circles[label] for face in target.faces for label in face.labels()])
+    places = np.array([[s.x, s.y + s.height / 2] for s in numbers])
+    for place, circle in zip(places.mean(0) + (xy - xy.mean(0)) / 5, ids, strict=True):
+        same = places[[s.words == circle for s in numbers]]
+        assert np.linalg.norm(same - place, axis=1).min() < 1e-6
+    boxes = [s.box() for s in words]
+    assert not any((a[0] < b[1]).all() and (b[0] < a[1]).all() for a, b in combinations(boxes, 2))
 
 
 def test_words_of_tabs_stand_on_them(target):
@@ -158,20 +176,52 @@ def test_a_net_of_two_plates_apart_has_two_pieces():
     assert [len(circles_of(part)) for part in parts] == [18, 18]
 
 
+@pytest.mark.parametrize(
+    ("body", "width_mm", "pieces"),
+    [("cube", 93.0, 1), ("cube", 200.0, 1), ("dodecahedron", 90.0, 1), ("dodecahedron", 160.0, 10)],
+)
+def test_no_seam_runs_through_a_tag_of_a_net(body, width_mm, pieces):
+    """Each tag is whole on a sheet that is cut along its seams. Of the large dodecahedron, only small nets can be."""
+    target = tag_body(body, width_mm, "DICT_APRILTAG_36h11", 0)
+    parts = net_for(target, "A4")
+    assert len(parts) == pieces
+    for part in parts:
+        whole, sheets = 0, paper_sheets([part], "A4", "net")
+        for sheet in sheets:
+            low, high = cut_along_seams(sheet, sheets)
+            boxes = [shape.box() for shape in sheet.shapes() if shape.layer == "PATTERN"]
+            whole += sum((box[0] > low).all() and (box[1] < high).all() for box in boxes)
+        assert whole == len(part.pattern())
+        assert not any(sheet.cuts for sheet in sheets)
+
+
+def test_a_tag_that_fits_on_no_sheet_is_cut_and_this_is_said(tmp_path):
+    target = tag_body("cube", 250.0, "DICT_APRILTAG_36h11", 0)
+    parts = net_for(target, "A4")
+    drawn = Drawn(tmp_path / "net.pdf", parts, paper_sheets(parts, "A4", "net"), "A4")
+    assert len(parts) == 1
+    assert "one runs through a pattern: state it in sigma_mm, or print with --paper" in drawn_text(drawn)
+
+
+def cut_along_seams(sheet, sheets) -> tuple[np.ndarray, np.ndarray]:
+    """What is left of a sheet, lower left and upper right corner; beyond all bounds where there is no other sheet."""
+    places = [tuple(map(int, place)) for s in sheets for place in re.findall(r"row (\d), column (\d)", s.title)]
+    if not places:
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    clip, (row, column), (rows, columns) = sheet.placed[0].clip, places[sheets.index(sheet)], np.max(places, axis=0)
+    low = np.where([column > 1, row < rows], clip[0] + OVERLAP / 2, -np.inf)
+    return low, np.where([column < columns, row > 1], clip[1] - OVERLAP / 2, np.inf)
+
+
 @pytest.mark.parametrize("edge_mm", [62.0, 75.0, 93.0])
 def test_no_seam_runs_through_the_words_of_a_net(edge_mm):
     """Every word of a net on several sheets of A4 is on one of them alone when these are cut along the seams."""
     (part,) = net_parts(tag_body("cube", edge_mm, "DICT_APRILTAG_36h11", 0))
     sheets = paper_sheets([part], "A4", "net")
     every = [shape.words for shape in framed(part) if isinstance(shape, Text)]
-    places = [tuple(map(int, re.findall(r"row (\d), column (\d)", sheet.title)[0])) for sheet in sheets]
-    rows, columns = np.max(places, axis=0)
     found = []
-    for sheet, (row, column) in zip(sheets, places, strict=True):
-        clip = sheet.placed[0].clip
-        assert clip is not None
-        low = np.where([column > 1, row < rows], clip[0] + OVERLAP / 2, -np.inf)
-        high = np.where([column < columns, row > 1], clip[1] - OVERLAP / 2, np.inf)
+    for sheet in sheets:
+        low, high = cut_along_seams(sheet, sheets)
         boxes = [(shape.words, shape.box()) for shape in sheet.placed[0].shapes if isinstance(shape, Text)]
         found += [words for words, box in boxes if (box[1] > low).all() and (box[0] < high).all()]
     assert len(sheets) > 1

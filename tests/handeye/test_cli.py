@@ -568,3 +568,5 @@ def test_the_remedy_against_an_answer_not_to_use_stands_on_the_terminal(command,
     assert "do not use" in verdict
     assert "flange_from_base" in remedy
     assert "board_from_camera" in remedy
+    code, out, err = command(tmp_path / "poses.csv", "--method", "pose", "--quiet")
+    assert (code, out, err) == (0, "", f"warning: {verdict}\n")

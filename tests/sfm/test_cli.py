@@ -56,6 +56,17 @@ def test_simulate_and_compare(command, small_dataset, small_run, tmp_path):
     assert 0 < json.loads((tmp_path / "errors.json").read_text())["worst"]["translation_um"] < 60
 
 
+@pytest.mark.parametrize(("faces", "word"), [("1,2,4", "Yes"), ("1,3", "No: ")])
+def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(command, small_set, no_page, faces, word):
+    """Face 3 is not in the photographs."""
+    small = small_set("12", "14")
+    files = ["--target", small.folder / "target.toml", "--board", small.folder / "board.toml"]
+    code, out, err = command(*small.arguments(*files, "--expect-faces", faces, "--no-strict", "--quiet"))
+    assert (code, out) == (0, "")
+    assert err.startswith(f"warning: may I use it? {word}") if word != "Yes" else not err
+    assert err.count("\n") == (word != "Yes")
+
+
 def circles_toml(rows) -> str:
     return ",\n".join(f'{{ id = "{i}", x_mm = {x}, y_mm = {y}, radius_mm = {r} }}' for i, x, y, r in rows)
 

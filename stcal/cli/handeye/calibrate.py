@@ -286,7 +286,7 @@ def handeye(
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
-    shared.require_passed(strict, judged(outcome).failed(), report)
+    shared.require_passed(strict, judged(outcome).failed(), report, judged(outcome).doubt())
 
 
 def _require_arm(

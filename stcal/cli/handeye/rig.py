@@ -78,4 +78,4 @@ def rig(
     write_if(out, lambda: HandEyeRigFile.of(outcome))
     write_if(report, document.page)
     write_if(json_file, lambda: HandEyeRigFile.of(outcome, whole=True))
-    shared.require_passed(strict, rig_judged(outcome).failed(), report)
+    shared.require_passed(strict, rig_judged(outcome).failed(), report, rig_judged(outcome).doubt())

@@ -21,9 +21,7 @@ app = typer.Typer()
 def plan(
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
-    distance: Annotated[
-        float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)
-    ] = 1000.0,
+    distance: shared.Distance = 1000.0,
     width: Annotated[
         int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,
@@ -108,7 +106,7 @@ def advise(
 
     saved = load_run(run)
     if doubt := doubts(saved):
-        say(f"warning: {doubt}")
+        print_each("warning", [doubt])
     geometry = known_of(saved)
     with StageProgress() as progress:
         advice = advice_for(geometry, count, progress)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import MOST_SEED, board_in_words
+from stcal.cli.options import MOST_SEED, Distance, board_in_words
 from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
 
@@ -67,9 +67,7 @@ def design(
         "Draw the smaller circles with this radius; if not given, it is chosen for box and camera.",
         Opt("--radius-mm", min=0.01, max=1e4),
     ] = None,
-    distance: Annotated[
-        float, "Place the camera at this distance.", Opt("--distance-mm --distance", min=50, max=1e5)
-    ] = 1000.0,
+    distance: Distance = 1000.0,
     width: Annotated[
         int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,

@@ -6,6 +6,7 @@ import re
 import sys
 import time
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,7 +31,7 @@ def measure(
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None,
-        "Read the images of this folder and its subfolders. With --live, it may be the URL of a stream or a video "
+        "Read the images of this folder and its subfolders. With --live, it may also be the URL of a stream or a video "
         "file; with --serve, give none.",
         Arg(),
     ] = None,
@@ -70,8 +71,8 @@ def measure(
     ] = False,
     live: Annotated[
         bool,
-        "Show a page with the pictures of a camera, or of the stream or video IMAGES, and the target's pose in each, "
-        "until Ctrl-C. One line is printed per second; with `--json -`, every pose is.",
+        "Show a page with the pictures of a camera, or of the folder, stream or video IMAGES, and the target's pose in "
+        "each, until Ctrl-C. One line is printed per second; with `--json -`, every pose is.",
     ] = False,
     camera_index: Annotated[
         int, "Take the pictures of --live from the camera with this number.", Opt(min=0, max=99)
@@ -232,7 +233,6 @@ def _live(setting: "Setting", source: int | str, listen, as_json: bool) -> None:
     from stcal.sfm.measurement.serve import MeasureService, ServeOptions, show_live
     from stcal.sfm.measurement.tracker import Tracker
 
-    tracker = Tracker(setting.target, setting.camera, setting.board, setting.pose, setting.ellipses)
     said_s = -SAY_EVERY_S
 
     def tell(picture: LivePicture) -> None:
@@ -248,4 +248,8 @@ def _live(setting: "Setting", source: int | str, listen, as_json: bool) -> None:
     with pictures_of(source) as frames, show_live(MeasureService(setting, 1), ServeOptions(*listen), view) as server:
         end = "it ends" if isinstance(source, str) else "Ctrl-C"
         _say_place(server, f"showing {server.url}/ until {end}")
+        first = next(frames)
+        camera = setting.camera.of_video(*first.shape[::-1])
+        tracker = Tracker(setting.target, camera, setting.board, setting.pose, setting.ellipses)
+        frames = chain([first], frames)
         say(f"ended after {follow(frames, tracker, view, tell)} pictures")

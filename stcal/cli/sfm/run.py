@@ -132,9 +132,10 @@ def run(
         say("\n".join(found_lines(result.labelled)))
     say(run_text(result))
     has_faces = bool(result.target.target_from_face)  # a run of the board alone has none, and was asked for none
-    if has_faces and result.judgement is not None and result.judgement.verdict == "no":
-        reason = f"may I use it? {result.judgement.use.removesuffix('.')}"
-        shared.require_usable(strict, [reason], out / "report.html")
+    if has_faces and result.judgement is not None and result.judgement.verdict != "yes":
+        verdict = f"may I use it? {result.judgement.use.removesuffix('.')}"
+        reasons = [verdict] if result.judgement.verdict == "no" else []
+        shared.require_usable(strict, reasons, out / "report.html", verdict)
 
 
 @app.command()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.declare import Arg, Opt
-from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, PlateMargin, TargetFile, Workers, designs_told
-from stcal.cli.terminal import StageProgress, say, write_if
+from stcal.cli.options import MOST_SEED, BoardFile, Distance, JsonFile, PlateMargin, TargetFile, Workers, designs_told
+from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, json_text, real_place, save
 
@@ -44,9 +44,7 @@ def simulate(
     folder: Annotated[Path, "Write the data set to this new folder.", Arg()],
     width: Annotated[int, "Render images of this width, px, in the ratio 3:2.", Opt(min=320, max=50_000)] = 2592,
     images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
-    distance: Annotated[
-        float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=200, max=1e5)
-    ] = 1000.0,
+    distance: Distance = 1000.0,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
         float | None,
@@ -173,15 +171,11 @@ def _body(
         if not (file.width and file.height):
             raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
         seen_by = file.calibrated(0, 0)
+    scene = make_body_scene(target, seen_by, options)
     with StageProgress() as progress:
-        paths = write_body(
-            folder,
-            make_body_scene(target, seen_by, options),
-            kind,
-            workers=workers,
-            progress=partial(progress, "render"),
-        )
+        paths = write_body(folder, scene, kind, workers=workers, progress=partial(progress, "render"))
     say(f"{len(paths)} images: {folder}")
+    print_each("note", filter(None, [scene.hardly_seen()]))
 
 
 def _lens(

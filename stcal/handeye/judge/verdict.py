@@ -63,6 +63,10 @@ class Verdict:
         """Returns what to do against the reasons that forbid to use the calibration, each once."""
         return list(dict.fromkeys(each.remedy for each in self.findings if each.word == BAD and each.remedy))
 
+    def doubt(self) -> str:
+        """Returns the sentence of a verdict that is not good; empty for a good one."""
+        return "" if self.word == GOOD else f"verdict: {self.sentence()}"
+
     def sentence(self) -> str:
         """Returns the word and its reasons in one line."""
         return f"{self.word}: {'; '.join(each.said for each in self.reasons())}"

@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.io.cameras.keys import pass_over
 from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
 COLMAP_FOREIGN = {
@@ -183,6 +184,8 @@ def one_of(names: list[str], choice: str, source: str) -> str:
             f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name, "
             "and in a rig file camera_name",
         )
+    others = [name for name in names if name != (choice or names[0])]
+    pass_over(others, "the other cameras, " if len(others) > 1 else "the other camera, ")
     return choice or names[0]
 
 

@@ -29,7 +29,7 @@ from stcal.io.cameras.foreign import (
     one_of,
     refused,
 )
-from stcal.io.cameras.keys import require_known
+from stcal.io.cameras.keys import pass_over, require_known
 from stcal.io.cameras.matlab import mat, zhang
 from stcal.io.cameras.model import CameraModel, cameras_txt
 
@@ -95,7 +95,10 @@ def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
             f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
             "ones are read: mrcal-convert-lensmodel makes one of another",
         )
-    return replace(made, region=region) if isinstance(made, ForeignLens) else made
+    if isinstance(made, ForeignLens):
+        return replace(made, region=region)
+    pass_over([] if region is None else ["valid_intrinsics_region"])
+    return made
 
 
 def _region(stated: object, source: str) -> np.ndarray | None:

@@ -4,6 +4,8 @@ is taken or refused."""
 import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import numpy as np
 
@@ -101,6 +103,26 @@ UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1."""
 SHOWN = 6
 """Largest number of keys that a message names."""
+_passed_over: ContextVar[list[str] | None] = ContextVar("_passed_over", default=None)
+
+
+@contextmanager
+def collecting_passed_over() -> Iterator[list[str]]:
+    """Collect what is in a camera file and not in the camera that is read: other cameras, and keys with numbers."""
+    collected: list[str] = []
+    token = _passed_over.set(collected)
+    try:
+        yield collected
+    finally:
+        _passed_over.reset(token)
+
+
+def pass_over(parts: Collection[str], what: str = "") -> None:
+    """Add parts of a camera file to what is passed over, the first ``SHOWN`` by name; ``what`` : what they are."""
+    collected = _passed_over.get()
+    if collected is not None and parts:
+        more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
+        collected.append(f"{what}{', '.join(part[:40] for part in list(parts)[:SHOWN])}{more}")
 
 
 def plain(key: object) -> str:
@@ -171,6 +193,7 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
     """
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []
+    pass_over(_with_numbers(unread))
     for keys, value in leaves(unread):
         path = [part for key in keys for part in key.split(".")]
         names = [*map(plain, path), plain("".join(path))]
@@ -197,6 +220,18 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
         more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""
         named = ", ".join(key[:40] for key in unknown[:SHOWN])
         warnings.warn(f"camera file {source}: not known, and passed over: {named}{more}", InputNote, stacklevel=2)
+
+
+def _with_numbers(unread: Mapping) -> list[str]:
+    """Return the names of the keys that hold numbers, such as poses and σ; without zeros and identity matrices."""
+    named = []
+    for keys, value in leaves(unread):
+        numbers = numbers_of(value)
+        is_identity = numbers.size == 9 and (numbers == np.eye(3).ravel()).all()
+        is_nested = isinstance(value, list) and any(isinstance(each, dict | list) for each in value)
+        if not isinstance(value, str | bool) and (numbers.any() if numbers.size else is_nested) and not is_identity:
+            named.append(".".join(keys))
+    return named
 
 
 def _short(value: object) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.io.cameras.foreign import ForeignLens, one_of, refused
-from stcal.io.cameras.keys import require_known
+from stcal.io.cameras.keys import pass_over, require_known
 from stcal.io.cameras.model import CameraModel, camera_from_opencv
 from stcal.io.covariance import Rows, require_covariance
 
@@ -114,8 +114,12 @@ def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraM
             "E-CAMERA-NONE", f"camera file {source}: no sensor with a calibration; export the cameras after alignment"
         )
     chosen, covariance = sensors[one_of(list(sensors), choice, source)]
+    pass_over(["poses of the photographs"] if root.find(".//camera/transform") is not None else [])
     camera = from_calibration(chosen, source)
-    if covariance is None or isinstance(camera, ForeignLens):
+    if covariance is None:
+        return camera
+    if isinstance(camera, ForeignLens):
+        pass_over(["σ and correlations of the parameters"])
         return camera
     return _with_covariance(camera, covariance, source)
 

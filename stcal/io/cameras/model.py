@@ -3,12 +3,13 @@
 :mod:`stcal.io.cameras.read` reads the files.
 """
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
@@ -60,6 +61,23 @@ class CameraModel:
     def calibrated(self, width: int, height: int) -> Camera:
         """Return the camera of :meth:`sized` with its covariance."""
         return replace(self.sized(width, height), covariance=self.covariance)
+
+    def of_video(self, width: int, height: int) -> "CameraModel":
+        """Return the camera of pictures of this size.
+
+        It is the camera itself, unless only the last row or column of an odd number is missing: most formats of video
+        have even numbers alone, and their writers drop it. An :class:`InputNote` says so.
+        """
+        stated = self.width or width, self.height or height
+        if (width, height) == stated or (width, height) != tuple(side // 2 * 2 for side in stated):
+            return self
+        warnings.warn(
+            f"pictures of {width}×{height} px, a camera of {stated[0]}×{stated[1]}: the last row or column of an odd "
+            "number is taken as dropped, as video does; if the pictures were resized instead, poses are off",
+            InputNote,
+            stacklevel=2,
+        )
+        return replace(self, width=width, height=height)
 
     def require_inside(self, width: int, height: int, image: str) -> None:
         """Refuse an image without the principal point: a file that states no size may belong to another camera.

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 
 from stcal.errors import InputNote
-from stcal.io.cameras.keys import CONTAINERS, numbers_of, plain, role_of
+from stcal.io.cameras.keys import CONTAINERS, numbers_of, pass_over, plain, role_of
 
 NUMBERED = re.compile(r"(.+?)[ _]?(\d+|left|right|l|r)$|(left|right|cam\d+)[ _.](.*)$", re.IGNORECASE)
 """A key with the number or the side of its camera, behind or in front."""
@@ -49,6 +49,7 @@ def cameras_of(values: dict) -> dict[str, dict]:
     if isinstance(frames, list) and any(_holds_lens(frame) for frame in frames):
         shared = {key: value for key, value in values.items() if key != "frames"}
         kept = [{k: v for k, v in f.items() if role_of(k)} for f in frames if isinstance(f, dict)]
+        pass_over(["frames"])
         if all(each == kept[0] for each in kept):
             return {"": shared | kept[0]}
         names = [str(frame.get("file_path", i)) for i, frame in enumerate(frames) if isinstance(frame, dict)]

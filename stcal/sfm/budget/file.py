@@ -400,10 +400,11 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         run.board_design.rows
         and budget.statement.board.temperature_sigma_k
         and budget.statement.target.temperature_sigma_k
+        and not budget.statement.one_thermometer
     ):
         notes.append(
-            "errors of the temperatures and expansions of board and target are taken as uncorrelated; where one "
-            "thermometer measured both, U is too large"
+            "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured "
+            "both, U is too large: state one_thermometer = true at the top of the statement"
         )
     notes += verified.said()
     notes.append(

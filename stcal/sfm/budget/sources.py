@@ -1,6 +1,6 @@
 """Sources of uncertainty of a budget, and the conditions stated for them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -37,6 +37,7 @@ FieldName = Annotated[str, Field(min_length=1, max_length=60)]
 class StatementFile(Strict):
     """The file of ``--statement``."""
 
+    one_thermometer: bool = False
     fields: dict[FieldName, Text] = Field(default_factory=dict)
     board: BoardSizeEntry = BoardSizeEntry()
     target: SizeEntry = SizeEntry()
@@ -47,13 +48,14 @@ class Statement:
     """What the user states.
 
     ``board``, ``target`` : their sizes; ``origin`` : the file that states a value, by ``board`` or ``target`` and key;
-    ``fields`` : fields of the head by name.
+    ``fields`` : fields of the head by name; ``one_thermometer`` : True if the temperatures of both err alike.
     """
 
     board: StatedSize
     target: StatedSize
     origin: dict[tuple[str, str], str]
     fields: dict[str, str]
+    one_thermometer: bool = False
 
 
 def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
@@ -80,7 +82,7 @@ def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, 
                 f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST} for a value",
             )
     named = dict.fromkeys(FIELDS, "") | file.fields | dict(given or {})
-    return Statement(sizes["board"], sizes["target"], origin, named)
+    return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
 
 
 def fields_of(given: Sequence[str]) -> dict[str, str]:
@@ -164,12 +166,12 @@ def sources_of(
     if board.rows:
         rows.append(_scale(contributions.by_scale, zero, statement))
     grown = contributions.joint.xyz_model - contributions.joint.xyz_model.mean(0)
-    for body, stated, effect in (
-        ("board", statement.board, contributions.by_scale),
-        ("target", statement.target, grown.ravel()),
-    ):
-        if board.rows:
-            rows += _temperature(body, stated, effect, statement)
+    bodies = (("board", statement.board, contributions.by_scale), ("target", statement.target, -grown.ravel()))
+    if board.rows:
+        rows += [row for body, stated, effect in bodies for row in _temperature(body, stated, effect, statement)]
+        if statement.one_thermometer:
+            rows = [row for row in rows if row.key not in ("board_temperature", "target_temperature")]
+            rows.append(_one_thermometer(bodies))
     return tuple(rows)
 
 
@@ -263,6 +265,28 @@ def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: S
             words = f"{name} of {statement.origin[what, name]}"
             covariance = (sigma * factor * PPM) ** 2 * np.outer(effect, effect)
             yield Source(f"{what}_{key}", title, "B", "stated", words, sigma, unit, covariance)
+
+
+def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> Source:
+    """Returns the row of an error that the temperatures of board and target have in common (JCGM 100, 5.2.2, r = 1).
+
+    A length is corrected by the difference of the expansions of both, so that such an error nearly cancels if their
+    coefficients are alike.
+    """
+    total, absent, sigmas = 0.0, [], []
+    for body, stated, effect in bodies:
+        sigma, rate = stated.temperature_sigma_k, stated.expansion_ppm_per_k
+        keys = (("temperature_sigma_k", sigma), ("expansion_ppm_per_k", rate))
+        absent += [f"{key} of [{body}]" for key, value in keys if value is None]
+        sigmas.append(sigma)
+        total = total + (sigma or 0.0) * (rate or 0.0) * PPM * effect
+    title, covariance = "temperature of board and target", np.outer(total, total)
+    if absent:
+        words = f"no {' and '.join(absent)}"
+        return Source("temperature", title, "B", "not stated", words, None, "K", np.zeros_like(covariance))
+    sigma = sigmas[0] if sigmas[0] == sigmas[1] else None
+    words = "temperature_sigma_k of both, one_thermometer: fully correlated"
+    return Source("temperature", title, "B", "stated", words, sigma, "K", covariance)
 
 
 def warmer_k(stated: StatedSize) -> float | None:

@@ -1,6 +1,7 @@
 """Overlay pictures: images with the measured circles drawn on them."""
 
 import hashlib
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -8,16 +9,19 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.io.cache import keep, kept, made_by
-from stcal.labels import BOARD, CircleLabel, DotLabel
+from stcal.labels import BOARD, CircleLabel, DotLabel, Label
 from stcal.sfm.data.model import ImageObservations
 
 # OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
 BOARD_COLOUR = (233, 180, 86)
-CACHE_VERSION = 1
+CACHE_VERSION = 2
 """Version of the drawing, which increases with every change of it, so that older kept overlays are not used."""
 QUALITY = 82
 MIN_WIDTH_PX = 1000
+LEFT_OUT = "left out of the adjustment"
+LEAST_CROSS_PX = 15
+"""Size of the cross on a circle that was left out, at least."""
 MIN_LABEL_GAP = 70.0
 """Smallest distance between numbered dots, px at text size 1."""
 
@@ -31,19 +35,21 @@ def kept_overlay(
     faces: list[str],
     focal_px: np.ndarray,
     notes: int,
+    left_out: frozenset[Label] = frozenset(),
 ) -> bytes:
     """Returns the JPEG of :func:`draw_overlay`, that of an earlier run with the same content if the ``cache`` has it.
 
     ``digest`` : of the image that the thumbnail shows
     """
     stated = CACHE_VERSION, made_by(), cv2.__version__, digest, scale, observations.name, observations.labels
-    hasher = hashlib.sha256("\0".join(map(repr, (*stated, faces, notes))).encode("utf-8", "backslashreplace"))
+    stated = *stated, faces, notes, sorted(left_out)
+    hasher = hashlib.sha256("\0".join(map(repr, stated)).encode("utf-8", "backslashreplace"))
     for values in (observations.centre_px, observations.shape, focal_px):
         hasher.update(values.tobytes())
     path = cache / f"overlay-{hasher.hexdigest()[:40]}.npz"
     picture = kept(path, lambda arrays, _: arrays["jpeg"].tobytes())
     if picture is None:
-        picture = draw_overlay(thumbnail, scale, observations, faces, focal_px, notes)
+        picture = draw_overlay(thumbnail, scale, observations, faces, focal_px, notes, left_out)
         keep(path, {"jpeg": np.frombuffer(picture, np.uint8)}, {})
     return picture
 
@@ -55,6 +61,7 @@ def draw_overlay(
     faces: list[str],
     focal_px: np.ndarray,
     notes: int,
+    left_out: Collection[Label] = (),
 ) -> bytes:
     """Returns a JPEG with every measured ellipse and its label.
 
@@ -63,6 +70,7 @@ def draw_overlay(
     thumbnail : JPEG of the image, ``scale`` its size over the image's
     faces : all face ids, for colours that stay the same over the images
     notes : number of things left out, for the caption
+    left_out : labels of the circles that the adjustment does not use; a white ×, explained at the bottom, crosses them
     """
     picture = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
@@ -85,6 +93,8 @@ def draw_overlay(
         if label in numbered or isinstance(label, CircleLabel):
             reach = np.abs(shape * focal_px[:, None]).sum(1).max() * scale
             _text(picture, text, (at[0] + int(0.75 * reach) + 1, at[1] - int(0.75 * reach)), size, colours[key])
+        if label in left_out:
+            _cross(picture, at, max(LEAST_CROSS_PX, int(1.4 * np.ptp(rim, axis=0).max() / 16)))
     _name_faces(picture, observations, scale, colours, size)
     counts = f"{observations.name}: {len(observations)} circles labelled"
     _text(
@@ -94,6 +104,10 @@ def draw_overlay(
         1.2 * size,
         (255,) * 3,
     )
+    if crossed := sum(label in left_out for label in observations.labels):
+        at = np.array([8 + LEAST_CROSS_PX // 2, picture.shape[0] - 10 - int(60 * size)])
+        _cross(picture, at, LEAST_CROSS_PX)
+        _text(picture, f"{LEFT_OUT}: {crossed}", (at[0] + LEAST_CROSS_PX, at[1] + 5), 1.2 * size, (255,) * 3)
     _, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return jpeg.tobytes()
 
@@ -126,6 +140,12 @@ def _name_faces(picture, observations: ImageObservations, scale: float, colours:
         low, high = observations.centre_px[members].min(0), observations.centre_px[members].max(0)
         at = (np.array([(low[0] + high[0]) / 2, low[1]]) * scale).astype(int)
         _text(picture, f"face {face}", (at[0] - int(45 * size), at[1] - int(45 * size)), 1.5 * size, colours[face])
+
+
+def _cross(picture, at: np.ndarray, reach: int) -> None:
+    """Draws a ×, white with a black edge: no other mark has its shape, and it is seen on any ground."""
+    for thickness, ink in ((4, (0, 0, 0)), (2, (255,) * 3)):
+        cv2.drawMarker(picture, at.tolist(), ink, cv2.MARKER_TILTED_CROSS, reach, thickness, cv2.LINE_AA)
 
 
 def _text(picture, text: str, at: tuple[int, int], size: float, colour) -> None:

@@ -115,7 +115,7 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
     placed = replace(
         target, faces=tuple(replace(face, rough_target_from_face=nominal[face.id]) for face in target.faces)
     )
-    scene, model, setup = _planned(options, placed)
+    scene, model, setup = planned_photographs(options, placed)
     expected = forecast([model], setup)
     half_print = forecast([model], setup.better_board(0.5), expected.derivatives)
     measured = forecast([model], _with_distance(setup, model), expected.derivatives)
@@ -135,6 +135,7 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
         expected,
         variance_shares(expected, [model], setup),
         tuple(remedies),
+        scene.hardly_seen(),
     )
 
 
@@ -151,13 +152,13 @@ def _with_distance(setup: Setup, model: MetricModel) -> Setup:
 
 def _remedy(what: str, options: PlanOptions, target: TargetDesign) -> Remedy:
     try:
-        _, model, setup = _planned(options, target)
+        _, model, setup = planned_photographs(options, target)
     except InputError as error:
         return Remedy(what, None, str(error))
     return Remedy(what, forecast([model], setup).worst()[1])
 
 
-def _planned(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, MetricModel, Setup]:
+def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, MetricModel, Setup]:
     """Returns the photographs of a plan: scene, model with the σ of its corners, and input of a forecast."""
     file = None if options.camera is None else camera_model(options.camera)
     camera = body_camera(options.width) if file is None else file.calibrated(0, 0)

@@ -278,10 +278,8 @@ def plan_text(plan: Plan, noise: str) -> str:
     if plan.setup.board.rows:
         lines.append("the random places of board and cameras (--seed) change it by about ±3 %")
     else:
-        lines.append(
-            "which faces the photographs happen to show (--seed) makes about ±20 % of many photographs, and up to a "
-            "factor of three of few that show a face twice or thrice: compare two seeds"
-        )
+        lines += filter(None, [plan.hardly_seen])
+        lines.append("which faces the photographs happen to show together (--seed) changes it: compare two seeds")
     return "\n".join(lines)
 
 

@@ -118,7 +118,8 @@ class Plan(Brief):
     """A plan with its forecast and remedies.
 
     ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``aperture_mm`` : see
-    :func:`widest_aperture_mm`; ``shares`` : of the variance, by face and source.
+    :func:`widest_aperture_mm`; ``shares`` : of the variance, by face and source; ``hardly_seen`` : sentence on the
+    faces of a body that the photographs hardly show, empty if there is none.
     """
 
     options: PlanOptions
@@ -130,6 +131,7 @@ class Plan(Brief):
     forecast: Forecast
     shares: dict[str, dict[str, float]]
     remedies: tuple[Remedy, ...]
+    hardly_seen: str = ""
 
 
 def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:

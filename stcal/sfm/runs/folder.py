@@ -32,6 +32,7 @@ from stcal.io.files import (
     save,
 )
 from stcal.io.json import checked, read_json
+from stcal.labels import Label
 from stcal.parallel import Progress
 from stcal.report.document import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile, require_faces_written
@@ -60,23 +61,26 @@ HASH_DIGITS = 12
 @contextlib.contextmanager
 def overlays_beside(
     detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, run: RunFolder, progress: Progress
-) -> Iterator[None]:
+) -> Iterator[dict[str, frozenset[Label]]]:
     """Draws the detections into every image while other work goes on; all overlays exist at the end of the block.
 
-    An overlay of an earlier run with the same content is taken from the cache.
+    An overlay of an earlier run with the same content is taken from the cache. Yields the labels, by image, of the
+    circles that are left out of the adjustment: the block adds them, and their images are drawn again with crosses.
     """
     face_ids, focal_px = [face.id for face in target.faces], detection.camera.focal
 
-    def draw(image: DetectedImage, each: LabelledImage) -> None:
+    left_out: dict[str, frozenset[Label]] = {}
+
+    def draw(image: DetectedImage, each: LabelledImage, crossed: frozenset[Label] = frozenset()) -> None:
         small = image.thumbnail, image.thumbnail_scale
         seen, notes = each.observations, len(each.notes)
-        picture = kept_overlay(run.cache, image.digest, *small, seen, face_ids, focal_px, notes)
+        picture = kept_overlay(run.cache, image.digest, *small, seen, face_ids, focal_px, notes, crossed)
         save(overlay_path(run.stage, image.file.name), picture)
 
     with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
         drawn = pool.map(draw, _in_order(detection, labelled), labelled)
         try:
-            yield
+            yield left_out
         except Exception:
             raise
         except BaseException:  # interrupted or exiting
@@ -84,6 +88,9 @@ def overlays_beside(
             raise
         for i, _ in enumerate(drawn):
             progress("overlays", i + 1, len(labelled))
+        again = [each for each in labelled if left_out.get(each.observations.name)]
+        crosses = [left_out[each.observations.name] for each in again]
+        list(pool.map(draw, _in_order(detection, again), again, crosses))
 
 
 def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):

@@ -7,7 +7,7 @@ import numpy as np
 import stcal
 from stcal.design import faces_of_known_shape
 from stcal.geometry.plane import fit_plane
-from stcal.labels import DotLabel
+from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
@@ -126,6 +126,14 @@ def residuals_px(result: RunResult) -> list[np.ndarray]:
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
             by_image[name][model.keypoint[rows]] = residual[rows]
     return list(by_image.values())
+
+
+def unadjusted(result: RunResult) -> dict[str, frozenset[Label]]:
+    """Returns the labels of the keypoints that are not in the result, by image."""
+    return {
+        image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residual).any(axis=1)))
+        for image, residual in zip(result.observations(), residuals_px(result), strict=True)
+    }
 
 
 def _focus(focus: Focus) -> dict:

@@ -101,6 +101,39 @@ def test_what_is_stated_adds_its_part(saved, plain, stated):
     assert found.conditions.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
 
 
+def test_one_thermometer_of_both_errs_in_the_difference_of_the_expansions(saved, stated):
+    """A length of L mm: |8 · 0.5 − 23 · 1| ppm; nothing for bodies of one alloy. All other rows are as without it."""
+    apart, common = (budget_of_run(saved, replace(stated, one_thermometer=one)) for one in (False, True))
+    for before, after in zip(apart.of_kind("distance"), common.of_kind("distance"), strict=True):
+        length = 1e-6 * after.measurand.length_mm
+        assert after.contributions["temperature"] / length == pytest.approx(19.0, rel=5e-3)
+        gone = {"board_temperature", "target_temperature"}
+        assert set(before.contributions) - set(after.contributions) == gone
+        for key in set(before.contributions) - gone:
+            assert after.contributions[key] == pytest.approx(before.contributions[key])
+        assert after.standard < before.standard
+    board, target = (
+        replace(s, expansion_ppm_per_k=23.0, temperature_sigma_k=1.0) for s in (stated.board, stated.target)
+    )
+    alike = budget_of_run(saved, replace(stated, board=board, target=target, one_thermometer=True))
+    for row in alike.of_kind("distance"):
+        assert row.contributions["temperature"] / row.measurand.length_mm < 0.1e-6  # of 23 ppm each
+    (source,) = (each for each in alike.sources if each.key == "temperature")
+    assert (source.sigma, source.unit, source.origin) == (1.0, "K", "stated")
+
+
+def test_one_thermometer_is_stated_before_the_tables(saved, tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_text("one_thermometer = true\n[board]\ntemperature_sigma_k = 0.5\n")
+    found = statement_of(StatedSize(), path)
+    assert found.one_thermometer
+    (source,) = (each for each in budget_of_run(saved, found).sources if each.key == "temperature")
+    assert source.origin == "not stated"
+    assert source.words == (
+        "no expansion_ppm_per_k of [board] and temperature_sigma_k of [target] and expansion_ppm_per_k of [target]"
+    )
+
+
 def test_rims_that_were_estimated_are_a_row(saved, plain):
     """Each face lies half of an error of the height along its own normal: against the reference face by the difference
     of both normals."""
@@ -271,7 +304,9 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     lengths = tmp_path / "lengths.csv"
     lengths.write_text("from,to,length_mm\n1:1,1:2,1000\n")
     words = ("--check-lengths", lengths, "--report", page, "--json", out, "--no-strict", "--quiet")
-    assert stcal_sfm("budget", copy, *words) == (0, "", "")
+    code, text, error = stcal_sfm("budget", copy, *words)
+    assert (code, text, error.count("\n")) == (0, "", 1)
+    assert error.startswith("warning: may run ")
     html, file = page.read_text(), json.loads(out.read_text())
     assert "do not hold before it is put right" in html
     assert "Lengths and positions hold" not in text + html

@@ -14,7 +14,7 @@ FOCAL = np.array([2000.0, 2000.0])
 GREY = 90
 
 
-def overlay(labels, centres, shapes, scale: float, width: int = 1600, notes: int = 0) -> np.ndarray:
+def overlay(labels, centres, shapes, scale: float, width: int = 1600, notes: int = 0, left_out=()) -> np.ndarray:
     """Drawn on a plain image of ``width`` px, its thumbnail ``scale`` of that."""
     n = len(labels)
     size = (round(width * 0.75 * scale), round(width * scale))
@@ -28,7 +28,7 @@ def overlay(labels, centres, shapes, scale: float, width: int = 1600, notes: int
         np.array(shapes) / FOCAL[:, None],
         np.tile(np.eye(2), (n, 1, 1)),
     )
-    drawn = draw_overlay(jpeg.tobytes(), scale, image, ["1", "2"], FOCAL, notes)
+    drawn = draw_overlay(jpeg.tobytes(), scale, image, ["1", "2"], FOCAL, notes, left_out)
     return cv2.imdecode(np.frombuffer(drawn, np.uint8), cv2.IMREAD_COLOR).astype(float)
 
 
@@ -74,6 +74,19 @@ def test_the_caption_grows_with_the_notes():
     caption = np.s_[-60:, :]
     assert (np.abs(noted - plain)[caption].max(2) > 60).sum() > 100
     assert np.abs(noted - plain)[:-80].max() < 20
+
+
+def test_what_is_left_out_has_a_cross_and_the_picture_says_what_it_means():
+    """White along the diagonals of the circle, and nowhere else beside a line of words at the bottom."""
+    labels, centres = ["1:3", "1:4"], [[500.0, 600.0], [1000.0, 600.0]]
+    plain, crossed = (overlay(labels, centres, 2 * [60 * np.eye(2)], 1.0, left_out=x) for x in ((), ("1:4",)))
+    y, x = np.nonzero(np.abs(crossed - plain).max(2) > 60)
+    legend = y > 1100
+    assert legend.sum() > 100
+    across, up = np.abs(x - 1000)[~legend], np.abs(y - 600)[~legend]
+    assert np.abs(across - up).max() < 8
+    assert 60 < across.max() < 100  # as large as the circle
+    assert crossed[580:590, 980:990].max() > 230
 
 
 def test_a_long_name_is_cut_to_one_of_its_own():

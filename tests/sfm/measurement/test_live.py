@@ -23,6 +23,7 @@ from stcal.sfm.measurement.tracker import Tracker
 from tests.outcome import fails_with
 from tests.report.browser import faults
 from tests.report.browser import opened as browser
+from tests.sfm.truth import true_poses
 
 PATIENCE_S = 60.0
 
@@ -124,6 +125,46 @@ def test_every_picture_of_a_video_is_read(tmp_path):
         pass
     with mosaic_of("RGGB"), fails_with("E-OPTION-CONFLICT … --bayer RGGB"), frames_of(path):
         pass
+
+
+def live(small_run, *words):
+    """What the command printed, which ends with the pictures."""
+    files = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json", "--port", "0"]
+    result = CliRunner().invoke(app, ["sfm", "measure", "--live", *map(str, [*files, *words])], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cut", [(0, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize("kind", ["folder", "video"])
+def test_pictures_of_a_folder_or_a_video_of_odd_size(small_run, small_dataset, tmp_path, kind, cut):
+    """The camera has images of 1295 columns or 863 rows, of which a video drops one: poses stay where they are."""
+    names = [path.name for path in sorted((small_dataset / "images/12").iterdir())][:2]
+    width, height = 1296 - cut[0], 864 - cut[1]
+    pictures = [cv2.imread(str(small_dataset / "images/12" / name))[:height, :width] for name in names]
+    line = (small_run / "cameras.txt").read_text().replace(" 1296 864 ", f" {width} {height} ")
+    (tmp_path / "odd.txt").write_text(line)
+    place = tmp_path / ("images" if kind == "folder" else "clip.avi")
+    if kind == "folder":
+        place.mkdir()
+        for name, picture in zip(names, pictures, strict=True):
+            cv2.imwrite(str(place / f"{name}.png"), picture)
+    else:
+        film = cv2.VideoWriter(str(place), cv2.VideoWriter.fourcc(*"MJPG"), 10, (width, height))
+        film.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
+        for picture in pictures:
+            film.write(picture)
+        film.release()
+    result = live(small_run, place, "--camera", tmp_path / "odd.txt", "--json", "-")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [each["status"] for each in lines] == ["certain", "certain"]
+    assert ("taken as dropped" in result.stderr) == (kind == "video" and cut != (0, 0))
+    truth = true_poses(json.loads((small_dataset / "truth.json").read_text()))
+    for name, each in zip(names, lines, strict=True):
+        found = np.array(each["poses"]["images"][0]["camera_from_target"])
+        off = found[:2, 3] - truth[f"12/{name}"].translation[:2]
+        assert np.linalg.norm(off) < 0.2  # mm, at 1 m; a shift of the pictures by a pixel would be 0.7 mm
 
 
 @pytest.mark.parametrize(

@@ -378,7 +378,7 @@ def test_a_plan_takes_a_camera_as_its_file():
     for given in (camera, model_of(camera)):
         assert session._scene(PlanOptions(images=2, camera=given), target, board, None).camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
-        assert bodies._planned(near, cube)[0].camera.same_as(camera)
+        assert bodies.planned_photographs(near, cube)[0].camera.same_as(camera)
 
 
 def test_advice_holds_the_sigma_of_estimated_rims(small_run):

@@ -9,6 +9,7 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
+from stcal.labels import DotLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import SigmaFactors, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.joint import adjust_jointly
@@ -17,6 +18,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.detection import Task, labelled_images
+from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -47,6 +49,28 @@ def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
     reasons = {name: why for s in result.solutions for name, why in s.left_out.items()}
     assert list(reasons) == ["12/black.png"]
     assert "0 of its circles are in the model, 6 needed" in reasons["12/black.png"]
+
+
+@pytest.mark.slow
+def test_a_dot_that_one_image_alone_shows_is_crossed_in_its_overlay(small_set, small_result):
+    """Painted over in the three others; the overlay of the image of a dot that is used has no white there."""
+    small, out = small_set("12"), DotLabel(3, 4)
+    seen = {image.name: image for image in small_result.observations() if image.group == "12"}
+    assert all(out in image.labels for image in seen.values())
+    for name in list(seen)[1:]:
+        picture = cv2.imread(str(small.images / name))
+        at = seen[name].centre_px[seen[name].labels.index(out)]
+        x, y = at.round().astype(int).tolist()
+        cv2.circle(picture, (x, y), 12, picture[y - 12, x - 12].tolist(), -1)
+        cv2.imwrite(str(small.images / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    result = calibrate(small.folder, small.out)
+    (name, *_), first = seen, next(iter(seen.values()))
+    assert {label for labels in unadjusted(result).values() for label in labels} == {out}
+    drawn = cv2.imread(str(small.out / "overlays" / name))
+    assert drawn.shape[:2] == (864, 1296)
+    for label in (out, DotLabel(3, 5)):
+        x, y = first.centre_px[first.labels.index(label)].round().astype(int)
+        assert (drawn[y - 3 : y + 4, x - 3 : x + 4].min(2).max() > 200) == (label == out)
 
 
 @pytest.mark.slow
