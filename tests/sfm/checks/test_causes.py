@@ -61,7 +61,12 @@ def zoomed(by):
 
 def turned_photograph(image, camera):
     """Where the centres are in a photograph turned by 180°, to be read upright: the lens is turned with its sensor."""
-    return camera.with_parameters(_turned(camera, 2)).pixel_from_normalised(image.centre)
+    return turned_camera(camera).pixel_from_normalised(image.centre)
+
+
+def turned_camera(camera):
+    """The camera that takes photographs turned by 180°: its tangential distortion is turned, too."""
+    return camera.with_parameters(_turned(camera, 2))
 
 
 RANDOM = np.random.default_rng(0).normal(size=(12, 2))
@@ -80,10 +85,7 @@ PLANTED = {
     ),
     "signs reversed": (of_file(distortion=lambda d, _: -d), "sign reversed"),
     "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled relative to the camera file"),
-    "turned": (
-        of_file(centre=lambda c, camera: np.array([camera.width - 1, camera.height - 1]) - c),
-        "turned by 180°",
-    ),
+    "turned": (lambda scene, images: (images, turned_camera(scene.camera)), "turned by 180°"),
     "some turned": (
         of_photographs(lambda i, camera, k: i.centre_px if k % 2 else turned_photograph(i, camera)),
         "some photographs are turned by 180°",
