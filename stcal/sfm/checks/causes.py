@@ -30,6 +30,8 @@ MOST_IMAGES = 60
 """Largest number of images of a group in which parameters of single images are fitted; more take minutes."""
 FIXED_WITHIN = 0.2
 """Largest deviation from 1 of the share of a change that is as a whole or not at all, such as a distortion removed."""
+FILE_WITHIN = 0.02
+"""That deviation where the true camera is known: what two good calibrations of a distortion differ by."""
 FEW = 0.25
 """Share of the images that may not explain alone what is taken for a cause of the whole set."""
 ALONE = 0.93
@@ -139,8 +141,9 @@ def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_
             continue
         along = to_model @ cause.direction
         test = solve_score(along.T @ weight @ along, along.T @ weight @ off)
-        is_whole = not cause.whole or abs(test.estimate[0] - 1) < FIXED_WITHIN
-        if is_whole and test.statistic > EXPLAINS * square:
+        if cause.whole and abs(test.estimate[0] - 1) > FILE_WITHIN + 3 * np.sqrt(test.covariance[0, 0]):
+            continue
+        if test.statistic > EXPLAINS_ALL * square:
             fitted.append((test.freedom - cause.whole, -test.statistic, cause, test))
     if not fitted:
         return None
