@@ -6,7 +6,8 @@ Sets: the sample and `../shared/data/stereo_target/white_block` with the circles
 and a simulated one of three faces with noise of 0.02 px. What is planted changes centres, camera file or designs, and
 mapping begins at the true geometry. `named`: of the runs that are not "Yes", the share whose first sentence (cause of
 the whole set, or first of the failed or suspicious checks) names the planted cause. `yes`: runs that answer "Yes", and
-the largest error of their faces, √(eᵀC⁻¹e/6). `silent`: "Yes" with an error over 4 σ. Sound sets: exact
+the largest error of their faces, √(eᵀC⁻¹e/6). `silent`: "Yes" with an error over 4 σ. A run that loses a
+group is not "Yes"; an error names a cause only by what it says as the likely cause. Sound sets: exact
 centres of the same sets with new noise of the σ of each centre.
 """
 

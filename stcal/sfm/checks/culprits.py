@@ -18,8 +18,6 @@ from stcal.sfm.data.model import WorldModel
 
 MOST = 0.5
 """Share of the suspects from which they are no culprits: either part may be the wrong one."""
-
-
 MIN_REDUNDANCY = 30.0
 """Smallest redundancy of the circles of the faces, and of the dots, whose residuals tell whether they agree."""
 MOVED = "the target moved relative to the board"
