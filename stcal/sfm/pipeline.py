@@ -38,7 +38,7 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
-from stcal.sfm.checks.verdict import Check
+from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, seen_by
@@ -46,6 +46,7 @@ from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
+from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.detection import (
     DetectedImages,
     Task,
@@ -61,12 +62,14 @@ from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import (
     GroupSolution,
+    explained,
     solve_body,
     solve_groups,
     ungrouped,
     unknown_face_notes,
     unseen_board,
     usable_groups,
+    wrong_file,
 )
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
@@ -208,7 +211,11 @@ def run_on_files(
         result = replace(result, camera_given=model is not None and not is_rough(model, options))
         if options.compare and result.target.target_from_face and model is not None:
             result = replace(result, comparison=compare_with_paper(result, _published(task, model)))
-        result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
+        evidence = result.evidence(camera_prior(result.camera))
+        is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
+        if is_misfit and result.camera_given and not options.refine_camera:
+            evidence = replace(evidence, cause=wrong_file(result.observations(), result.camera, result.board_design))
+        result = replace(result, checks=run_checks(evidence, progress))
         result = replace(result, calibration=_on_surface(result))
         result = replace(result, checks=(*result.checks, *own_checks(result, checks)))
         return replace(result, judgement=write_run(result, folder.stage, progress, reload_s))
@@ -434,25 +441,27 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
         scratch = folder.stage / "scratch"
         return solve_groups(observations, graph, scratch, folder.cache, camera, target, board, options, progress, names)
 
-    solutions, unsolved = solve(calibrated_camera, groups)
     adjust_options, prior = options.adjustment(target), camera_prior(calibrated_camera)
-    if board_alone:
-        progress("faces", 0, 1)
-        calibration = calibrate_board([s.model for s in solutions], calibrated_camera, board, adjust_options)
-        progress("faces", 1, 1)
-    else:
 
-        def adjust_all(of: Sequence[GroupSolution]) -> Calibration:
-            models = [s.model for s in of]
-            return calibrate(models, calibrated_camera, target, board, adjust_options, prior, progress)
+    def adjust_all(of: Sequence[GroupSolution]) -> Calibration:
+        models = [s.model for s in of]
+        if board_alone:
+            return calibrate_board(models, calibrated_camera, board, adjust_options)
+        return calibrate(models, calibrated_camera, target, board, adjust_options, prior, progress)
 
+    with nullcontext() if options.refine_camera else explained(usable, calibrated_camera, board):
+        solutions, unsolved = solve(calibrated_camera, groups)
+        if board_alone:
+            progress("faces", 0, 1)
         calibration = adjust_all(solutions)
-        if doubted := {s.model.group for s in solutions if s.outliers and options.refine_camera}:
-            # What disagrees with the others by the first camera may agree by the refined one.
-            with suppress(StcalError):
-                again = {s.model.group: s for s in solve(calibration.camera, doubted)[0]}
-                refined = [again.get(s.model.group, s) for s in solutions]
-                calibration, solutions = adjust_all(refined), refined
+    if board_alone:
+        progress("faces", 1, 1)
+    elif doubted := {s.model.group for s in solutions if s.outliers and options.refine_camera}:
+        # What disagrees with the others by the first camera may agree by the refined one.
+        with suppress(StcalError):
+            again = {s.model.group: s for s in solve(calibration.camera, doubted)[0]}
+            refined = [again.get(s.model.group, s) for s in solutions]
+            calibration, solutions = adjust_all(refined), refined
     return RunResult(
         out=folder.out,
         camera=calibrated_camera,

@@ -18,6 +18,9 @@ from stcal.sfm.data.model import GroupModel
 MIN_SHARE = 1e-6
 """Smallest share of a parameter's information that poses and points leave to it. Below this share, the parameter cannot
 be separated from them."""
+MIN_CONTROL = 0.1
+"""Smallest redundancy of one coordinate at which the other observations control it: its residual then shows a tenth of
+its error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,8 +30,8 @@ class Network:
     ``residual`` : (n, 2) over σ; ``by_pose`` : (n, 2, 6), ``by_point`` : (n, 2, 3), derivatives of the projections over
     σ; ``inverse`` : (m, 6, 6) of the poses' normal blocks; ``coupling`` : (m, 6, 3p) between poses and points;
     ``pose_right`` : (m, 6), ``point_right`` : (3p,) right-hand sides after the adjustment, almost zero;
-    ``covariance_mm2`` : (3p, 3p) of the points, in the datum of smallest trace (7 free directions); ``redundancy`` :
-    (n,) of each observation, between 0 and 2.
+    ``covariance_mm2`` : (3p, 3p) of the points, in the datum of smallest trace (7 free directions);
+    ``residual_cofactor`` : (n, 2, 2) covariance of each residual over σ².
     """
 
     model: GroupModel
@@ -40,11 +43,32 @@ class Network:
     pose_right: np.ndarray
     point_right: np.ndarray
     covariance_mm2: np.ndarray
-    redundancy: np.ndarray
+    residual_cofactor: np.ndarray
 
     def __post_init__(self):
         p = 3 * len(self.model.labels)
         freeze(self, "covariance_mm2", (p, p), "covariance")
+
+    @property
+    def redundancy(self) -> np.ndarray:
+        """Redundancy of each observation, (n,), between 0 and 2."""
+        return np.trace(self.residual_cofactor, axis1=1, axis2=2)
+
+    def squares_of_observations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the squared residual of each observation over its own covariance, (n,), and the degrees of freedom.
+
+        It follows χ² with these (n,) 0, 1 or 2 degrees of freedom: a direction along which the other observations
+        hardly control this one tells nothing.
+        """
+        value, vector = np.linalg.eigh(self.residual_cofactor)
+        held = value > MIN_CONTROL
+        along = (np.swapaxes(vector, 1, 2) @ self.residual[..., None])[..., 0]
+        square = np.where(held, along**2 / np.where(held, value, 1.0), 0.0)
+        return square.sum(1), held.sum(1)
+
+    def noise(self) -> float:
+        """Returns the squared residual per degree of freedom of this group; 1 if that is less, as σ explain it."""
+        return max(float((self.residual**2).sum() / max(self.redundancy.sum(), 1e-9)), 1.0)
 
     def square_by_image(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns squared residuals over σ² and redundancy of each image, (m,)."""
@@ -139,23 +163,24 @@ def free_network(model: GroupModel, camera: Camera) -> Network:
     place = 3 * np.arange(p)[:, None] + np.arange(3)
     normal[place[:, :, None], place[:, None]] += points
     covariance = constrained_inverse(normal, free_motions(model.xyz_model, scale=True))
-    redundancy = 2 - _leverage(model, a, b, reduction.inverse, reduction.from_kept, covariance)
+    cofactor = np.eye(2) - _leverage(model, a, b, reduction.inverse, reduction.from_kept, covariance)
     right_of_points = point_right.ravel() - reduction.right
     return Network(
-        model, residual, a, b, reduction.inverse, coupling, pose_right, right_of_points, covariance, redundancy
+        model, residual, a, b, reduction.inverse, coupling, pose_right, right_of_points, covariance, cofactor
     )
 
 
 def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.ndarray:
-    """Returns the trace of the cofactors of each adjusted observation, (n,)."""
+    """Returns the cofactors of each adjusted observation, (n, 2, 2)."""
     p = len(model.labels)
     weighted = eliminated @ covariance
     pose = inverse + weighted @ np.swapaxes(eliminated, 1, 2)
     mixed = weighted.reshape(len(model.images), 6, p, 3)[model.image_index, :, model.point_index]
     blocks = covariance.reshape(p, 3, p, 3)[np.arange(p), :, np.arange(p)]
-    trace = np.einsum("nki,nij,nkj->n", a, pose[model.image_index], a, optimize=True)
-    trace -= 2 * np.einsum("nki,nij,nkj->n", a, mixed, b, optimize=True)
-    return trace + np.einsum("nki,nij,nkj->n", b, blocks[model.point_index], b, optimize=True)
+    b_transposed = np.swapaxes(b, 1, 2)
+    cross = a @ mixed @ b_transposed
+    of_poses = a @ pose[model.image_index] @ np.swapaxes(a, 1, 2)
+    return of_poses - cross - np.swapaxes(cross, 1, 2) + b @ blocks[model.point_index] @ b_transposed
 
 
 @dataclass(frozen=True, slots=True, eq=False)

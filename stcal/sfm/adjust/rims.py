@@ -19,7 +19,11 @@ SECOND_ORDER = 0.085
 MIN_VIEWS, MIN_SPREAD = 30, 0.15
 """Smallest number of views of a kind of circle, and of the standard deviation of their tan τ, for a rim."""
 BLUR_SHARE = 0.3
-"""σ of the blur's effect on the radius that is left after its correction, as a share of it (``defocus_study.py``)."""
+"""σ of the blur's effect on the radius that is left after its correction, as a share of it (``defocus_study.py``): the
+prior of the share that all views of a kind have in common, which the views determine better."""
+BLUR_SHARE_BY_TILT = 0.05
+"""σ by which this share grows with the tangent of the tilt, which looks like a rim: it is 0.00 to 0.02 for circles that
+face the camera, 0.05 at 50° and 0.04 to 0.13 at 62° (``defocus_study.py``, circles of 8 px and more)."""
 LEAST_SIGMA_MM = 0.003
 """Smallest σ of a rim: what light that falls towards the edge of a circle adds."""
 HUBER = 2.0
@@ -128,18 +132,21 @@ def find_rims(
 
 
 def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.ndarray) -> Rim:
-    """Returns the rim from the radii's excess ``short`` (mm) over the design, with an offset of each radius."""
+    """Returns the rim from the radii's excess ``short`` (mm) over the design, with an offset of each radius, and the
+    share of the blur's effect that its correction left in all of them."""
     _, kind = np.unique(radius, return_inverse=True)
-    rows = np.column_stack([np.eye(kind.max() + 1)[kind], -tangent / np.pi])
+    rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -tangent / np.pi])
     height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)
     for _ in range(STEPS):
         right = short + lost_radius_mm(height, tangent, radius) - height * tangent / np.pi
-        inverse = np.linalg.pinv((rows.T * weight) @ rows, hermitian=True)
+        normal = (rows.T * weight) @ rows
+        normal[-2, -2] += (sigma / BLUR_SHARE) ** 2
+        inverse = np.linalg.pinv(normal, hermitian=True)
         solution = inverse @ ((rows.T * weight) @ right)
         height = float(solution[-1])
         length = np.abs(right - rows @ solution)
         sigma = float(robust_sigma(length, redundancy=max(1 - rows.shape[1] / len(rows), 0.1)))
         weight = huber_weights(length / max(sigma, 1e-9), HUBER)
-    of_blur = float((inverse @ ((rows.T * weight) @ blur))[-1])
+    by_tilt = BLUR_SHARE_BY_TILT * float((inverse @ ((rows.T * weight) @ (blur * tangent)))[-1])
     spread = sigma * float(np.sqrt(inverse[-1, -1]))
-    return Rim(height, float(np.sqrt(spread**2 + (BLUR_SHARE * of_blur) ** 2 + LEAST_SIGMA_MM**2)), len(short))
+    return Rim(height, float(np.sqrt(spread**2 + by_tilt**2 + LEAST_SIGMA_MM**2)), len(short))

@@ -13,7 +13,7 @@ from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
-from stcal.labels import unseen_lines
+from stcal.labels import DotLabel, unseen_lines
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.camera.checks import (
     AUTO,
@@ -38,7 +38,7 @@ from stcal.sfm.camera.intrinsics import (
     start_camera,
 )
 from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.data.patterns import pattern_of_board
+from stcal.sfm.data.patterns import MIN_DOTS, pattern_of_board
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.files import DetectionResult, detect_files
@@ -156,6 +156,28 @@ def camera_of_dots(
     """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``; errors as
     :func:`calibrate_camera`."""
     return _of_one_round(files, (), detection, board, start, colmap_model, True)[2]
+
+
+def camera_of_labelled(
+    images: Sequence[ImageObservations], board: BoardDesign, camera: Camera
+) -> tuple[Intrinsics, Intrinsics]:
+    """Returns the intrinsics by the labelled dots of the board alone, and an adjustment that keeps those of ``camera``.
+
+    The first begins at a lens that ``camera`` does not influence, and has the same model.
+
+    Raises
+    ------
+    DetectionError, DegenerateError, ConvergenceError
+        As :func:`calibrate_camera`.
+    """
+    dots = [[k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)] for image in images]
+    views = [image.select(own) for image, own in zip(images, dots, strict=True) if len(own) >= MIN_DOTS]
+    require_views(views, (), ())
+    model = camera.colmap_model
+    start = closed_form(views, board, start_camera(camera.width, camera.height, model))
+    found = adjust_intrinsics(views, board, start, model)
+    require_determined(found, views)
+    return found, adjust_intrinsics(views, board, camera, model, held=True)
 
 
 def _of_one_round(

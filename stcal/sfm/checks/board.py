@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.align import align_similarity
@@ -15,7 +16,7 @@ from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.rims import Rim, lost_radius_mm, radius_views
-from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations
 
 EDGE_BIAS_PX = 0.05
@@ -235,7 +236,8 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
 def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     """Returns dots minus grid after a similarity, their weight matrix, and their cells (d, 2).
 
-    The differences are (3d,) mm, board frame. The weight matrix is the inverse of their covariance (pseudo).
+    The differences are (3d,) mm, board frame. The weight matrix is the inverse of their covariance (pseudo), with the
+    noise of this group, so that a noisy image is not taken for a bent board.
     """
     labels = [network.model.labels[i] for i in dots]
     cells = dot_cells(labels)
@@ -243,7 +245,8 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     xyz = network.model.xyz_model[dots]
     board_from_model = align_similarity(design, xyz)
     turn = np.kron(np.eye(len(dots)), board_from_model.scale * board_from_model.rigid.rotation)
-    covariance = turn @ network.covariance_of(dots) @ turn.T + board.sigma_mm**2 * np.eye(3 * len(dots))
+    of_images = network.noise() * network.covariance_of(dots)
+    covariance = turn @ of_images @ turn.T + board.sigma_mm**2 * np.eye(3 * len(dots))
     middle = design - design.mean(0)
     free = np.concatenate(
         [-skew(middle), np.broadcast_to(np.eye(3), (len(dots), 3, 3)), middle[:, :, None]], axis=2
@@ -280,16 +283,21 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
 
     Positions: a similarity maps the design to the circles of each face, and its residuals give the σ of their
     placement. Radii: the slope of measured over designed radii, which a constant bias of the edges does not change. The
-    weighted mean of both is tested, with 100 ppm as σ of the target's own size, in addition to that of the result.
+    weighted mean of both is tested, with 100 ppm as σ of the target's own size, in addition to that of the result. A
+    wrong pitch scales both alike; radii that contradict the positions are wrong themselves, and are left out.
     Without a board (``has_board``) the result has its size from printed faces or known distances.
     """
     if target.up_to_scale:
         return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
-    measures = [m for m in (_size_by_positions(calibrated, target), size_by_radii(radii)) if m is not None]
+    positions, of_radii = _size_by_positions(calibrated, target), size_by_radii(radii)
+    measures = [m for m in (positions, of_radii) if m is not None]
     if not measures:
         reason = f"no face with {MIN_DOTS} circles, and no circles of two sizes"
         has_circles = any(face.printed is None for face in target.faces)
         return impossible("pitch", PITCH, reason, "add views of the faces" if has_circles else "")
+    shown = measures
+    if positions and of_radii and _contradict(positions, of_radii):
+        measures = [positions]
     weight = np.array([1 / m.sigma**2 for m in measures])
     size = float(weight @ [m.size for m in measures] / weight.sum())
     variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
@@ -305,8 +313,15 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
         "board pitch" if has_board else "size of the circles' faces", 1e6 * size, "ppm", size**2 / variance, 1, freedom
     )
     check = judge("pitch", PITCH, [trial], "boards", remedy)
-    single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in measures)
-    return replace(check, measured=check.measured + single)
+    single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
+    reason = check.reason if measures == shown else f"{check.reason}; by positions alone, which radii contradict"
+    return replace(check, reason=reason, measured=check.measured + single)
+
+
+def _contradict(a: Size, b: Size) -> bool:
+    """Whether two sizes differ by more than chance."""
+    square = (a.size - b.size) ** 2 / (a.sigma**2 + b.sigma**2)
+    return float(fdtrc(1, min(a.freedom, b.freedom), square)) < SUSPICIOUS
 
 
 def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Size | None:

@@ -12,20 +12,26 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, fdtrc
 
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
+from stcal.sfm.checks.culprits import MOVED, MOVED_REMEDY
 from stcal.sfm.checks.images import summed
 from stcal.sfm.checks.verdict import FAILED, Check, Measured
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8
-"""A hypothesis with fewer parameters is preferred if it explains at least this share of what the best one explains."""
+"""Smallest share of what the best hypothesis explains that another one with fewer parameters must explain."""
+EXPLAINS_ALL = 0.95
+"""That share where chance is small against what is explained: tests of first order leave s² of the square of a change
+by a share s, 4 % of one by a fifth."""
 MOST_IMAGES = 60
 """Largest number of images of a group in which parameters of single images are fitted; more take minutes."""
 FIXED_WITHIN = 0.2
 """Largest deviation from 1 of the share of a change that is as a whole or not at all, such as a distortion removed."""
+FILE_WITHIN = 0.02
+"""That deviation where the true camera is known: what two good calibrations of a distortion differ by."""
 FEW = 0.25
 """Share of the images that may not explain alone what is taken for a cause of the whole set."""
 ALONE = 0.93
@@ -42,7 +48,8 @@ class _Cause:
     ``name``, ``remedy`` in words; ``size`` : its size in words, from the estimates (q,) and their σ; ``columns`` : (n,
     2, q) derivatives of the projections of a network over σ; ``scope`` : one set of parameters for all images, or one
     for each group or image; ``whole`` : True if the first parameter is 1 where the hypothesis is true, and so is not
-    free.
+    free, or 0 or 1 in each image; ``direction`` : (p, q) derivatives of the camera's parameters, None of what is no
+    matter of the camera file.
     """
 
     name: str
@@ -51,6 +58,7 @@ class _Cause:
     columns: Callable[[Network], np.ndarray]
     scope: str = "all"
     whole: bool = False
+    direction: np.ndarray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,18 +74,23 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = F
     """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals.
 
     The residuals beyond chance are those that the most flexible hypothesis explains. Of all hypotheses that explain
-    ``EXPLAINS`` of it the one with fewest parameters is named.
+    ``EXPLAINS_ALL`` of it, less what chance may do, the one with fewest parameters is named.
 
     ``moved`` : whether the target seems to have moved, and no few images are the culprits.
     """
     fitted = [f for cause in _hypotheses(camera) if (f := _fit(cause, networks)) is not None]
-    most = max((f.explained for f in fitted), default=0.0)
+    if not fitted:
+        return None
+    richest = max(fitted, key=lambda f: f.explained)
+    most = richest.explained
+    by_chance = 2 * richest.left * np.sqrt(2 * richest.test.freedom)  # two σ of what its parameters fit by chance
+    enough = max(EXPLAINS * most, EXPLAINS_ALL * most - by_chance)
     named = [
         f
         for f in fitted
         if (moved or f.cause.columns is not _by_motion)
         and f.probability * len(fitted) < FAILED
-        and f.explained > EXPLAINS * most
+        and f.explained >= enough
         and _applies(f, networks)
     ]
     if not named:
@@ -100,6 +113,44 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = F
     return Check(
         CAUSE, f"{OF_WHOLE_SET}{best.cause.name}", "failed", reason, measured, len(fitted), (), best.cause.remedy
     )
+
+
+def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_model: str) -> Check | None:
+    """Returns a failed check that names what of a camera file is wrong; None if no hypothesis on the file explains it.
+
+    Unlike :func:`whole_set_cause` it begins at the true camera, so that the file may be far off.
+
+    Parameters
+    ----------
+    camera
+        The camera of the file.
+    found
+        The camera of the photographs.
+    covariance : (q, q)
+        Covariance of the parameters of ``found``.
+    colmap_model
+        COLMAP's camera model, which has these parameters.
+    """
+    to_model = np.linalg.pinv(intrinsic_basis(colmap_model))
+    weight = np.linalg.inv(covariance)
+    off = to_model @ (found.parameters() - camera.parameters())
+    square = float(off @ weight @ off)
+    fitted = []
+    for cause in _hypotheses(camera):
+        if cause.direction is None:
+            continue
+        along = to_model @ cause.direction
+        test = solve_score(along.T @ weight @ along, along.T @ weight @ off)
+        if cause.whole and abs(test.estimate[0] - 1) > FILE_WITHIN + 3 * np.sqrt(test.covariance[0, 0]):
+            continue
+        if test.statistic > EXPLAINS_ALL * square:
+            fitted.append((test.freedom - cause.whole, -test.statistic, cause, test))
+    if not fitted:
+        return None
+    _, explained, cause, test = min(fitted, key=lambda f: f[:2])
+    size = cause.size(test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0)))
+    share = Measured(cause.name, -100 * explained / square, None, "% explained", None)
+    return Check(CAUSE, f"{OF_WHOLE_SET}{cause.name}", "failed", size, (share,), len(fitted), (), cause.remedy)
 
 
 def _redundancy(networks: Sequence[Network]) -> float:
@@ -151,11 +202,15 @@ def _together(tests: Sequence[ScoreTest]) -> ScoreTest:
 
 
 def _applies(fitted: _Fitted, networks: Sequence[Network]) -> bool:
-    """Whether the estimates are those of a cause of the whole set: a change as a whole is 1, groups differ, and a few
-    images do not explain it alone."""
+    """Whether the estimates are those of a cause of the whole set: a change as a whole is 1, or in each image 1 or 0,
+    groups differ, and a few images do not explain it alone."""
     estimate = fitted.test.estimate
-    if fitted.cause.whole:
+    if fitted.cause.whole and fitted.cause.scope == "all":
         return bool(abs(estimate[0] - 1) < FIXED_WITHIN)
+    if fitted.cause.whole:
+        sigma = np.sqrt(fitted.left * np.diag(fitted.test.covariance))
+        if (np.abs(estimate - (estimate > 0.5)) > FIXED_WITHIN + 3 * sigma).any():
+            return False
     if fitted.cause.scope == "group":
         away = (estimate - np.median(estimate)) ** 2 / np.maximum(np.diag(fitted.test.covariance), 1e-300)
         return len(networks) > 1 and bool((away > fitted.left * chdtri(1, FAILED)).any())
@@ -197,15 +252,19 @@ def _explained_by_one(networks: Sequence[Network], left: float) -> float:
     return most
 
 
-def _percent(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
+Size = Callable[[np.ndarray, np.ndarray], str]
+"""Words on the size of a cause, from its parameters (q,) and their σ."""
+
+
+def _percent(what: str) -> Size:
     return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} % against the file"
 
 
-def _spread(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
+def _spread(what: str) -> Size:
     return lambda value, _: f"{what} up to {100 * np.ptp(value):.3g} % apart"
 
 
-def _listed(names: Sequence[str]) -> Callable[[np.ndarray, np.ndarray], str]:
+def _listed(names: Sequence[str]) -> Size:
     return lambda value, _: ", ".join(f"{name} {v:+.2g}" for name, v in zip(names, value, strict=True))
 
 
@@ -224,22 +283,25 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
         return lambda network: network.model.whiten(_by_parameters(network, camera) @ direction)
 
+    def of_file(name: str, remedy: str, size: Size, direction: np.ndarray, whole: bool = False) -> _Cause:
+        return _Cause(name, remedy, size, by(direction), whole=whole, direction=direction)
+
     causes = [
-        _Cause("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
-               f"file belongs to another lens: {ANEW}", _percent("focal length"), by(focal)),
-        _Cause("the photographs are scaled relative to the camera file", "use the photographs at the size of the "
+        of_file("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
+               f"file belongs to another lens: {ANEW}", _percent("focal length"), focal),
+        of_file("the photographs are scaled relative to the camera file", "use the photographs at the size of the "
                "calibration, or scale focal length and principal point in the camera file by the same factor",
-               _percent("size"), by(scaled)),
-        _Cause("width and height are scaled differently", "the photographs were resized without keeping their "
+               _percent("size"), scaled),
+        of_file("width and height are scaled differently", "the photographs were resized without keeping their "
                "proportions, or fx and fy of the camera file are wrong: use the original photographs",
-               _percent("fx over fy"), by(fx * unit[:, [0]])),
-        _Cause("the principal point is not that of the camera file", "the photographs are cropped, or from another "
+               _percent("fx over fy"), fx * unit[:, [0]]),
+        of_file("the principal point is not that of the camera file", "the photographs are cropped, or from another "
                f"sensor: use them uncropped, or correct cx and cy in the camera file; or {ANEW}",
-               _listed(("cx", "cy")), by(unit[:, 2:4])),
-        _Cause("the distortion is not that of the camera file", f"another lens or focus, or its signs or order are "
-               f"wrong in the file: {ANEW}", _listed(("k1", "k2", "p1", "p2")), by(unit[:, 4:8])),
-        _Cause("the intrinsics are not those of the camera file", f"the camera file belongs to another camera: {ANEW}",
-               _listed(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")), by(unit[:, :8])),
+               _listed(("cx", "cy")), unit[:, 2:4]),
+        of_file("the distortion is not that of the camera file", f"another lens or focus, or its signs or order are "
+               f"wrong in the file: {ANEW}", _listed(("k1", "k2", "p1", "p2")), unit[:, 4:8]),
+        of_file("the intrinsics are not those of the camera file", f"the camera file belongs to another camera: {ANEW}",
+               _listed(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")), unit[:, :8]),
         _Cause("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom and "
                "focus, and take the photographs again; or run each group with a camera file of its own",
                _spread("focal lengths"), by(focal), "group"),
@@ -248,36 +310,45 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                "image"),
         _Cause("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, or "
                "stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
-        _Cause("the target moved relative to the board", "sort the images into groups in which nothing moved, or "
-               "take them again", lambda value, _: "in more than one image", _by_motion, "image"),
+        _Cause("the centres are not those of ellipses (eccentricity)", "the measured centres do not move as those of "
+               "ellipses: check radii, polarity and exposure; centroids of grey values or of contours need another "
+               "correction", lambda value, sigma: f"{1 + value[0]:.3f} ± {sigma[0]:.2g} of the eccentricity found",
+               lambda network: network.model.whiten(network.model.shift_px[:, :, None])),
+        _Cause(MOVED, MOVED_REMEDY, lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
         causes.append(
-            _Cause("the photographs are already undistorted", "the camera file has a distortion that they no longer "
+            of_file("the photographs are already undistorted", "the camera file has a distortion that they no longer "
                    "have: use the original photographs, or set the distortion in the camera file to 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
-                   "not in them", by(removed), whole=True)
+                   "not in them", removed, whole=True)
         )  # fmt: skip
         causes.append(
-            _Cause("the photographs are already undistorted, with another camera matrix", "give the original "
+            of_file("the photographs are already undistorted, with another camera matrix", "give the original "
                    "photographs, or a camera file with the matrix that they were undistorted to, and a distortion of 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    f"not in them, {_listed(('fx', 'fy', 'cx', 'cy'))(value[1:], sigma[1:])}",
-                   by(np.hstack([removed, unit[:, :4]])), whole=True)
+                   np.hstack([removed, unit[:, :4]]), whole=True)
         )  # fmt: skip
         causes.append(
-            _Cause("the distortion of the camera file has its sign reversed", "the program that wrote it undistorts "
+            of_file("the distortion of the camera file has its sign reversed", "the program that wrote it undistorts "
                    "where this one distorts: change the signs of all coefficients in the camera file",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way",
-                   by(2 * removed), whole=True)
+                   2 * removed, whole=True)
         )  # fmt: skip
     for quarters in (1, 2, 3) if camera.width == camera.height else (2,):
         turned = _turned(camera, quarters)[:, None] - camera.parameters()[:, None]
         if np.abs(turned[2:4]).max() > LEAST_SHIFT_PX:
             causes.append(
-                _Cause(f"the photographs are turned by {90 * quarters}° relative to the camera file", "use "
+                of_file(f"the photographs are turned by {90 * quarters}° relative to the camera file", "use "
                        "them as the sensor recorded them, without the rotation that a viewer or converter applied",
-                       lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
+                       lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", turned, whole=True)
+            )  # fmt: skip
+            causes.append(
+                _Cause(f"some photographs are turned by {90 * quarters}° relative to the others", "use them as the "
+                       "sensor recorded them, without the rotation that a viewer or converter applied",
+                       lambda value, _: f"{(value > 0.5).sum()} of {len(value)} are turned", by(turned), "image",
+                       whole=True)
             )  # fmt: skip
     return causes
 

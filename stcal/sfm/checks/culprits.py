@@ -1,16 +1,27 @@
 """Culprits: one is named only if leaving it out cures the result, and leaving out another one does not."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import fdtrc
 
-from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
-from stcal.sfm.checks.verdict import SUSPICIOUS
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import StcalError
+from stcal.geometry.camera import Camera
+from stcal.labels import CircleLabel
+from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_score
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
+from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.checks.verdict import MOST_SIGMAS, SUSPICIOUS
+from stcal.sfm.data.model import WorldModel
 
 MOST = 0.5
 """Share of the suspects from which they are no culprits: either part may be the wrong one."""
+MIN_REDUNDANCY = 30.0
+"""Smallest redundancy of the circles of the faces, and of the dots, whose residuals tell whether they agree."""
+MOVED = "the target moved relative to the board"
+MOVED_REMEDY = "sort the images into groups in which nothing moved, or take them again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +92,13 @@ def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[
     apart = np.zeros((n, 2, images, q))
     apart[np.arange(n), :, place] = columns
     normal, right = network.score(apart.reshape(n, 2, images * q))
-    redundancy = float(network.redundancy.sum())
+    redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
+
+    def of(out: Collection[int]) -> np.ndarray:
+        return (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
 
     def test(image: int, out: Collection[int]) -> ScoreTest:
-        own = q * image + np.arange(q)
-        held = (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
+        own, held = of([image]), of(out)
         if not len(held):
             return solve_score(normal[np.ix_(own, own)], right[own])
         away = normal[np.ix_(own, held)] @ np.linalg.pinv(normal[np.ix_(held, held)], hermitian=True)
@@ -93,12 +106,34 @@ def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[
 
     def worst(out: Collection[int]) -> int | None:
         tests = {i: test(i, out) for i in suspects if i not in out}
-        chance = {
-            i: fdtrc(t.freedom, max(redundancy - t.freedom, 1.0), t.statistic / t.freedom)
-            for i, t in tests.items()
-            if t.freedom
-        }
+        taken = solve_score(normal[np.ix_(of(out), of(out))], right[of(out)]) if out else None
+        total, freedom = square, redundancy
+        if taken is not None:
+            total, freedom = square - taken.statistic, redundancy - taken.freedom
+        chance = {}
+        for i, t in tests.items():
+            if t.freedom:
+                rest = max(freedom - t.freedom, 1.0)
+                noise = max((total - t.statistic) / rest, 1.0)
+                chance[i] = fdtrc(t.freedom, rest, t.statistic / noise / t.freedom)
         guilty = [i for i, probability in chance.items() if probability * count < SUSPICIOUS]
         return max(guilty, key=lambda i: tests[i].statistic, default=None)
 
     return culprits(network.model.images, worst, where)
+
+
+def moved_apart(model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign) -> bool:
+    """Whether the observations of a group that contradict one another agree if faces and board are taken by themselves.
+
+    Then the camera is right, and target and board moved relative to each other between the images. Where the camera is
+    wrong, the dots and circles by themselves do not agree to their σ either.
+    """
+    on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])[model.point_index]
+    try:
+        radius = {**target.radius_of(), **board.radius_of()}
+        shift = eccentricity_px(model, camera, radius, find_scale(model, board).mm_per_unit)
+        corrected = replace(model, shift_px=shift)
+        parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (on_face, ~on_face)]
+    except (StcalError, ValueError, np.linalg.LinAlgError):
+        return False
+    return all(n.redundancy.sum() > MIN_REDUNDANCY and n.noise() < MOST_SIGMAS**2 for n in parts)

@@ -184,7 +184,7 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
 def _agree(joint: JointResult, networks: Sequence[Network]) -> bool:
     """Whether a joint adjustment adds no more to the squared residuals of its groups than chance does."""
     extra, freedom, free = _added(joint, networks)
-    return float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS
+    return freedom < 1 or float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS
 
 
 def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int, float]:
@@ -274,6 +274,8 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     """
     key, title = "agreement", "Groups, board and faces against one another"
     extra, freedom, free = _added(joint, networks)
+    if freedom < 1:
+        return impossible(key, title, "one target and board add no condition to the groups", "add images")
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
     trial = Trial("all groups", value, "σ", extra, freedom, free)
@@ -341,7 +343,7 @@ def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np
     towards = np.mean([pose.inverse().translation for pose in model.camera_from_model], axis=0) - xyz.mean(0)
     plane = fit_plane(xyz, towards)
     across = np.kron(np.eye(len(members)), plane.normal)
-    covariance = across @ network.covariance_of(members) @ across.T
+    covariance = network.noise() * across @ network.covariance_of(members) @ across.T
     basis = np.linalg.svd(np.eye(3) - np.outer(plane.normal, plane.normal))[0][:, :2]
     free = np.column_stack([np.ones(len(members)), (xyz - xyz.mean(0)) @ basis])
     inverse = np.linalg.inv(covariance)

@@ -16,13 +16,23 @@ from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
 from stcal.sfm.checks.culprits import Guilt, culprits, culprits_by_score
-from stcal.sfm.checks.verdict import SHOWN, SUSPICIOUS, Check, Measured, Trial, impossible, judge, without_image
+from stcal.sfm.checks.verdict import (
+    MOST_SIGMAS,
+    SHOWN,
+    SUSPICIOUS,
+    Check,
+    Measured,
+    Trial,
+    impossible,
+    judge,
+    without_image,
+)
 from stcal.sfm.data.model import ImageObservations, Outlier
 
 MIN_CIRCLES = 3
 """Smallest number of circles of the faces, and of the board, in an image that can show motion between both."""
-SIGMA_LIMITS = (2.0, 4.0)
-"""Limits of residuals over the centres' own σ: light and lens may add a factor of two, four is another model."""
+SIGMA_LIMITS = (2.0, MOST_SIGMAS)
+"""Limits of residuals over the centres' own σ: light and lens may add a factor of two."""
 DULL = 1.5
 """Ratio of an image's σ of centres to that of its group at which the image has lost more than half of its weight."""
 MAD_EFFICIENCY = 0.37
@@ -240,8 +250,9 @@ def moved_check(networks: Sequence[Network]) -> Check:
     """Tests whether the target moved relative to the board, one image against all others.
 
     In every image all faces together may be shifted and turned against the board. Whether this motion is needed is a
-    test with six degrees of freedom. Where it leaves residuals that are too large for the σ, these are the yardstick: a
-    noisy image seems to move too.
+    test with six degrees of freedom. The residuals that it leaves, in the image and in its whole group, are the
+    yardstick if they are too large for the σ: an image that is noisy seems to move too, and so do its neighbours, which
+    share its points.
     """
     trials: list[Trial] = []
     tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
@@ -252,7 +263,8 @@ def moved_check(networks: Sequence[Network]) -> Check:
             continue
         columns = _motion(network, on_face)
         normal, right = network.score_by_image(columns)
-        redundancy = network.redundancy.sum()
+        redundancy = float(network.redundancy.sum())
+        square = float((network.residual**2).sum())
         tested = []
         for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
             faces = on_face[model.point_index[rows]].sum()
@@ -261,9 +273,12 @@ def moved_check(networks: Sequence[Network]) -> Check:
             test = solve_score(normal[i], right[i])
             if test.freedom:
                 shift_um = 1e3 * float(np.linalg.norm(test.estimate[3:]))
-                left = float((network.residual[rows] ** 2).sum()) - test.statistic
-                noise = max(left / max(float(network.redundancy[rows].sum()) - test.freedom, 1.0), 1.0)
-                statistic = test.statistic / noise
+                own = float((network.residual[rows] ** 2).sum()), float(network.redundancy[rows].sum())
+                noise = max(
+                    (total - test.statistic) / max(freedom - test.freedom, 1.0)
+                    for total, freedom in (own, (square, redundancy))
+                )
+                statistic = test.statistic / max(noise, 1.0)
                 trials.append(Trial(name, shift_um, "µm", statistic, test.freedom, redundancy - test.freedom))
                 tested.append(i)
         tested_by_group[model.group] = network, columns, tested
@@ -330,7 +345,7 @@ def labels_check(
     """Tests every observation against all others.
 
     Observations that were left out already do no harm and are named. Observations that were kept but are beyond chance
-    (squared residual over its own redundancy: Baarda's data snooping) are named, too; their weight is reduced. Labels
+    (squared residual over its own covariance: Baarda's data snooping) are named, too; their weight is reduced. Labels
     of one image that are at each other's places are a fault: other labels may be exchanged without being noticed.
     """
     remedy = (
@@ -398,12 +413,12 @@ def _of_group(image: str, network: Network) -> bool:
 def _trials(networks: Sequence[Network]) -> list[Trial]:
     trials = []
     for network in networks:
-        model, total = network.model, network.redundancy.sum()
-        length = np.linalg.norm(network.residual, axis=1)
-        for k in np.flatnonzero(network.redundancy > 0.2):
-            statistic = 2 * length[k] ** 2 / network.redundancy[k]
+        model, total = network.model, float(network.redundancy.sum())
+        square, freedom = network.squares_of_observations()
+        for k in np.flatnonzero(freedom):
             name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
-            trials.append(Trial(name, float(length[k]), "σ", float(statistic), 2, float(total)))
+            length = float(np.linalg.norm(network.residual[k]))
+            trials.append(Trial(name, length, "σ", float(square[k]), int(freedom[k]), total))
     return trials
 
 

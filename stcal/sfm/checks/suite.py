@@ -17,7 +17,7 @@ from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
-from stcal.sfm.checks.board import board_checks, measure_radii, pitch_check, radius_checks, rim_check
+from stcal.sfm.checks.board import KINDS, board_checks, measure_radii, pitch_check, radius_checks, rim_check
 from stcal.sfm.checks.causes import whole_set_cause
 from stcal.sfm.checks.faces import (
     Again,
@@ -62,7 +62,8 @@ class Evidence:
     ``models`` : adjusted models of the single groups, without unit; ``outliers`` : observations left out of the models;
     ``images`` : all observations; ``camera`` : as given; ``prior`` : of the intrinsics if they were refined;
     ``blur_px`` : blur of the edges by image, may be empty; ``rim`` : whether rims are estimated for the result;
-    ``camera_given`` : False if there is no camera file and the camera was found from the photographs.
+    ``camera_given`` : False if there is no camera file and the camera was found from the photographs; ``cause`` : the
+    cause of the whole set if it is known already.
     """
 
     models: tuple[WorldModel, ...]
@@ -77,6 +78,7 @@ class Evidence:
     blur_px: dict[str, float]
     rim: bool = False
     camera_given: bool = True
+    cause: Check | None = None
 
     def radius_mm(self) -> dict[Label, float]:
         """Returns the radii of all circles and dots, without the corners of printed faces."""
@@ -106,12 +108,13 @@ def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, Mapping[str
     return rims, float(max(known)) if known else None, stated
 
 
-def _allowed_mm(evidence: Evidence, rims: Mapping[str, Rim]) -> dict[Label, float]:
-    """Returns the heights of the rims that the result allows for, by label: as estimated, or as stated."""
-    if not evidence.rim:
-        return {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
-    kinds = {label: "dots" if isinstance(label, DotLabel) else "circles" for label in evidence.radius_mm()}
-    return {label: rims[kind].height_mm for label, kind in kinds.items() if kind in rims}
+def _before_circles_mm(evidence: Evidence, rims: Mapping[str, Rim], check: Check) -> dict[Label, float]:
+    """Returns the heights of the rims in front of circles and dots, by label: as estimated where the result allows for
+    that or ``check`` finds another rim than stated, else as stated."""
+    stated = {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
+    of_label = {label: "dots" if isinstance(label, DotLabel) else "circles" for label in evidence.radius_mm()}
+    found = {kind for kind in rims if evidence.rim or KINDS[kind][0] in check.names}
+    return {k: rims[kind].height_mm if kind in found else stated.get(k, 0.0) for k, kind in of_label.items()}
 
 
 def _bend(evidence: Evidence) -> tuple[set[str], float]:
@@ -128,7 +131,9 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     rims, sigma_mm, allowed = _rims(evidence)
-    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, _allowed_mm(evidence, rims))
+    of_rims = rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
+    before_mm = _before_circles_mm(evidence, rims, of_rims)
+    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior, evidence.camera_given),
         lambda: field_check(networks, camera),
@@ -142,7 +147,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: board_checks(networks, board),
         lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
         lambda: radius_checks(radii),
-        lambda: rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm())),
+        lambda: of_rims,
         lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
         lambda: control_check(evidence, networks),
     )
@@ -159,7 +164,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
             step(None)
     failed = any(check.verdict == "failed" for check in checks)
     moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
-    cause = whole_set_cause(networks, camera, moved) if failed else None
+    cause = evidence.cause or (whole_set_cause(networks, camera, moved) if failed else None)
     return (cause, *checks) if cause else tuple(checks)
 
 
@@ -196,6 +201,8 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     if not any(n.model.shift_px.any() for n in networks):
         return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
     test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
+    if not test.freedom:
+        return impossible(key, CONTROL, "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy = sum(n.redundancy.sum() for n in networks)
     remedy = (
         "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "

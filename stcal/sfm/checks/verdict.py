@@ -25,6 +25,8 @@ FAILED = 1e-5
 BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"
 KNOWN = 1e9
 """Degrees of freedom of a σ that is stated, not estimated."""
+MOST_SIGMAS = 4.0
+"""Residuals over the centres' own σ from which the model does not describe the images."""
 SHOWN = 8
 """Number of measurements that a check lists, the worst first."""
 

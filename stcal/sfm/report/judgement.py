@@ -37,13 +37,11 @@ CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
 GENERAL = ("centres", "agreement", "halves")
 """Keys of the checks that show that something is wrong, but not what. Other checks are named before them."""
-EXPLAINED_BY = {
-    "radius-design": ("rim",),
-    "groups": ("board", "board-lines", "flatness"),
-    "loops": ("board", "board-lines", "flatness"),
-}
-"""Checks that fail because of what others found; those are said before them. Board and flatness are tested in each
-group by itself, and need no agreement of groups."""
+IN_ONE_GROUP = ("board", "board-lines", "flatness", "control", "camera", "residual-field", "moved", "image-residuals")
+"""Keys of the checks that test each group by itself, and need no agreement of groups."""
+EXPLAINED_BY = {"radius-design": ("rim",), "groups": IN_ONE_GROUP, "loops": IN_ONE_GROUP}
+"""Checks that fail because of what others found; those are said before them. A fault within a group makes it contradict
+the others, but groups that contradict one another make no fault within one of them."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "
@@ -120,7 +118,8 @@ def judgement_of(report: dict) -> Judgement:
     report : content of ``report.json``
     """
     verdict, use = _use(report)
-    cause = _control(report) or _by_checks(report) or _by_gaps(report) or _by_size(report) or _by_sigma(report)
+    by_result = _control(report) or _by_checks(report) or _by_gaps(report)
+    cause = by_result or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
@@ -199,7 +198,8 @@ def _by_result(report: dict) -> tuple[Use, str]:
     n = counts["failed"]
     if cause := [check for check in report.get("checks", []) if check["key"] == CAUSE]:
         name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
-        return "no", f"No: {name}; that is the likely cause of {n} of {made} checks that failed."
+        of = f"; that is the likely cause of {n} of {made} checks that failed" if n else ""
+        return "no", f"No: {name}{of}."
     if n:
         return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
     if different := report.get("crosscheck", {}).get("differences"):
@@ -401,6 +401,15 @@ def _by_gaps(report: dict) -> _Cause | None:
             f"Face {join(missing)} should have been photographed, and is not in the result.",
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
+    return None
+
+
+def _by_lost_group(report: dict) -> _Cause | None:
+    """Returns why the first group that was left out could not be solved; None if all could."""
+    for note in report["notes"]:
+        if note.startswith(f"{LEFT_OUT_WHOLE}group "):
+            found, _, remedy = note.removeprefix(LEFT_OUT_WHOLE).partition("; ")
+            return _Cause(f"Left out: {found}.", f"{remedy[:1].upper()}{remedy[1:]}." if remedy else "Take it again.")
     return None
 
 

@@ -3,8 +3,9 @@
 import hashlib
 import json
 import shutil
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,13 @@ from stcal.io.cache import keep, kept, made_by
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress, counted, run_briefly
-from stcal.sfm.adjust.refine import refine
+from stcal.report.text import significant
+from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
+from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
+from stcal.sfm.checks.culprits import MOVED, MOVED_REMEDY, moved_apart
+from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
 from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
@@ -26,7 +32,7 @@ from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
-from stcal.sfm.report.judgement import LEFT_OUT_WHOLE
+from stcal.sfm.report.judgement import LEFT_OUT_WHOLE, OF_WHOLE_SET
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 
 CACHE_VERSION = 7
@@ -215,7 +221,7 @@ def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
         )
         write_database(database, camera, images, group.matched)
         mapping = map_group(database, scratch / "models", images, group.skeleton, ids, pairs, camera)
-        refined = refine(mapping.model, camera, group.target, board, group.eccentricity)
+        refined = refine_or_explain(mapping.model, camera, group.target, board, group.eccentricity)
     except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
         return error
     return GroupSolution(
@@ -226,6 +232,57 @@ def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
         mapping.left_out | left_out([i for i in images if i.name in mapping.model.images], refined.model),
         (*mapping.outliers, *refined.outliers),
     )
+
+
+LIKELY = "; the likely cause: "
+"""How the part of an error begins that says what the photographs that cannot be solved have in common."""
+
+
+def refine_or_explain(
+    model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign, eccentricity: bool = True
+) -> Refined:
+    """Refines a group, as :func:`stcal.sfm.adjust.refine.refine`; its errors say if target and board moved apart."""
+    try:
+        return refine(model, camera, target, board, eccentricity)
+    except (MappingError, ConvergenceError) as error:
+        if moved_apart(model, camera, target, board):
+            agree = "the circles of the faces agree with one another, and the dots of the board do"
+            error.append(f"{LIKELY}{MOVED}, as {agree}: {MOVED_REMEDY}")
+        raise
+
+
+def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Check | None:
+    """Returns a failed check that names what of a camera file is wrong; None if the dots of the board do not tell it.
+
+    The dots alone, whose places are known, tell the camera, also where groups cannot be solved, or residuals are so
+    large that tests of first order mislead. The file is wrong if another camera explains what it leaves as residuals.
+    """
+    if not board.rows:
+        return None
+    try:
+        found, stated = camera_of_labelled(images, board, camera)
+    except StcalError:
+        return None
+    square, square_of_file = (weighted_rms_px(each) ** 2 for each in (found, stated))
+    if square > (1 - EXPLAINS) * square_of_file:
+        return None
+    cause = cause_of_file(camera, found.camera, found.covariance, found.colmap_model)
+    if cause is None:
+        return None
+    rms = f"{significant(square**0.5)} px RMS from where the board has them, {significant(square_of_file**0.5)} px"
+    return replace(cause, reason=f"{cause.reason}; by the dots of the board alone, which are {rms} with the file")
+
+
+@contextmanager
+def explained(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Iterator[None]:
+    """Lets errors of a run that cannot be solved name what of the camera file is wrong, if the board tells it."""
+    try:
+        yield
+    except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+        if LIKELY not in str(error) and (cause := wrong_file(images, camera, board)):
+            name = cause.title.removeprefix(OF_WHOLE_SET)
+            error.append(f"{LIKELY}{name} ({cause.reason}): {cause.remedy}")
+        raise
 
 
 def _save(path: Path, solution: GroupSolution) -> None:
@@ -295,7 +352,7 @@ def solve_body(
             gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
             seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
             is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
-            refined = refine(model.without(is_gross), camera, target, board, eccentricity)
+            refined = refine_or_explain(model.without(is_gross), camera, target, board, eccentricity)
             find_scale(refined.model, board)
         except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
             errors.append(error)

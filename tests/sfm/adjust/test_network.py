@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import chdtrc
 
 from stcal.geometry.rigid import skew
 from stcal.sfm.adjust.network import free_network, solve_score
@@ -12,6 +13,7 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.sfm.adjust import dense
 
 NOISE_PX, FACTOR = 0.01, 1.3
+DRAWS = 1000
 
 
 @pytest.fixture(scope="module")
@@ -118,3 +120,30 @@ def test_directions_without_information_count_for_nothing():
     assert test.freedom == 1
     assert test.statistic == pytest.approx(0.5)
     assert normal @ test.estimate == pytest.approx([1.0, 1.0])
+
+
+def test_squares_of_observations_are_chi_square(network, full):
+    """Of 1000 draws of noise: as many beyond the quantile of one in a thousand as there should be.
+
+    By the trace of the cofactors alone, as if both coordinates were controlled alike, there are several times as many.
+    """
+    jacobian, cofactor = full
+    projector = np.eye(len(jacobian)) - jacobian @ cofactor @ jacobian.T
+    rng, beyond, by_trace, count = np.random.default_rng(4), 0, 0, 0
+    for _ in range(DRAWS):
+        residual = (projector @ rng.standard_normal(len(jacobian))).reshape(-1, 2)
+        drawn = replace(network, residual=residual)
+        square, freedom = drawn.squares_of_observations()
+        held = freedom > 0
+        beyond += int((chdtrc(freedom[held], square[held]) < 1e-3).sum())
+        length2 = (residual[held] ** 2).sum(1)
+        by_trace += int((chdtrc(2, 2 * length2 / network.redundancy[held]) < 1e-3).sum())
+        count += int(held.sum())
+    assert 0.8 < beyond / (1e-3 * count) < 1.25
+    assert by_trace > 1.25e-3 * count
+
+
+def test_the_noise_of_a_group_is_that_of_its_residuals(network):
+    """σ that are as stated are never made smaller."""
+    assert network.noise() == 1.0
+    assert replace(network, residual=3 / FACTOR * network.residual).noise() > 1.0

@@ -8,7 +8,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board, load_target, target_toml
 from stcal.sfm.adjust.joint import adjust_jointly
-from stcal.sfm.adjust.rims import Rim, find_rims, lost_radius_mm
+from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
@@ -107,3 +107,16 @@ def test_rims_of_dots_move_the_board_and_no_face(scene):
     np.testing.assert_allclose(surface.xyz_model, seen.xyz_model, atol=1e-6)
     moved = surface.model_from_board["12"].translation - seen.model_from_board["12"].translation
     np.testing.assert_allclose(moved, 0.15 * seen.model_from_board["12"].rotation[:, 2], atol=1e-6)
+
+
+@pytest.mark.parametrize("height_mm", [0.0, 0.05])
+def test_a_blur_that_is_corrected_by_too_little_is_no_rim(height_mm):
+    """Radii that blur makes smaller, by a fifth more than is put back, in views of other tilts and distances."""
+    rng = np.random.default_rng(3)
+    tangent, distance = rng.uniform(0.1, 2.0, 240), rng.uniform(0.8, 1.4, 240)
+    radius = np.where(np.arange(240) % 2, 4.0, 8.0)
+    blur = 0.02 * distance**2 / radius * 6 * np.sqrt(1 + tangent**2)
+    noise = rng.normal(0, 0.003, 240)
+    rim = _rim(noise + 0.2 * blur - lost_radius_mm(height_mm, tangent, radius), tangent, radius, blur)
+    assert rim.height_mm == pytest.approx(height_mm, abs=2.5 * rim.sigma_mm)
+    assert 0.003 < rim.sigma_mm < 0.0125  # of 0.05 mm at four σ

@@ -6,11 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.geometry.conic import circle_image_offset
 from stcal.labels import CircleLabel
-from stcal.sfm.checks.causes import _turned
+from stcal.sfm.checks.causes import _turned, cause_of_file
+from stcal.sfm.checks.culprits import moved_apart
 from stcal.sfm.checks.verdict import ranked
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+from stcal.synthetic.observe import image_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.sfm.checks.test_checks import Lab
 
@@ -56,6 +59,16 @@ def zoomed(by):
     return of_photographs(lambda i, camera, k: camera.centre + (1 + by(i, k)) * (i.centre_px - camera.centre))
 
 
+def turned_photograph(image, camera):
+    """Where the centres are in a photograph turned by 180°, to be read upright: the lens is turned with its sensor."""
+    return turned_camera(camera).pixel_from_normalised(image.centre)
+
+
+def turned_camera(camera):
+    """The camera that takes photographs turned by 180°: its tangential distortion is turned, too."""
+    return camera.with_parameters(_turned(camera, 2))
+
+
 RANDOM = np.random.default_rng(0).normal(size=(12, 2))
 PLANTED = {
     "focal length long": (of_file(focal=lambda f, _: 1.01 * f), "the focal length is not"),
@@ -72,9 +85,10 @@ PLANTED = {
     ),
     "signs reversed": (of_file(distortion=lambda d, _: -d), "sign reversed"),
     "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled relative to the camera file"),
-    "turned": (
-        of_file(centre=lambda c, camera: np.array([camera.width - 1, camera.height - 1]) - c),
-        "turned by 180°",
+    "turned": (lambda scene, images: (images, turned_camera(scene.camera)), "turned by 180°"),
+    "some turned": (
+        of_photographs(lambda i, camera, k: i.centre_px if k % 2 else turned_photograph(i, camera)),
+        "some photographs are turned by 180°",
     ),
     "zoom by group": (zoomed(lambda i, _: {"12": 0, "14": 0.003, "15": -0.004}[i.group]), "between the groups"),
     "autofocus": (zoomed(lambda _, k: 0.003 * RANDOM[k, 0]), "from image to image"),
@@ -169,3 +183,87 @@ def test_a_check_that_names_nearly_all_images_names_none(few, lab):
 
 def test_a_sound_set_has_no_cause(few, lab):
     assert CAUSE not in lab.check(few, lab.observe(few))
+
+
+def centroids(scene, images):
+    """Images of the circles' centres, as of centroids that nothing corrects."""
+    made = []
+    for image in images:
+        seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
+        rows = [seen.labels.index(label) for label in image.labels]
+        xyz, normal, radius = seen.xyz_camera[rows], seen.normal_camera[rows], seen.radius_mm[rows]
+        shift = scene.camera.project(circle_image_offset(xyz, normal, radius)) - scene.camera.project(xyz)
+        made.append(replace(image, centre_px=image.centre_px - shift))
+    return made
+
+
+def test_centroids_are_named_before_what_they_make_fail(few, lab):
+    check = first(few, lab, centroids(few, lab.observe(few)))
+    assert "eccentricity" in check.title
+    found = float(re.match(r"(-?[\d.]+) ± ", check.reason)[1])
+    assert found == pytest.approx(0, abs=0.2)
+
+
+FAR_OFF = {
+    "focal length": (lambda c: c.focal * 1.3, lambda c: c.centre, lambda c: c.distortion, "the focal length is not"),
+    "cropped": (
+        lambda c: c.focal,
+        lambda c: c.centre + np.array([400, -300]),
+        lambda c: c.distortion,
+        "the principal point is not",
+    ),
+    "undistorted": (lambda c: c.focal, lambda c: c.centre, lambda c: 0 * c.distortion, "undistorted"),
+    "distortion": (  # 106 % of it is not in the photographs, which is no removal
+        lambda c: c.focal,
+        lambda c: c.centre,
+        lambda c: -16 * c.distortion,
+        "the distortion is not",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAR_OFF)
+def test_a_file_that_is_far_off_is_compared_with_the_true_camera(few, name):
+    """By hypotheses on its parameters, which need no derivatives at the file."""
+    own = Camera.of(few.camera, "OPENCV")
+    *made, words = FAR_OFF[name]
+    focal, centre, distortion = (make(own) for make in made)
+    file, found = (own, replace(own, distortion=distortion)) if name == "undistorted" else (
+        replace(own, focal=focal, centre=centre, distortion=distortion),
+        own,
+    )  # fmt: skip
+    covariance = np.diag([0.5, 0.5, 0.5, 0.5, 1e-4, 1e-3, 1e-5, 1e-5]) ** 2
+    check = cause_of_file(file, found, covariance, "OPENCV")
+    assert (check.key, check.verdict) == (CAUSE, "failed")
+    assert words in check.title
+    assert check.remedy
+
+
+def test_a_file_that_is_off_in_all_it_states_belongs_to_another_camera(few):
+    own = Camera.of(few.camera, "OPENCV")
+    off = np.array([90, -70, 80, 60, 0.02, 0.2, 2e-3, 2e-3])
+    file = own.with_parameters(own.parameters() + intrinsic_basis("OPENCV") @ off)
+    check = cause_of_file(file, own, np.diag([0.5, 0.5, 0.5, 0.5, 1e-4, 1e-3, 1e-5, 1e-5]) ** 2, "OPENCV")
+    assert "the intrinsics are not" in check.title
+
+
+def elsewhere(image, scene, shift_mm):
+    """The image with all faces ``shift_mm`` off their place, board and camera where they were."""
+    seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
+    rows = [seen.labels.index(label) for label in image.labels]
+    xyz, normal, radius = seen.xyz_camera[rows], seen.normal_camera[rows], seen.radius_mm[rows]
+    on_face = np.array([isinstance(label, CircleLabel) for label in image.labels])
+    before, after = (
+        scene.camera.project(circle_image_offset(at, normal, radius)) for at in (xyz, xyz + on_face[:, None] * shift_mm)
+    )
+    return replace(image, centre_px=image.centre_px + after - before)
+
+
+def test_target_and_board_that_moved_apart_agree_by_themselves(few, lab, labels_only):
+    """In half of the images of a group the target stood 2 mm elsewhere: no minimum of all, but one of each part."""
+    images = [elsewhere(i, few, [2, -1, 1]) if k % 4 > 1 else i for k, i in enumerate(lab.observe(few))]
+    moved = labels_only.models(few, images)[0]
+    assert moved_apart(moved, few.camera, few.target, few.board)
+    wrong = replace(few.camera, distortion=few.camera.distortion - 0.3 * np.eye(len(few.camera.distortion))[0])
+    still = labels_only.models(few, lab.observe(few))[0]
+    assert not moved_apart(still, wrong, few.target, few.board)

@@ -9,13 +9,16 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import faces
+from stcal.sfm.checks.board import board_checks
 from stcal.sfm.checks.culprits import culprits
 from stcal.sfm.checks.images import moved_check
 from stcal.sfm.checks.suite import Evidence, run_checks
@@ -146,6 +149,34 @@ def test_a_wrong_pitch_is_named(full_scene, lab):
     assert checks["pitch"].measured[0].value == pytest.approx(1000, abs=250)
 
 
+def test_radii_of_another_design_are_no_wrong_pitch(full_scene, lab):
+    """All circles of the faces 8 % larger: their slope says 8 %, and their places that the pitch is right."""
+    images = []
+    for image in lab.observe(full_scene):
+        larger = np.array([1.08 if isinstance(label, CircleLabel) else 1.0 for label in image.labels])
+        images.append(replace(image, shape=image.shape * larger[:, None, None]))
+    checks = lab.check(full_scene, images)
+    assert not_passed(checks) == {"radius-design": "failed"}
+    assert checks["pitch"].reason.endswith("by positions alone, which radii contradict")
+    by_radii = next(m for m in checks["pitch"].measured if m.name == "by radii of circles")
+    assert by_radii.value == pytest.approx(80_000, rel=0.05)
+
+
+def test_a_rim_is_said_alone(full_scene, lab):
+    """0.6 mm before all circles: their radii are smaller than designed because of it, and are no fault of their own."""
+    images = []
+    for image in lab.observe(full_scene):
+        seen = image_circles(full_scene, image.group, int(image.name.rpartition("/")[2]))
+        own = [seen.labels.index(label) for label in image.labels]
+        tangent, radius = np.tan(seen.tilt_rad[own]), seen.radius_mm[own]
+        is_circle = np.array([isinstance(label, CircleLabel) for label in image.labels])
+        lost = np.where(is_circle, lost_radius_mm(0.6, tangent, radius), 0.0)
+        images.append(replace(image, shape=image.shape * (1 - lost / radius)[:, None, None]))
+    checks = lab.check(full_scene, images)
+    assert not_passed(checks) == {"rim": "suspicious"}
+    assert checks["rim"].measured[0].value == pytest.approx(600, rel=0.05)
+
+
 @pytest.mark.parametrize(("stated", "caught"), [(5, {"sharpness": "suspicious"}), (1, {"image-residuals": "failed"})])
 def test_a_blurred_image_is_named(full_scene, lab, stated, caught):
     """Five times the noise, whether the centres' σ say so or not."""
@@ -185,6 +216,8 @@ def test_a_noisy_image_has_not_moved(full_scene, lab):
         refined, calibration, _ = lab.calibrate(full_scene, images)
         networks = [free_network(each.model, calibration.camera) for each in refined]
         assert moved_check(networks).verdict == "passed"
+        bent = [check for check in board_checks(networks, full_scene.board) if check.verdict != "passed"]
+        assert bent == []
 
 
 @pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.full)])

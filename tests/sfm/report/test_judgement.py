@@ -309,3 +309,23 @@ def test_the_page_has_the_same_sentences(stored):
 def test_how_often_chance_does_it_is_that_of_the_checks():
     assert pytest.approx(1 / SUSPICIOUS) == TESTS_OF_CHANCE
     assert f"{round(1 / SUSPICIOUS):,}, 'failed' in one in {round(1 / FAILED):,}." in CHANCE
+
+
+def test_a_group_that_is_left_out_says_why():
+    """In place of what limits the rest, which is not what the user should look at first."""
+    lost = report()
+    lost["notes"] = [f"{LEFT_OUT_WHOLE}group 15: its images contradict one another; take them again"]
+    found = judgement_of(lost)
+    assert found.verdict == "with care"
+    assert "group 15 was left out completely" in found.use
+    assert (found.limit, found.next) == (
+        "Left out: group 15: its images contradict one another.",
+        "Take them again.",
+    )
+
+
+def test_a_cause_that_no_check_saw_is_no():
+    """The dots of the board tell it where groups are lost."""
+    found = judgement_of(report(check(CAUSE, "failed"), check("camera", "passed")))
+    assert found.verdict == "no"
+    assert "checks" not in found.use

@@ -1,13 +1,15 @@
 """What cannot be solved is refused before anything is mapped, and says what to add."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.io.images import Skipped
-from stcal.sfm.runs.solve import require_usable, usable_groups
+from stcal.sfm.runs.solve import LIKELY, explained, require_usable, usable_groups, wrong_file
 from stcal.sfm.runs.text import run_text
 from tests.outcome import fails_with
 
@@ -83,3 +85,37 @@ def test_a_run_says_behind_which_rims_circles_and_dots_lie(small_result):
     said = " ".join(run_text(behind).split())
     assert "faces are those of the luminous surface, behind rims of 0.200 ± 0.004 mm, as estimated" in said
     assert "dots of the board are seen 0.150 mm before its surface, as stated" in said
+
+
+@pytest.fixture(scope="module")
+def all_groups(scene, labels_only):
+    return labels_only.observations(scene, 0.01, np.random.default_rng(0))
+
+
+WRONG_FILES = {
+    "longer by a quarter": (lambda c: replace(c, focal=1.25 * c.focal), "the focal length is not", r"-20(\.0|) ± "),
+    "cropped": (lambda c: replace(c, centre=c.centre + np.array([300, -200])), "the principal point is not", "cx -3"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_FILES)
+def test_an_error_of_photographs_that_cannot_be_solved_says_what_of_the_file_is_wrong(scene, all_groups, name):
+    make, words, size = WRONG_FILES[name]
+    file = make(Camera.of(scene.camera, "OPENCV"))
+    with pytest.raises(MappingError) as error, explained(all_groups, file, scene.board):
+        raise MappingError("E-GROUP-CONTRADICTS", "group 12: a symptom")
+    symptom, _, cause = str(error.value).partition(LIKELY)
+    assert symptom == "group 12: a symptom"
+    assert words in cause
+    assert re.search(size, cause)
+    assert "px RMS" in cause
+
+
+def test_an_error_names_no_cause_that_the_photographs_do_not_tell(scene, all_groups):
+    """A camera file that fits the dots; the board out of view; and a mistake in the input."""
+    file = Camera.of(scene.camera, "OPENCV")
+    assert wrong_file(all_groups, file, scene.board) is None
+    assert wrong_file(only(all_groups, board=False), replace(file, focal=2 * file.focal), scene.board) is None
+    with pytest.raises(InputError) as error, explained(all_groups, replace(file, focal=2 * file.focal), scene.board):
+        raise InputError("E-OPTION-VALUE", "a symptom")
+    assert str(error.value) == "a symptom"
