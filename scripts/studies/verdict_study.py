@@ -13,10 +13,13 @@ centres of the same sets with new noise of the σ of each centre.
 
 import argparse
 import json
+import multiprocessing
 import tempfile
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -555,7 +558,32 @@ def names_it(first: str, words: tuple[str, ...]) -> bool:
     return key in words or (key == CAUSE and any(word in title for word in words))
 
 
+MAKERS = {"sample": lambda: photographed(SAMPLE), "block": lambda: photographed(BLOCK), "own": lambda: simulated()}
+
+
+@cache
+def case_of(name: str) -> Case:
+    """The set of this name; detection takes seconds, once in each process."""
+    return MAKERS[name]()
+
+
 @one_thread()
+def planted(cause: str, where: str) -> list[dict]:
+    """The answers to a cause at all strengths in one set."""
+    strengths, plant, words = CAUSES[cause]
+    runs = []
+    for value in strengths:
+        found = answer(plant(case_of(where), value))
+        runs.append(found | {"cause": cause, "set": where, "value": value, "named": names_it(found["first"], words)})
+    return runs
+
+
+@one_thread()
+def sound(where: str, seed: int) -> dict:
+    """The answer to a sound draw of a set."""
+    return answer(drawn(case_of(where), seed))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="causes with this word in their name")
@@ -563,19 +591,13 @@ def main() -> None:
     parser.add_argument("--sound", type=int, default=40, help="draws of each sound set")
     parser.add_argument("--json", type=Path, help="write each run here")
     given = parser.parse_args()
-    makers = {"sample": lambda: photographed(SAMPLE), "block": lambda: photographed(BLOCK), "own": simulated}
-    cases = {name: makers[name]() for name in given.sets.split(",")}
+    sets = given.sets.split(",")
+    causes = [name for name in CAUSES if given.only in name]
+    pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
+    answers = pool.map(planted, *zip(*[(name, where) for name in causes for where in sets], strict=True))
     rows, kept = [], []
-    for name, (strengths, plant, words) in CAUSES.items():
-        if given.only not in name:
-            continue
-        runs = []
-        for where, case in cases.items():
-            for value in strengths:
-                found = answer(plant(case, value))
-                runs.append(
-                    found | {"cause": name, "set": where, "value": value, "named": names_it(found["first"], words)}
-                )
+    for name in causes:
+        runs = [run for _ in sets for run in next(answers)]
         kept += runs
         asked = [r for r in runs if r["verdict"] != "yes"]
         quiet = [r for r in runs if r["verdict"] == "yes"]
@@ -590,19 +612,19 @@ def main() -> None:
                 "; ".join(text[:60] for text in others),
             ]
         )
-        print("  ".join(rows[-1]), flush=True) if given.json else None
     asked = [r for r in kept if r["verdict"] != "yes"]
     named = sum(r["named"] for r in asked)
     quiet = [r for r in kept if r["verdict"] == "yes"]
     print("\n".join(text_table([["<planted cause", "named", "yes", "silent", "<named instead"], *rows])))
     print(f"named: {named} of {len(asked)} runs that are not Yes, {100 * named / max(len(asked), 1):.0f} %")
     print(f"silent: {sum(r['sigma'] > SILENT_SIGMA for r in quiet)} of {len(kept)} runs")
-    sound = [answer(drawn(case, seed)) for case in cases.values() for seed in range(given.sound)]
-    wrong = [r for r in sound if r["verdict"] != "yes"]
+    draws = [(where, seed) for where in sets for seed in range(given.sound)]
+    drawn_sound = list(pool.map(sound, *zip(*draws, strict=True))) if draws else []
+    wrong = [r for r in drawn_sound if r["verdict"] != "yes"]
     said = sorted({key for r in wrong for key in r["bad"]})
-    share = f"{100 * len(wrong) / max(len(sound), 1):.1f} %"
+    share = f"{100 * len(wrong) / max(len(drawn_sound), 1):.1f} %"
     listed = f": {', '.join(said)}" if said else ""
-    print(f"sound sets: {len(wrong)} of {len(sound)} answered No or With care, {share}{listed}")
+    print(f"sound sets: {len(wrong)} of {len(drawn_sound)} answered No or With care, {share}{listed}")
     if given.json:
         given.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
 
