@@ -27,7 +27,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
-from stcal.locate.calibration.solve import CalibrationImages
+from stcal.locate.calibration import CalibrationImages
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
 from stcal.locate.pipeline import LocateOptions, locate_image, run

@@ -92,7 +92,7 @@ def calibrate(
     """Find the corners of the target's tags, with σ, in the frame at the centre of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
     from stcal.io.cameras.read import read_camera
-    from stcal.locate.calibration.solve import calibrate as calibrated
+    from stcal.locate.calibration import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan, require_layout_written
     from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
@@ -177,9 +177,8 @@ def run(
     from stcal.locate.pipeline import run as located
     from stcal.locate.pose.patent import PatentOptions
     from stcal.locate.pose.verdict import VerdictOptions
-    from stcal.locate.report.base import goal_chain, goals
-    from stcal.locate.report.located import LocatedFile
-    from stcal.locate.report.page import accepted, poses_csv, run_report, uncertain
+    from stcal.locate.report.chain import goal_chain, goals
+    from stcal.locate.report.page import LocatedFile, accepted, poses_csv, run_report, uncertain
 
     chain = None
     if hand_eye or registration or robot_poses or offset:

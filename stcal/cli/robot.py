@@ -44,9 +44,8 @@ def convert(
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
-    from stcal.robot.urdf.read import load_urdf
-    from stcal.robot.urdf.universal import read_universal
-    from stcal.robot.urdf.write import coupled, require_urdf_written, robot_urdf
+    from stcal.robot.universal import read_universal
+    from stcal.robot.urdf import coupled, load_urdf, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")

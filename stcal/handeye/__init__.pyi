@@ -6,14 +6,14 @@ from .data.rig import RigPoses as RigPoses
 from .data.views import View as View
 from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views
-from .judge.verdict import Finding as Finding
-from .judge.verdict import Verdict as Verdict
+from .judge.remarks import Finding as Finding
+from .judge.remarks import Verdict as Verdict
 from .methods.evolution import EvolutionOptions as EvolutionOptions
 from .methods.noise import Noise as Noise
 from .pipeline import handeye as handeye
 from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
-from .report.planned import planned_csv as planned_csv
+from .plan import planned_csv as planned_csv
 from .result import HandEye as HandEye
 from .rig import Rig as Rig
 from .rig import RigOptions as RigOptions

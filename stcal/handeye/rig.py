@@ -14,10 +14,10 @@ from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
+from stcal.handeye.judge.ambiguity import repair, turned_view
 from stcal.handeye.judge.conventions import check_conventions
 from stcal.handeye.judge.observability import LEAST_POSES, Observability, check, require_scale
 from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.judge.symmetry import repair, turned_view
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.joint import Adjusted, adjust_rig
 from stcal.handeye.methods.noise import Noise, kind

@@ -13,9 +13,9 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.judge.ambiguity import repair
 from stcal.handeye.judge.observability import check
 from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import IN_COMMON, METHODS, HandEyeOptions, handeye, solved

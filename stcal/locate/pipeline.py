@@ -19,9 +19,8 @@ from stcal.locate.data.exposures import SceneFiles, SceneTags, detect, read_scen
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.estimate import ObjPose, locate
 from stcal.locate.pose.merge import Merged, Shift, merge
-from stcal.locate.pose.misread import likely_mistake
 from stcal.locate.pose.patent import PatentOptions, PatentPose, locate_as_patent
-from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge
+from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge, likely_mistake
 
 Method = Literal["joint", "patent"]
 MOVED_SIGMAS = 5.0

@@ -12,7 +12,7 @@ from stcal.boards.tags import find_tags
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
-from stcal.locate.calibration.solve import CalibrationImages
+from stcal.locate.calibration import CalibrationImages
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan
 from stcal.locate.pipeline import run

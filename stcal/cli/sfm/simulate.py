@@ -290,15 +290,21 @@ def demo(
     workers: Workers = None,
 ) -> None:
     """Render a small data set with known truth, calibrate it, and compare the faces with the truth."""
-    from stcal.sfm.report.compare import comparison_table
+    from stcal.sfm.pipeline import run
+    from stcal.sfm.report.compare import compare, comparison_table
+    from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.text import run_text
-    from stcal.workflows.demo import WHAT
-    from stcal.workflows.demo import demo as demonstrate
+    from stcal.synthetic.dataset import write_dataset
+    from stcal.synthetic.scene import SceneOptions, make_scene
 
     folder = out or Path(tempfile.mkdtemp(prefix="stcal-demo-"))
-    say(WHAT)
+    data, options = folder / "data", SceneOptions(seed=1, width=1728, height=1152, images_per_group=5)
+    say("simulated photographs of the reference target: 4 groups of 5 images, 1728×1152 px, at 1 m")
     with StageProgress() as progress:
-        result, comparison = demonstrate(folder, workers, progress)
+        write_dataset(data, make_scene(options), workers=workers, progress=partial(progress, "render"))
+        designs = data / "target.toml", data / "board.toml", RunOptions(workers=workers)
+        result = run(data / "images", data / "cameras.txt", folder / "run", *designs, progress)
+        comparison = compare(folder / "run", data / "truth.json")
     say(run_text(result))
     say("\nagainst the truth:")
     say(comparison_table(comparison))

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.io.json import Matrix, Part, Pose, ResultFile
-from stcal.locate.calibration.solve import CalibratedLayout
+from stcal.locate.calibration import CalibratedLayout
 
 
 class BoardImageRow(Part):

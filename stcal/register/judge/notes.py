@@ -7,18 +7,17 @@ import numpy as np
 
 from stcal.geometry.rigid import Affine, Similarity
 from stcal.geometry.robust import ratio_limit
-from stcal.register.core.covariance import Covariance
 from stcal.register.core.liu2017 import ASSUMED
 from stcal.register.core.models import squares
 from stcal.register.core.pairs import Problem
 from stcal.register.core.result import Alternative
-from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitted
+from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Covariance, Fitted
 from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
-from stcal.register.judge.groups import Shifted
 from stcal.register.judge.mistakes import (
     SHOWN,
     UNIT_WITHIN,
     UNITS,
+    Shifted,
     Wider,
     moved_meanwhile,
     neighbours_alike,

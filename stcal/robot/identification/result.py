@@ -13,8 +13,7 @@ from stcal.robot.identification.adjustment import (
     Solution,
     Weighting,
 )
-from stcal.robot.identification.observability import ObservabilityIndices
-from stcal.robot.identification.predicted import Predicted
+from stcal.robot.identification.observability import ObservabilityIndices, Predicted
 from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identification.residuals import (
     Kind,

@@ -21,8 +21,14 @@ from stcal.robot.identification.adjustment import (
     unseen,
 )
 from stcal.robot.identification.consensus import agreeing
-from stcal.robot.identification.observability import ObservabilityIndices, directions_named, parameter_scale
-from stcal.robot.identification.predicted import doubts, predicted, widened
+from stcal.robot.identification.observability import (
+    ObservabilityIndices,
+    directions_named,
+    doubts,
+    parameter_scale,
+    predicted,
+    widened,
+)
 from stcal.robot.identification.prior import Deviations, NominalRows, bending, carries, placed
 from stcal.robot.identification.residuals import (
     WIDTH,

@@ -17,7 +17,7 @@ from stcal.handeye.data.inputs import Told, mapped_pairs, own_told, read_pairs, 
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.judge.flips import flipped, tilted
+from stcal.handeye.judge.ambiguity import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
 from stcal.handeye.solve import handeye
@@ -29,8 +29,7 @@ from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.workflows.board_views import Board, detect_boards, kind_of
-from stcal.workflows.handeye.arm import Arm, read_arm
-from stcal.workflows.handeye.times import Timing, robot_at_images
+from stcal.workflows.handeye.robot_at_images import Arm, Timing, read_arm, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()

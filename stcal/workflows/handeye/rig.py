@@ -31,7 +31,7 @@ from stcal.handeye.validate import LEAST_LEFT, splits
 from stcal.io.cameras.read import read_camera
 from stcal.parallel import Progress, one_thread
 from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
-from stcal.workflows.handeye.times import Timing
+from stcal.workflows.handeye.robot_at_images import Timing
 
 
 @dataclass(frozen=True, slots=True, eq=False)

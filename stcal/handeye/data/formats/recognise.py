@@ -11,8 +11,7 @@ import yaml
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order
 from stcal.handeye.data.formats import colmap
-from stcal.handeye.data.formats.arrays import NPY, NPZ, load_npy, load_npz
-from stcal.handeye.data.formats.numeric import TABLE, read_columns, read_numbers, todays
+from stcal.handeye.data.formats.numeric import NPY, NPZ, TABLE, load_npy, load_npz, read_columns, read_numbers, todays
 from stcal.handeye.data.formats.record import Content, Said, Side, Unit, require_each_once
 from stcal.handeye.data.formats.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of

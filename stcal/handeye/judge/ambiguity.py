@@ -1,15 +1,16 @@
-"""Boards that look the same after a rotation: views that were numbered from another end, found from the robot's
-motion."""
+"""Views of a board with two answers, numbered from another end or tilted the other way; motions of the robot decide."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.views import View, Views
-from stcal.handeye.judge.remarks import Aside
+from stcal.handeye.judge.remarks import Aside, spoken
 from stcal.handeye.methods import closed_form
 
 ROUNDS = 20
@@ -135,3 +136,34 @@ def _carried(seen: Poses, poses: Poses) -> np.ndarray:
 def turned_view(view: View, turn: Rigid) -> View:
     """Returns the same corners under the numbers that they have after the turn."""
     return view.turned(turn.inverse())
+
+
+PUT_RIGHT = 0.2
+"""Largest share of a pose's error of rotation that is left when it is tilted the other way. Of errors of any direction
+0.2³, one in a hundred, seem to be flips."""
+
+
+def tilted(poses: Poses) -> Poses:
+    """Returns camera_from_board with the depths about the board's origin mirrored along the line of sight."""
+    other = mirrored(PoseStack(np.asarray(poses.rotation), np.asarray(poses.translation)), Rigid())
+    return Poses(other.rotation, np.asarray(poses.translation))
+
+
+def flipped(loop: Loop, x: Rigid, z: Rigid, outliers: np.ndarray) -> np.ndarray:
+    """Returns a mask (m,) of the ``outliers`` that agree with the solution when they are tilted the other way."""
+    other = replace(loop, camera_from_board=tilted(loop.camera_from_board))
+    before, after = (np.linalg.norm(each.residuals(x, z)[:, :3], axis=1) for each in (loop, other))
+    return outliers & (after < PUT_RIGHT * before)
+
+
+def flip_note(names: tuple[str, ...], flips: np.ndarray) -> tuple[str, ...]:
+    """Returns a note on the poses that are flipped, (m,)."""
+    if not flips.any():
+        return ()
+    shown = ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
+    return (
+        Aside(
+            f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat target "
+            f"is, which its image hardly excludes: {shown}; --undo-flips takes that one, or give images"
+        ),
+    )
