@@ -38,7 +38,7 @@ MODULES = (
     "stcal.handeye.plan",
     "stcal.register.report.file",
     "stcal.locate.data.exposures",
-    "stcal.locate.report.calibration",
+    "stcal.locate.report.page",
     "stcal.locate.report.page",
     "stcal.robot.axes.report",
     "stcal.robot.identification.report",

@@ -511,8 +511,8 @@ def plan(
     from stcal.handeye.plan import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
+    from stcal.workflows.handeye.calibrate import plan_handeye
     from stcal.workflows.handeye.inputs import read_handeye
-    from stcal.workflows.handeye.plan import plan_handeye
 
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     pairs = source_of(source, first, second, key, statements, quaternions, None, columns, columns_a)
@@ -576,7 +576,7 @@ def rig(
     strict: shared.Strict = False,
 ) -> None:
     """Find where several cameras are on one flange, or in one base, and relative to each other, in one adjustment."""
-    from stcal.handeye.data.rig import read_rig_file
+    from stcal.handeye.data.views import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged
     from stcal.handeye.report.rig_page import rig_report

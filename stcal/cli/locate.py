@@ -94,7 +94,7 @@ def calibrate(
     from stcal.io.cameras.read import read_camera
     from stcal.locate.calibration import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan, require_layout_written
-    from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
+    from stcal.locate.report.page import calibrated_file, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)

@@ -1,8 +1,8 @@
 from .data.pairs import SETUPS as SETUPS
 from .data.pairs import HandEyePoses as HandEyePoses
 from .data.pairs import read_poses as read_poses
-from .data.rig import RigCamera as RigCamera
-from .data.rig import RigPoses as RigPoses
+from .data.views import RigCamera as RigCamera
+from .data.views import RigPoses as RigPoses
 from .data.views import View as View
 from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views

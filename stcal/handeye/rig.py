@@ -11,8 +11,7 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
-from stcal.handeye.data.rig import RigPoses
-from stcal.handeye.data.views import Views
+from stcal.handeye.data.views import RigPoses, Views
 from stcal.handeye.judge import remarks
 from stcal.handeye.judge.ambiguity import repair, turned_view
 from stcal.handeye.judge.conventions import check_conventions

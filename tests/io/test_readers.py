@@ -18,8 +18,8 @@ from stcal.boards.target import load_body
 from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, require_own
-from stcal.handeye.data.rig import read_rig_file
 from stcal.handeye.data.robot_poses import read_robot_poses
+from stcal.handeye.data.views import read_rig_file
 from stcal.io.design import load_target
 from stcal.io.files import text_of
 from stcal.io.poses.columns import read_mapped

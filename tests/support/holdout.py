@@ -13,8 +13,7 @@ from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, re
 from stcal.geometry.rigid import Rigid
 from stcal.locate.calibration import CalibratedLayout, CalibrationImages, calibrate
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
-from stcal.locate.pose.estimate import SeenTags, locate
-from stcal.locate.pose.merge import merge
+from stcal.locate.pose.estimate import SeenTags, locate, merge
 from stcal.locate.pose.patent import PatentOptions, locate_as_patent
 from stcal.locate.pose.verdict import Decision, VerdictOptions, judge
 

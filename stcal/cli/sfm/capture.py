@@ -220,9 +220,8 @@ def capture(
     shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
     from stcal.sfm.runs.options import RunOptions
-    from stcal.workflows.growing import GrowingRun, WatchOptions
-    from stcal.workflows.photographs import Trigger
-    from stcal.workflows.photographs import capture as captured
+    from stcal.workflows.growing import GrowingRun, Trigger, WatchOptions
+    from stcal.workflows.growing import capture as captured
 
     run_options = RunOptions(
         refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers

@@ -14,8 +14,7 @@ from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import Loop, Setup
-from stcal.handeye.data.rig import RigCamera, RigPoses
-from stcal.handeye.data.views import Views, whitened
+from stcal.handeye.data.views import RigCamera, RigPoses, Views, whitened
 from stcal.handeye.methods.bundle import (
     ARM_ROUNDS,
     SETTLED_MM,

@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, AxisFit, refit_axis, unwound_by
 from stcal.robot.axes.pairs import jacobian_by_axes, pair_values
 from stcal.robot.axes.sweeps import called
-from stcal.robot.identification.residuals import State, observed
+from stcal.robot.identification.adjustment import State, observed
 from stcal.robot.identification.unexplained import moved_meanwhile
 from stcal.robot.kinematics.dh import PARALLEL_RAD
 from stcal.robot.kinematics.forward import joint_frames

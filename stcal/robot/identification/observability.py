@@ -12,7 +12,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.residuals import WIDTH, Kind, Observed, State, tip_jacobian, tool_width
+from stcal.robot.identification.adjustment import WIDTH, Kind, Observed, State, tip_jacobian, tool_width
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import chain_parameters
@@ -104,7 +104,7 @@ def identification_jacobian(
     """Returns the derivatives (m, r, k) of the measured values at joint vectors by all identified parameters, over σ.
 
     r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
-    are those of :func:`~stcal.robot.identification.residuals.parameter_names`, rad and mm.
+    are those of :func:`~stcal.robot.identification.adjustment.parameter_names`, rad and mm.
 
     ``q`` : (m, n) joint values of the controller, rad or mm.
     """

@@ -12,12 +12,22 @@ from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import (
+    WIDTH,
+    Kind,
+    Observed,
     Solution,
+    State,
     Weighting,
     huber_limit,
+    jacobian,
     normal_rank,
+    observed,
+    only_of,
+    parameter_names,
     parameter_units,
+    residuals,
     solve,
+    tips_of,
     unseen,
 )
 from stcal.robot.identification.consensus import agreeing
@@ -30,18 +40,6 @@ from stcal.robot.identification.observability import (
     widened,
 )
 from stcal.robot.identification.prior import Deviations, NominalRows, bending, carries, placed
-from stcal.robot.identification.residuals import (
-    WIDTH,
-    Kind,
-    Observed,
-    State,
-    jacobian,
-    observed,
-    only_of,
-    parameter_names,
-    residuals,
-    tips_of,
-)
 from stcal.robot.identification.result import (
     LEAST_FOLDS,
     Adjustment,

@@ -13,8 +13,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
-from stcal.robot.identification.adjustment import USELESS_MM
-from stcal.robot.identification.residuals import State, observed, residuals, tips_of
+from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
 from stcal.robot.kinematics.dh import FITS, require_convention
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm

@@ -11,12 +11,11 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.prior import Placed, base_name, tool_name
-from stcal.robot.identification.residuals import (
+from stcal.robot.identification.adjustment import (
     WIDTH,
     Observed,
     State,
+    Weighting,
     as_seen,
     jacobian,
     observed,
@@ -25,6 +24,7 @@ from stcal.robot.identification.residuals import (
     residuals,
     tips_of,
 )
+from stcal.robot.identification.prior import Placed, base_name, tool_name
 from stcal.robot.identification.result import position_errors
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left

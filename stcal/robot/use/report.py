@@ -17,10 +17,10 @@ from stcal.io.table import read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
 from stcal.report.figure import COLOURS, INK, SMALL, calm, locator, new_figure, plane
 from stcal.report.text import NONE, number
+from stcal.robot.identification.adjustment import tips_of
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.report import placed_parts, placed_table
-from stcal.robot.identification.residuals import tips_of
 from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot

@@ -12,9 +12,9 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses, read_rig_file
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S
+from stcal.handeye.data.views import RigCamera, RigFiles, RigPoses, read_rig_file
 from stcal.handeye.report.outcome import Outcome, RigOutcome
 from stcal.handeye.rig import (
     Rig,
