@@ -243,10 +243,10 @@ def handeye(
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.export import (
+        FORMS,
         exported,
         opencv_yaml,
         require_export_written,
-        require_form,
         ros_yaml,
         urdf_joint,
     )
@@ -275,7 +275,7 @@ def handeye(
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = shared.exports_of(export or [], require_form)
+    exports = shared.exports_of(export or [], FORMS)
     _require_frames(ros or urdf, exports, setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(

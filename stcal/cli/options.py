@@ -3,7 +3,7 @@
 import inspect
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import wraps
@@ -192,11 +192,13 @@ def several_tables(
     return [each.table for each in joined]
 
 
-def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:
-    """Returns form and file of each FORM=FILE of --export."""
+def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, Path]]:
+    """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
+    from stcal.io.poses.controllers import require_form
+
     for word in words:
         form, _, path = word.partition("=")
-        require_form(form)
+        require_form(form, forms)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
     return _exports(words)

@@ -402,13 +402,13 @@ def compensate(
 ) -> None:
     """Compute the joint values with which the real robot reaches the commanded poses."""
     from stcal.io.files import require_same
-    from stcal.robot.export import require_form, robot_program
+    from stcal.robot.export import FORMS, robot_program
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation
     from stcal.robot.use.report import compensation_report
     from stcal.robot.use.targets import read_targets
 
-    exports, pulses = shared.exports_of(export or [], require_form), _pulses(pulses_per_deg)
+    exports, pulses = shared.exports_of(export or [], FORMS), _pulses(pulses_per_deg)
     identified = load_robot(robot_file)
     source = shared.one_table(
         targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a

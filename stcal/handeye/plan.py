@@ -112,7 +112,7 @@ def plan_poses(
         raise InputError("E-PLAN-NO-SIGMA", f"plan: {result.method} gives no σ; give a result of pose or reprojection")
     inliers = np.flatnonzero(~result.outliers)
     loop = Loop.of(pairs, result.setup)[inliers]
-    errors, rng = _Errors.of(loop, result), np.random.default_rng(seed)
+    errors, rng = _errors(loop, result), np.random.default_rng(seed)
     x, z = result.mount_from_camera, result.stand_from_board
     normal = _information(loop, errors, result).sum(0)
     board_poses = loop.camera_from_board
@@ -169,33 +169,26 @@ def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Pose
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Errors:
-    """Covariances (6, 6) of a pose of the flange and of one of the board."""
-
-    robot: np.ndarray
-    camera: np.ndarray
-
-    @classmethod
-    def of(cls, loop: Loop, result: HandEye) -> "_Errors":
-        """Returns the means of the covariances stated with the poses, or those from the σ of the result."""
-        sigma = result.sigma
-        robot, camera = (
-            np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
-            for side in ("robot", "camera")
-        )
-        if loop.robot_covariance is not None and "robot_rad" not in sigma:
-            robot = loop.robot_covariance.mean(0)
-        if loop.camera_covariance is not None:
-            camera = sigma.get("camera_factor", 1.0) ** 2 * loop.camera_covariance.mean(0)
-        return cls(robot, camera)
+def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
+    the poses, or those from the σ of the result."""
+    sigma = result.sigma
+    robot, camera = (
+        np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
+        for side in ("robot", "camera")
+    )
+    if loop.robot_covariance is not None and "robot_rad" not in sigma:
+        robot = loop.robot_covariance.mean(0)
+    if loop.camera_covariance is not None:
+        camera = sigma.get("camera_factor", 1.0) ** 2 * loop.camera_covariance.mean(0)
+    return robot, camera
 
 
-def _information(loop: Loop, errors: _Errors, result: HandEye) -> np.ndarray:
+def _information(loop: Loop, errors: tuple[np.ndarray, np.ndarray], result: HandEye) -> np.ndarray:
     """Returns the information of each pose about X and Z, (m, 12, 12)."""
     x, scale = result.mount_from_camera, result.scale
     robot, camera = loop.by_robot(x, scale), loop.by_camera(x, scale)
-    spread = robot @ errors.robot @ np.swapaxes(robot, 1, 2) + camera @ errors.camera @ np.swapaxes(camera, 1, 2)
+    spread = robot @ errors[0] @ np.swapaxes(robot, 1, 2) + camera @ errors[1] @ np.swapaxes(camera, 1, 2)
     jacobian = loop.jacobian(x, scale)[:, :, :12]
     return np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(spread, jacobian)
 

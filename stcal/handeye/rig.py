@@ -262,7 +262,7 @@ def of_places(names: tuple[str, ...], found: list[HandEye | None]) -> tuple[str,
             squared = float(difference @ np.linalg.solve(later.stand_covariance + earlier.stand_covariance, difference))
             apart[j, i] = squared > chi2.ppf(1 - BY_CHANCE, len(difference)), difference
     notes = []
-    for names_of, against, difference in _named({pair: far for pair, (far, _) in apart.items()}, len(names), apart):
+    for names_of, against, difference in _named(apart, len(names)):
         many = len(names_of) > 1
         accused, witnesses = ", ".join(names[k] for k in names_of), ", ".join(names[k] for k in against)
         where = f"{np.linalg.norm(difference[3:]):.2g} mm and {np.degrees(np.linalg.norm(difference[:3])):.2g}°"
@@ -273,18 +273,20 @@ def of_places(names: tuple[str, ...], found: list[HandEye | None]) -> tuple[str,
     return tuple(notes)
 
 
-def _named(apart: dict[tuple[int, int], bool], count: int, off: dict) -> list[tuple[list[int], list[int], np.ndarray]]:
+def _named(
+    apart: dict[tuple[int, int], tuple[bool, np.ndarray]], count: int
+) -> list[tuple[list[int], list[int], np.ndarray]]:
     """Explains contradicting pairs by few cameras: repeatedly names the camera with most contradictions.
 
     Returns per camera its number, the numbers of the cameras that it contradicts, and one difference of poses.
     """
-    unexplained, named = {pair for pair, far in apart.items() if far}, []
+    unexplained, named = {pair for pair, (far, _) in apart.items() if far}, []
     while unexplained:
         contradictions = [sum(k in pair for pair in unexplained) for k in range(count)]
         k = int(np.argmax(contradictions))
         pairs_of_camera = sorted(pair for pair in unexplained if k in pair)
         others = [pair[0] if pair[1] == k else pair[1] for pair in pairs_of_camera]
-        named.append(([k], others, off[pairs_of_camera[0]][1]))
+        named.append(([k], others, apart[pairs_of_camera[0]][1]))
         unexplained -= set(pairs_of_camera)
     return named
 
@@ -343,7 +345,7 @@ def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
                 difference = Poses.of([camera.z]).difference(Poses.of([earlier.z]))[0]
                 far = np.linalg.norm(difference[3:]) > GROSS_SHARE * max(reach[i], reach[j])
                 apart[j, i] = bool(far or np.linalg.norm(difference[:3]) > GROSS_RAD), difference
-    named = _named({pair: far for pair, (far, _) in apart.items()}, len(given.cameras), apart)
+    named = _named(apart, len(given.cameras))
     if not named:
         return
     (accused, *_), others, difference = named[0]

@@ -1,5 +1,5 @@
-"""Pose camera_from_obj from the corners of one scene, with covariance, and the second pose that may fit as well. Corners
-of several exposures are merged, and it is tested whether the scene stood still."""
+"""Pose camera_from_obj from the corners of one scene, with covariance, and the second pose that may fit as well.
+Corners of several exposures are merged, and it is tested whether the scene stood still."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -37,7 +37,7 @@ from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
-from stcal.workflows.handeye.inputs import HandEyeInput
+from stcal.workflows.handeye.inputs import HandEyeInput, naming_left_out
 from stcal.workflows.handeye.robot_at_images import Arm
 
 ALL, AUTO = "all", "auto"
@@ -122,37 +122,6 @@ def calibrate_handeye(
     return with_offset(calibrate(given, setup, method, options, validation, told, time_offset), offset)
 
 
-def calibrate(
-    given: HandEyeInput,
-    setup: Setup,
-    method: str | None,
-    options: HandEyeOptions,
-    validation: Splits,
-    progress: Progress = lambda *_: None,
-    offset_known: bool = False,
-) -> Outcome:
-    """Returns the result and its errors on poses held out.
-
-    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
-
-    All methods are compared where ``method`` is :data:`ALL`;
-    the way of solving that predicts best is used where it is :data:`AUTO`.
-
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
-    """
-    try:
-        return _outcome(given, setup, method, options, validation, progress, offset_known)
-    except StcalError as error:
-        if not given.left_out:
-            raise
-        name, reason = given.left_out[0]
-        error.append(f"; {len(given.left_out)} left out before, first {name}: {reason}")
-        raise
-
-
 FAR_MM, TOO_FAR_MM = 600.0, 1000.0
 """Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
 stated; brackets are shorter."""
@@ -176,67 +145,82 @@ def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, 
     return (Grave(said) if away > TOO_FAR_MM else said,)
 
 
-def _outcome(
+def calibrate(
     given: HandEyeInput,
     setup: Setup,
     method: str | None,
     options: HandEyeOptions,
     validation: Splits,
-    progress: Progress,
-    offset_known: bool,
+    progress: Progress = lambda *_: None,
+    offset_known: bool = False,
 ) -> Outcome:
-    pairs, views = given.pairs, given.views
-    if options.camera is None:
-        options = replace(options, camera=given.prior)
-    compared, rows = (), np.zeros((0, 0), int)
-    if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
-        rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
-    if method == ALL:
-        result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
-        compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
-        held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
-        solution = Validated(result if held_out is None else widened_by_scatter(result, held_out), held_out, options)
-    else:
-        prior, done = given.prior if views is not None else None, partial(progress, "held out")
-        asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
-        solution = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
-    result, options, notes = solution.result, solution.options, solution.notes
-    if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
-        notes = (*notes, meant)
-    notes = (*notes, *_of_setup(given, setup, result))
-    if not offset_known:
-        result, lagging = lag_tried(given, setup, options, result)
-        notes = (*notes, *lagging)
-    motions = None
-    if validation.motions is not None:
-        motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
-    model = options.intrinsics.colmap_model if options.intrinsics else ""
-    own_sigmas = views is not None and all(view.covariance is not None for view in views.views)
-    if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views = mended.pairs, mended.views
-    outcome = Outcome(
-        given.where,
-        result,
-        solution.held_out,
-        compared,
-        given.pitch_mm,
-        model,
-        own_sigmas,
-        given.left_out,
-        notes,
-        motions,
-        solution.choice,
-        understood=given.understood,
-        unit_mm=given.unit_mm,
-        pairs=pairs,
-        views=views,
-        folder=given.folder,
-    )
-    if given.arm is None:
-        return outcome
-    done = partial(progress, "with the arm")
-    return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)
+    """Returns the result and its errors on poses held out.
+
+    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
+
+    All methods are compared where ``method`` is :data:`ALL`;
+    the way of solving that predicts best is used where it is :data:`AUTO`.
+
+    Raises
+    ------
+    StcalError
+        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    """
+    with naming_left_out(given.left_out):
+        pairs, views = given.pairs, given.views
+        if options.camera is None:
+            options = replace(options, camera=given.prior)
+        compared, rows = (), np.zeros((0, 0), int)
+        if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
+            rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
+        if method == ALL:
+            result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
+            compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
+            held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
+            solution = Validated(
+                result if held_out is None else widened_by_scatter(result, held_out), held_out, options
+            )
+        else:
+            prior, done = given.prior if views is not None else None, partial(progress, "held out")
+            asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
+            solution = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
+        result, options, notes = solution.result, solution.options, solution.notes
+        if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
+            notes = (*notes, meant)
+        notes = (*notes, *_of_setup(given, setup, result))
+        if not offset_known:
+            result, lagging = lag_tried(given, setup, options, result)
+            notes = (*notes, *lagging)
+        motions = None
+        if validation.motions is not None:
+            motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
+        model = options.intrinsics.colmap_model if options.intrinsics else ""
+        own_sigmas = views is not None and all(view.covariance is not None for view in views.views)
+        if options.symmetries:
+            mended = repair(pairs, setup, options.symmetries, views)
+            pairs, views = mended.pairs, mended.views
+        outcome = Outcome(
+            given.where,
+            result,
+            solution.held_out,
+            compared,
+            given.pitch_mm,
+            model,
+            own_sigmas,
+            given.left_out,
+            notes,
+            motions,
+            solution.choice,
+            understood=given.understood,
+            unit_mm=given.unit_mm,
+            pairs=pairs,
+            views=views,
+            folder=given.folder,
+        )
+        if given.arm is None:
+            return outcome
+        done = partial(progress, "with the arm")
+        return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)
 
 
 def with_arm(
