@@ -39,10 +39,12 @@ MODULES = (
     "stcal.register.report.file",
     "stcal.locate.data.exposures",
     "stcal.locate.report.page",
-    "stcal.locate.report.page",
     "stcal.robot.axes.report",
     "stcal.robot.identification.report",
-    "stcal.robot.use.files",
+    "stcal.robot.use.evaluation",
+    "stcal.robot.use.compensation",
+    "stcal.robot.use.verification",
+    "stcal.robot.use.design",
 )
 """Where the models are."""
 WORDS = {str: "string", int: "integer", float: "number", bool: "true or false", type(None): "null", Any: "any"}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Arg, Opt
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 from stcal.io.files import keep_apart

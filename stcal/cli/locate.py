@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 
 app = typer.Typer(

@@ -13,8 +13,7 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.views import RigPoses, Views
 from stcal.handeye.judge import remarks
-from stcal.handeye.judge.ambiguity import repair, turned_view
-from stcal.handeye.judge.conventions import check_conventions
+from stcal.handeye.judge.mistakes import check_conventions, repair, turned_view
 from stcal.handeye.judge.observability import LEAST_POSES, Observability, check, require_scale
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.methods import closed_form

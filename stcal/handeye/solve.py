@@ -15,8 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
-from stcal.handeye.judge.ambiguity import flip_note, flipped, repair
-from stcal.handeye.judge.conventions import Guess, check_conventions
+from stcal.handeye.judge.mistakes import Guess, check_conventions, flip_note, flipped, repair
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.methods import closed_form

@@ -13,7 +13,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.data.views import View, Views, resect
-from stcal.handeye.judge.ambiguity import repair
+from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.judge.observability import check
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.methods.noise import UNKNOWNS

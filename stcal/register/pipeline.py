@@ -29,7 +29,6 @@ from stcal.register.core.robust import (
     sigma_within,
     turn_between,
 )
-from stcal.register.judge.degeneracy import by_chance, check_extent, check_supports, row_name
 from stcal.register.judge.mistakes import (
     Shifted,
     Wider,
@@ -43,7 +42,7 @@ from stcal.register.judge.mistakes import (
     two_groups,
     wider,
 )
-from stcal.register.judge.notes import Subject, notes_of
+from stcal.register.judge.notes import Subject, by_chance, check_extent, check_supports, notes_of, row_name
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9

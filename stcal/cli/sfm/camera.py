@@ -5,8 +5,18 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, designs_told, require_new, require_passed
+from stcal.cli.options import (
+    WRITES,
+    Arg,
+    Opt,
+    ReportFile,
+    Strict,
+    TargetFile,
+    Workers,
+    designs_told,
+    require_new,
+    require_passed,
+)
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import Arg, Opt
+from stcal.cli.options import Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 

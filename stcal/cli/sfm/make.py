@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import MOST_SEED, board_in_words
+from stcal.cli.options import MOST_SEED, WRITES, Arg, Opt, board_in_words
 from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
 

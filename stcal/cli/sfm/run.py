@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Opt
+from stcal.cli.options import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, verbose, write, write_if
 from stcal.errors import InputError
 from stcal.io.files import keep_apart

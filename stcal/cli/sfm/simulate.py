@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.declare import Arg, Opt
-from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, PlateMargin, TargetFile, Workers, designs_told
+from stcal.cli.options import MOST_SEED, Arg, BoardFile, JsonFile, Opt, PlateMargin, TargetFile, Workers, designs_told
 from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, json_text, real_place, save

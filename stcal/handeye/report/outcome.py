@@ -11,7 +11,7 @@ from stcal.geometry.rigid import skew
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge.ambiguity import flipped
+from stcal.handeye.judge.mistakes import flipped
 from stcal.handeye.judge.observability import COMMON_MM, in_words
 from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, Verdict, Word, spoken
 from stcal.handeye.result import HandEye

@@ -1,6 +1,7 @@
 """Mistakes that the data show: units, mirrored axes, exchanged rows, scale, correlated residuals of neighbours, and two
 groups of points that were shifted against each other."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,6 @@ from stcal.geometry.robust import ratio_limit
 from stcal.register.core.models import MODELS, Model, Transform, jacobian, parts, unit_covariance, whitened
 from stcal.register.core.pairs import Problem
 from stcal.register.core.robust import BY_CHANCE, FALSE_ALARMS, Fitted, by_share, chernoff, search
-from stcal.register.judge.degeneracy import Namer
 from stcal.row_order import Change, change_along
 
 UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
@@ -106,7 +106,7 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
     )
 
 
-def outlier_notes(problem: Problem, fitted: Fitted, name: Namer) -> list[str]:
+def outlier_notes(problem: Problem, fitted: Fitted, name: Callable[[int], str]) -> list[str]:
     """Returns notes on outliers that a slip explains: exchanged rows, or another unit."""
     rows = np.flatnonzero(~fitted.inliers)[:LOOKED_AT]
     if not len(rows):
@@ -281,7 +281,7 @@ def _turn(transform: Transform) -> np.ndarray:
     return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
 
 
-def order_note(change: Change, name: Namer) -> str:
+def order_note(change: Change, name: Callable[[int], str]) -> str:
     """Returns one line on a change along the order of the rows."""
     size = f"{np.linalg.norm(change.motion[3:]):.3g} mm and {np.degrees(np.linalg.norm(change.motion[:3])):.2g}°"
     share = f"{change.share:.0%} of the squared residuals, p {'< 0.001' if change.p < 1e-3 else f'= {change.p:.2g}'}"

@@ -26,8 +26,7 @@ from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
 from stcal.robot.use.design import PoseDesign
-from stcal.robot.use.evaluation import Evaluated, Evaluation, Figures
-from stcal.robot.use.files import EvaluationFile
+from stcal.robot.use.evaluation import Evaluated, Evaluation, EvaluationFile, Figures
 from stcal.robot.use.verification import Verification
 
 

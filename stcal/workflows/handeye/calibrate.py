@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
-from stcal.handeye.judge.ambiguity import repair
+from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.pipeline import Validated, validated
 from stcal.handeye.report.outcome import ArmFound, Outcome

@@ -18,7 +18,7 @@ from stcal.handeye.data.inputs import Told, mapped_pairs, own_told, read_pairs, 
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.judge.ambiguity import flipped, tilted
+from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
 from stcal.handeye.solve import handeye
