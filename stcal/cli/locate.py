@@ -40,15 +40,13 @@ def schedule(
 def capture(
     out: Annotated[Path, "Write the scene's folder of images below this folder.", Arg("SCENES")] = Path("scenes"),
     scene: Annotated[str, "Name the scene like this; its folder must not exist."] = "scene-1",
-    device: Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."] = "0",
+    device: shared.Device = "0",
     shortest: Annotated[
         float, "Start with this exposure, in the driver's unit; V4L2: 100 µs.", Opt(min=1e-9, max=1e9)
     ] = 10.0,
     longest: Annotated[float, "End with this exposure, in the driver's unit.", Opt(min=1e-9, max=1e9)] = 1000.0,
     count: Annotated[int, "Take this many exposures, in a geometric series.", Opt(min=1, max=1000)] = 5,
-    gain: Annotated[
-        float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
-    ] = None,
+    gain: shared.Gain = None,
     settle: Annotated[float, "Give the camera this time after each change, s.", Opt("--settle-s", min=0, max=60)] = 0.3,
     simulate: Annotated[
         Path | None, "Use a simulated camera that shows this image at exposure 1, in place of --device."

@@ -135,6 +135,10 @@ JsonFile = Annotated[
 ReportFile = Annotated[
     Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
 ]
+Device = Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."]
+Gain = Annotated[
+    float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
+]
 Exclude = Annotated[
     list[str] | None,
     "Ignore this image, by its name in results, such as 12/IMG_1003.jpg; repeat it for more images.",

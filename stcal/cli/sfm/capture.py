@@ -188,15 +188,13 @@ def capture(
     group: Annotated[str, "Name the group like this; only the camera may move between its photographs."],
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    device: Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."] = "0",
+    device: shared.Device = "0",
     exposure: Annotated[
         float | None,
         "Set this exposure, in the driver's unit; if not given, the camera chooses it.",
         Opt(min=1e-9, max=1e9),
     ] = None,
-    gain: Annotated[
-        float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
-    ] = None,
+    gain: shared.Gain = None,
     settle: Annotated[
         float, "Give the camera this time before each photograph, s.", Opt("--settle-s", min=0, max=60)
     ] = 0.3,

@@ -117,20 +117,19 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
     apart_deg = _apart_deg(pose)
     if pose.second is not None and apart_deg <= options.equal_deg:
         pose = covering_both(pose)
-    margin2 = options.sigma_margin**2
+    chi2_limit = options.sigma_margin**2 * float(chi_square.isf(options.max_p, pose.redundancy) / pose.redundancy)
     checks = [
         PoseCheck("tags", len(pose.rows), at_least=options.min_tags),
         PoseCheck("spread", pose.extent_px, at_least=options.min_spread_px, unit=" px"),
         PoseCheck("foreshortening", pose.foreshortening, at_least=options.min_foreshortening),
-        PoseCheck(
-            "chi2 per dof", pose.chi2_per_redundancy(), at_most=margin2 * _chi2_limit(pose.redundancy, options.max_p)
-        ),
+        PoseCheck("chi2 per dof", pose.chi2_per_redundancy(), at_most=chi2_limit),
         PoseCheck("sigma of rotation", float(np.degrees(pose.sigma_rad())), at_most=options.max_sigma_deg, unit="°"),
     ]
     if options.max_sigma_mm is not None:
         checks.append(PoseCheck("sigma of position", pose.sigma_mm(), at_most=options.max_sigma_mm, unit=" mm"))
     failed = [check.text() for check in checks if not check.passed]
-    ambiguity = PoseCheck("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta(pose, options))
+    needed_delta = deciding_delta(options.flip_odds, options.sigma_margin, pose.chi2_per_redundancy())
+    ambiguity = PoseCheck("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta)
     clear = ambiguity.passed or apart_deg <= options.equal_deg
     checks.append(ambiguity)
     if failed:
@@ -139,15 +138,6 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
         return pose, Verdict("accept", tuple(checks), ())
     reason = f"two poses {apart_deg:.1f}° apart: {ambiguity.text()}"
     return pose, Verdict("ambiguous", tuple(checks), (reason,))
-
-
-def needed_delta(pose: ObjPose, options: VerdictOptions) -> float:
-    """Returns the Δχ² that decides between two poses."""
-    return deciding_delta(options.flip_odds, options.sigma_margin, pose.chi2_per_redundancy())
-
-
-def _chi2_limit(redundancy: int, p: float) -> float:
-    return float(chi_square.isf(p, redundancy) / redundancy)
 
 
 def _apart_deg(pose: ObjPose) -> float:

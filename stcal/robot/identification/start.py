@@ -344,7 +344,8 @@ def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
     for i, k in combinations(range(n), 2):
         if n > MOST_JOINTS or robot.joints[i].type != robot.joints[k].type:
             continue
-        order = _exchanged(n, i, k)
+        order = list(range(n))
+        order[i], order[k] = k, i
         reason = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
         yield reason, robot, replace(data, q=data.q[:, order])
         if robot.tree is None:
@@ -419,13 +420,6 @@ def _inner(robot: Robot) -> list[int]:
 def _turned(rows: tuple[DHRow, ...], turns_deg: dict[int, int]) -> tuple[DHRow, ...]:
     """Returns the rows with θ larger by these angles."""
     return tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in enumerate(rows))
-
-
-def _exchanged(n: int, i: int, k: int) -> list[int]:
-    """Returns the order of n things with two exchanged."""
-    order = list(range(n))
-    order[i], order[k] = k, i
-    return order
 
 
 def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
