@@ -140,44 +140,6 @@ class GoalChain(Brief):
             )
 
 
-def read_chain(
-    hand_eye: HandEyeResult | Rigid | str | Path,
-    robot_poses: Mapping[str, Rigid] | str | Path | None,
-    offset: Rigid | str | Path | None = None,
-    quaternions: Order = "wxyz",
-    key: str = "scene",
-    columns: str | Path | None = None,
-) -> GoalChain:
-    """Reads the hand-eye transform, the robot's poses by scene, and the offset, as far as they are given as files.
-
-    ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
-    ``key`` : column of the robot's poses that names the scenes; ``columns`` : map of their columns.
-
-    Raises InputError: a file does not follow ``data_layout.md``, or robot poses are missing, or are given for a fixed
-    camera.
-    """
-    name, mount = _mounted(hand_eye, robot_poses)
-    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
-    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
-    moving = name == MOVING
-    if moving and robot_poses is None:
-        raise InputError(
-            "E-OPTION-MISSING",
-            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
-        )
-    if not moving and robot_poses is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
-        )
-    if robot_poses is None:
-        return GoalChain(mount, moving, {}, _offset(offset), source)
-    if isinstance(robot_poses, str | Path):
-        flange = read_robot_poses(robot_poses, quaternions, key, columns)
-        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
-    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
-    return GoalChain(mount, moving, exact, _offset(offset), source)
-
-
 def _mounted(
     hand_eye: HandEyeResult | Rigid | str | Path, robot_poses: Mapping[str, Rigid] | str | Path | None
 ) -> tuple[str, UncertainRigid]:
@@ -416,16 +378,37 @@ def goal_chain(
         )
     if hand_eye is None and robot_poses is not None:
         raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
-    if hand_eye is not None:
-        return read_chain(hand_eye, robot_poses, offset, quaternions, key, columns)
     if registration is not None:
         return read_registered(registration, offset)
-    if offset is not None:
+    if hand_eye is None and offset is not None:
         raise InputError(
             "E-OPTION-NEEDS",
             "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
         )
-    raise InputError("E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base")
+    if hand_eye is None:
+        raise InputError(
+            "E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base"
+        )
+    name, mount = _mounted(hand_eye, robot_poses)
+    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
+    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
+    moving = name == MOVING
+    if moving and robot_poses is None:
+        raise InputError(
+            "E-OPTION-MISSING",
+            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
+        )
+    if not moving and robot_poses is not None:
+        raise InputError(
+            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
+        )
+    if robot_poses is None:
+        return GoalChain(mount, moving, {}, _offset(offset), source)
+    if isinstance(robot_poses, str | Path):
+        flange = read_robot_poses(robot_poses, quaternions, key, columns)
+        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
+    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
+    return GoalChain(mount, moving, exact, _offset(offset), source)
 
 
 def _named(given: object) -> str:
