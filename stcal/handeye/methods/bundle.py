@@ -154,10 +154,6 @@ class Corners:
         """Returns :func:`camera_parts` of the intrinsics solved for."""
         return camera_parts(self.basis, self.information)
 
-    def no_step(self) -> np.ndarray:
-        """Returns zeros (k,) for the arm's parameters."""
-        return np.zeros(0 if self.arm is None else len(self.arm.parameters))
-
     def by_arm(self, step: np.ndarray) -> Poses:
         """Returns base_from_flange after a step (k,) of the arm's parameters; as reported without an arm."""
         return self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, step)
@@ -236,10 +232,6 @@ class Corners:
             robot=None if self.robot is None else self.robot[keep],
             arm=None if self.arm is None else self.arm[keep],
         )
-
-    def with_sigma(self, sigma: dict[str, float]) -> "Corners":
-        """Returns the same problem with other σ."""
-        return replace(self, sigma=sigma)
 
     def with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> "Corners":
         """Returns the same problem with intrinsics among the unknowns, about ``camera``. The factors of their prior σ
@@ -482,12 +474,8 @@ class RigCorners:
         """Returns the same problem with other σ."""
         problems = []
         for name, corners in zip(self.names, self.each, strict=True):
-            problems.append(corners.with_sigma({key: sigma[_renamed(key, name)] for key in corners.sigma}))
+            problems.append(replace(corners, sigma={key: sigma[_renamed(key, name)] for key in corners.sigma}))
         return replace(self, each=tuple(problems))
-
-    def with_board_scale(self) -> "RigCorners":
-        """Returns the same problem with the board's scale among the unknowns."""
-        return replace(self, each=tuple(replace(own, with_scale=True) for own in self.each))
 
     def with_intrinsics(self, known: dict[int, tuple[np.ndarray, np.ndarray]]) -> "RigCorners":
         """Returns the same problem with intrinsics of some cameras among the unknowns: basis and information, by number

@@ -327,9 +327,8 @@ def _adjusted(
         rows = _rows(given, used, outliers)
         corners, free = _problem(given, loops, used, rows, noise, refine, with_scale, arm, sigma)
         cameras, one = tuple(camera.views.camera for camera in given.cameras), corners.each[0]
-        begin = RigBundle(
-            tuple(first[0]), first[1], one.base_from_flange, one.xyz_board, cameras, first[2], one.no_step()
-        )
+        no_step = np.zeros(0 if arm is None else len(arm.parameters))
+        begin = RigBundle(tuple(first[0]), first[1], one.base_from_flange, one.xyz_board, cameras, first[2], no_step)
         solution = adjust(corners, begin, free)
         corners, state = solution.corners, solution.state
         inverse = solution.linear.inverse()
@@ -391,7 +390,7 @@ def contradicting(corners: RigCorners, state: Bundle | RigBundle, inverse: np.nd
 def _scale_hint(corners: RigCorners, state: RigBundle) -> tuple[float, float]:
     """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
     unknowns."""
-    wider = corners.with_board_scale()
+    wider = replace(corners, each=tuple(replace(own, with_scale=True) for own in corners.each))
     left, at = wider.linear(state).eliminated(), wider.places()["scale"].start
     inverse = generalised_inverse(left.normal)
     return state.scale - float(inverse[at] @ left.gradient), float(np.sqrt(inverse[at, at]))

@@ -445,20 +445,19 @@ def _cells(values) -> list[str]:
 
 def evaluation_file(result: Evaluation) -> EvaluationFile:
     """Returns the complete result in machine-readable form (keys: ``data_layout.md``)."""
-    robots = []
-    for each in result.robots:
-        robots.append(
-            {
-                "name": each.robot.name,
-                "position_mm": Figures.of(each.errors_mm),
-                "good_mm": Figures.of(each.errors_mm[~result.wrong]),
-                "orientation_rad": Figures.of(each.rotation_rad) if len(each.rotation_rad) else None,
-                "placed": placed_parts(each.placed),
-                "left": each.left,
-                "beyond": each.beyond,
-                "residuals": list(each.residuals),
-            }
-        )
+    robots = [
+        {
+            "name": each.robot.name,
+            "position_mm": Figures.of(each.errors_mm),
+            "good_mm": Figures.of(each.errors_mm[~result.wrong]),
+            "orientation_rad": Figures.of(each.rotation_rad) if len(each.rotation_rad) else None,
+            "placed": placed_parts(each.placed),
+            "left": each.left,
+            "beyond": each.beyond,
+            "residuals": list(each.residuals),
+        }
+        for each in result.robots
+    ]
     content = {
         "format": "stcal evaluation 1",
         "refit": result.refit,
