@@ -31,7 +31,7 @@ from stcal.handeye.data.formats.record import (
     require_each_once,
     role_of,
 )
-from stcal.handeye.data.formats.single import ROS
+from stcal.handeye.data.formats.tree import ROS
 from stcal.io.files import MB, TABLE_BYTES
 from stcal.io.poses.columns import find_column, places_of, read_rotations
 from stcal.io.poses.matrices import MatrixColumns, find_matrices
