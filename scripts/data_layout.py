@@ -35,14 +35,16 @@ MODULES = (
     "stcal.sfm.interop.gates",
     "stcal.sfm.diagnose.findings",
     "stcal.handeye.report.file",
-    "stcal.handeye.report.planned",
+    "stcal.handeye.plan",
     "stcal.register.report.file",
     "stcal.locate.data.exposures",
-    "stcal.locate.report.calibration",
-    "stcal.locate.report.located",
+    "stcal.locate.report.page",
     "stcal.robot.axes.report",
     "stcal.robot.identification.report",
-    "stcal.robot.use.files",
+    "stcal.robot.use.evaluation",
+    "stcal.robot.use.compensation",
+    "stcal.robot.use.verification",
+    "stcal.robot.use.design",
 )
 """Where the models are."""
 WORDS = {str: "string", int: "integer", float: "number", bool: "true or false", type(None): "null", Any: "any"}

@@ -42,15 +42,13 @@ INSIDE = {
         ("make",),
         (".",),
     ),
-    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), (".",)),
+    "robot": (("kinematics",), ("identification",), ("axes",), ("use",), (".",)),
     "register": (("core",), ("judge",), (".",), ("report",)),
     "handeye": (("data",), ("methods",), ("judge",), (".",), ("report",)),
-    "locate": (("data",), ("pose", "calibration"), (".",), ("report",)),
+    "locate": (("data",), ("pose",), (".",), ("report",)),
 }
 """Folders of each system, from below; ``.`` stands for the files beside them. Folders of one layer know nothing of each
 other; a folder uses those inside it, not they it."""
-SIDEWAYS = {("locate/calibration", "locate/pose")}
-"""(importer, imported) of one layer."""
 FRONTS = {f"{system}/__init__.py" for system in INSIDE}
 """May hand on everything of their system."""
 LIBRARIES = {
@@ -138,7 +136,7 @@ def forbidden(path: str, target: str) -> str:
     if system == other and system in INSIDE and not target.startswith(f"{own}/"):
         if inner_layer(target) > inner_layer(own):
             return f"{target} lies above {own}"
-        if inner_layer(target) == inner_layer(own) and (own, target) not in SIDEWAYS:
+        if inner_layer(target) == inner_layer(own):
             return f"{target} stands beside {own}"
     if system != other and system in INSIDE and other in INSIDE:
         return f"{target} is another system"

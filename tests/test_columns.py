@@ -6,7 +6,7 @@ from decimal import Decimal
 import pytest
 
 from stcal.cli.main import main
-from stcal.workflows.handeye.times import Timing, _times_of_images
+from stcal.workflows.handeye.robot_at_images import Timing, _times_of_images
 from tests.outcome import assert_error, ended
 
 CALLS = {

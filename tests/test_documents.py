@@ -9,7 +9,7 @@ from typer.main import get_command
 
 import stcal
 import stcal.errors
-from stcal.cli.examples import EXAMPLES, GROUPS
+from stcal.cli.help import EXAMPLES, GROUPS
 from stcal.cli.main import app
 from tests.scripts import load_script
 

@@ -24,8 +24,8 @@ from stcal.labels import parse_label
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.robot.axes.model import robot_from_sweeps
-from stcal.robot.identification.residuals import jacobian as jacobian_of
-from stcal.robot.identification.residuals import observed, residuals
+from stcal.robot.identification.adjustment import jacobian as jacobian_of
+from stcal.robot.identification.adjustment import observed, residuals
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.forward import forward, jacobian

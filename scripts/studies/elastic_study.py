@@ -27,9 +27,8 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.identification.adjustment import parameter_units
+from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
 from stcal.robot.identification.prior import HEAVIER, Deviations, NominalRows
-from stcal.robot.identification.residuals import State, jacobian, observed, tip_jacobian, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions

@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 
 from stcal.handeye import HandEyeOptions, splits
-from stcal.handeye.judge.verdict import GOOD
+from stcal.handeye.judge.remarks import GOOD
 from stcal.handeye.pipeline import validated
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.solve import handeye

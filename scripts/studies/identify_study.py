@@ -19,7 +19,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
-from stcal.robot.identification.residuals import Observed, State, jacobian, observed, residuals, tips
+from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.inverse import inverse

@@ -27,12 +27,11 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
-from stcal.locate.calibration.solve import CalibrationImages
+from stcal.locate.calibration import CalibrationImages
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
 from stcal.locate.pipeline import LocateOptions, locate_image, run
-from stcal.locate.pose.estimate import locate
-from stcal.locate.pose.merge import merge
+from stcal.locate.pose.estimate import locate, merge
 from stcal.locate.pose.patent import PatentOptions
 from stcal.locate.pose.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread

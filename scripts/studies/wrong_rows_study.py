@@ -16,7 +16,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.identification.residuals import State, observed, residuals, tips
+from stcal.robot.identification.adjustment import State, observed, residuals, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements

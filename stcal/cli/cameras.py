@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, warn
 from stcal.errors import InputError
 

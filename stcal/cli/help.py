@@ -4,8 +4,6 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
-from stcal.cli.examples import EXAMPLES, GROUPS
-
 PLAIN: dict[str, Any] = {
     "rich_markup_mode": None,  # rich takes twice as long to load as all the rest of `--help`
     "context_settings": {"max_content_width": 120, "help_option_names": ["-h", "--help"]},
@@ -119,3 +117,72 @@ class Commands(TyperGroup):
         for title, names in groups.items():
             with formatter.section(title):
                 formatter.write_dl([rows[name] for name in names])
+
+
+EXAMPLES = {
+    "sfm run": ("photos --camera cameras.txt --target target.toml --board board.toml --out result",),
+    "sfm detect": ("photos --camera cameras.txt --out look",),
+    "sfm verify": ("result",),
+    "sfm report": ("result --pdf",),
+    "sfm init": ("design",),
+    "sfm simulate": ("set --images 5 --width 1728",),
+    "sfm compare": ("result set/truth.json",),
+    "sfm demo": ("--out demo",),
+    "sfm draw": ("design/target.toml --out target.pdf",),
+    "sfm design": ("box --size 160,140,120 --faces front,right,top",),
+    "sfm export-database": ("result old.db --schema 3.8",),
+    "sfm export-model": ("result model --format colmap-txt",),
+    "sfm export": ("result target.urdf", "result target.csv"),
+    "sfm crosscheck": ("result",),
+    "sfm faces": ("model --run result --out faces.json",),
+    "sfm pairs": ("result",),
+    "sfm doctor": ("result --images photos",),
+    "sfm plan": ("--camera cameras.txt --target target.toml --board board.toml --images 6",),
+    "sfm advise": ("result --count 3",),
+    "sfm watch": ("photos --camera cameras.txt --out result",),
+    "sfm capture": ("photos --camera cameras.txt --out result --group 12",),
+    "sfm calibrate-camera": ("photos --board board.toml --out cameras.txt",),
+    "sfm measure": ("photos --camera cameras.txt --faces result/faces.json --out poses.csv",),
+    "sfm budget": ("result --report budget.html --pdf",),
+    "register": ("pairs.csv --out b_from_a.json --report pairs.html",),
+    "handeye": ("photos --poses flange.csv --camera cameras.txt --board board.toml --report handeye.html",),
+    "handeye plan": ("photos --poses flange.csv --camera cameras.txt --board board.toml --robot robot.toml",),
+    "handeye rig": ("rig.toml --report rig.html",),
+    "locate run": ("scenes --layout tags.toml --camera cameras.txt --out poses.csv",),
+    "locate calibrate": ("photos --camera cameras.txt --board board.toml --layout tags.toml --out measured.toml",),
+    "locate schedule": ("1 64 7",),
+    "locate capture": ("scene",),
+    "camera show": ("cameras.txt --plot distortion.svg",),
+    "camera convert": ("cameras.txt camera.yaml --form ros",),
+    "camera compare": ("cameras.txt camera.yaml",),
+    "robot init": ("robot.toml",),
+    "robot axes": ("sweeps.csv --robot robot.toml --out axes.toml",),
+    "robot identify": ("poses.csv --robot robot.toml --out identified.toml --report identified.html",),
+    "robot evaluate": ("new.csv --robot robot.toml --robot identified.toml",),
+    "robot compensate": ("targets.csv --robot identified.toml --nominal robot.toml --out joints.csv",),
+    "robot verify": ("measured.csv --plot errors.svg",),
+    "robot design": ("--robot robot.toml --count 40 --out poses.csv",),
+    "robot convert": ("robot.toml robot.urdf",),
+    "robot from-photos": (
+        "photos --camera cameras.txt --faces faces.json --joints joints.csv --robot robot.toml --out arm",
+    ),
+}
+"""Arguments of typical calls of each command, by its words."""
+
+GROUPS = {
+    "stcal": {
+        "Stereo targets": ("sfm",),
+        "Robots": ("robot", "handeye", "handeye plan", "handeye rig"),
+        "Other instruments and targets": ("register", "locate"),
+        "Camera files": ("camera",),
+    },
+    "sfm": {
+        "Make and photograph a target": ("init", "design", "draw", "plan", "capture", "watch"),
+        "Calibrate it": ("run", "report", "budget", "advise", "calibrate-camera"),
+        "Use it": ("measure", "export"),
+        "Where something is wrong": ("detect", "doctor", "pairs", "verify"),
+        "COLMAP": ("crosscheck", "faces", "export-model", "export-database"),
+        "Simulate": ("demo", "simulate", "compare"),
+    },
+}
+"""Commands that belong together, in the order of the help text."""

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, warn_if_quiet, write, write_if
 
 app = typer.Typer(
@@ -40,15 +40,13 @@ def schedule(
 def capture(
     out: Annotated[Path, "Write the scene's folder of images below this folder.", Arg("SCENES")] = Path("scenes"),
     scene: Annotated[str, "Name the scene like this; its folder must not exist."] = "scene-1",
-    device: Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."] = "0",
+    device: shared.Device = "0",
     shortest: Annotated[
         float, "Start with this exposure, in the driver's unit; V4L2: 100 µs.", Opt(min=1e-9, max=1e9)
     ] = 10.0,
     longest: Annotated[float, "End with this exposure, in the driver's unit.", Opt(min=1e-9, max=1e9)] = 1000.0,
     count: Annotated[int, "Take this many exposures, in a geometric series.", Opt(min=1, max=1000)] = 5,
-    gain: Annotated[
-        float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
-    ] = None,
+    gain: shared.Gain = None,
     settle: Annotated[float, "Give the camera this time after each change, s.", Opt("--settle-s", min=0, max=60)] = 0.3,
     simulate: Annotated[
         Path | None, "Use a simulated camera that shows this image at exposure 1, in place of --device."
@@ -92,9 +90,9 @@ def calibrate(
     """Find the corners of the target's tags, with σ, in the frame at the centre of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
     from stcal.io.cameras.read import read_camera
-    from stcal.locate.calibration.solve import calibrate as calibrated
+    from stcal.locate.calibration import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan, require_layout_written
-    from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
+    from stcal.locate.report.page import calibrated_file, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
@@ -177,9 +175,8 @@ def run(
     from stcal.locate.pipeline import run as located
     from stcal.locate.pose.patent import PatentOptions
     from stcal.locate.pose.verdict import VerdictOptions
-    from stcal.locate.report.base import goal_chain, goals
-    from stcal.locate.report.located import LocatedFile
-    from stcal.locate.report.page import accepted, poses_csv, run_report, uncertain
+    from stcal.locate.report.chain import goal_chain, goals
+    from stcal.locate.report.page import LocatedFile, accepted, poses_csv, run_report, uncertain
 
     chain = None
     if hand_eye or registration or robot_poses or offset:

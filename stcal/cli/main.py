@@ -2,9 +2,12 @@
 
 import json
 import os
+import platform
+import shutil
 import signal
 import sys
 import threading
+from importlib import import_module
 from io import TextIOWrapper
 from itertools import pairwise
 from typing import Any, NoReturn
@@ -17,13 +20,15 @@ from stcal.cli import cameras, handeye, locate, register, robot, sfm
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
-from stcal.errors import NO_MEMORY, StcalError, at_command_line, lacks_memory
+from stcal.errors import NO_MEMORY, InputError, StcalError, at_command_line, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
 AGAIN_S = 0.02
 """Time after which a signal is sent again, s."""
 MESSAGE_CHARACTERS = 600
 """Largest length of an error's line. Texts from files, which it may quote, can have any length."""
+LIBRARIES = {"pycolmap": "pycolmap", "OpenCV": "cv2", "NumPy": "numpy", "SciPy": "scipy"}
+"""Module of each library, by name."""
 RESUMED = {"run", "detect", "watch"}
 """Commands that keep finished detections when they are interrupted."""
 # The class is Click's, which newer versions of Typer contain.
@@ -56,13 +61,40 @@ def _version(
         print(stcal.__version__)
         raise typer.Exit
     if versions:
-        from stcal.workflows.versions import environment
-
         versions_by_name = environment()
         width = max(map(len, versions_by_name))
         for name, installed in versions_by_name.items():
             say(f"{name:{width}}  {installed}")
         raise typer.Exit
+
+
+def environment() -> dict[str, str]:
+    """Returns the versions by name, as loaded. A library that is missing or does not load is reported as such.
+
+    Returns
+    -------
+    versions : stcal, Python, system, the libraries, and the native COLMAP on the PATH
+    """
+    version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
+    return version_of | {name: _library(module) for name, module in LIBRARIES.items()} | {"native colmap": _native()}
+
+
+def _library(module: str) -> str:
+    try:
+        return str(import_module(module).__version__)
+    except Exception as error:  # raised by a broken installation, which this report is to reveal
+        return f"does not load: {error}"
+
+
+def _native() -> str:
+    from stcal.sfm.interop.native import find_colmap
+
+    if shutil.which("colmap") is None:
+        return "not found"
+    try:
+        return find_colmap().version
+    except InputError as error:
+        return str(error)
 
 
 def main() -> None:

@@ -1,19 +1,24 @@
-"""Options that several commands share, and the notes on assumed designs."""
+"""Options that several commands share, how commands declare their parameters, and the notes on assumed designs.
+
+``count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3`` is the option ``--count``: with its help
+text and range. Its name, and its panel in the help, follow from the parameter's name and type. What a command writes
+beside a parameter's type becomes Typer's form of it.
+"""
 
 import inspect
 import os
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
-from stcal.cli.declare import Arg, Opt, declared
-from stcal.cli.help import Command
+from stcal.cli.help import Command, panel_of
 from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say, warn_if_quiet
 from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
 from stcal.io.files import keep_apart
@@ -23,6 +28,72 @@ if TYPE_CHECKING:
     from stcal.geometry.rigid import Order
     from stcal.io.table import Table
     from stcal.sfm.detect.circles.candidates import EllipseOptions
+
+
+@dataclass(frozen=True, slots=True)
+class Opt:
+    """An option: what its help text and its parameter do not state.
+
+    ``name`` : its names, such as ``--a``, or ``--robust/--least-squares``; ``--held-out`` for ``held_out`` if not
+    given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is written; ``metavar``,
+    ``envvar`` : word for the value in the help text, and variable of the environment that sets it.
+    """
+
+    name: str = ""
+    min: float | None = None
+    max: float | None = None
+    writes: bool = False
+    metavar: str | None = None
+    envvar: str | None = None
+
+    def info(self, parameter: str, text: str) -> Any:
+        """Returns Typer's form of the option."""
+        names = self.name.split() or [f"--{parameter.replace('_', '-')}"]
+        more = {"metavar": self.metavar, "envvar": self.envvar, "writable": self.writes}
+        return typer.Option(*names, help=text, min=self.min, max=self.max, **more)
+
+
+WRITES = Opt(writes=True)
+"""An option with the name of a file that is written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arg:
+    """An argument: a parameter without the name of an option; fields as of :class:`Opt`."""
+
+    metavar: str | None = None
+    min: float | None = None
+    max: float | None = None
+    writes: bool = False
+
+    def info(self, _: str, text: str) -> Any:
+        """Returns Typer's form of the argument."""
+        return typer.Argument(metavar=self.metavar, help=text, min=self.min, max=self.max, writable=self.writes)
+
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """``annotation`` : of a parameter, for Typer; ``word`` : its name in messages; ``reads``, ``writes`` : whether its
+    value is a path that is read, or written; ``reads_images`` : whether images are read there."""
+
+    annotation: Any
+    word: str
+    reads: bool
+    writes: bool
+    reads_images: bool
+
+
+def declared(parameter: str, annotation: Any) -> Declared:
+    """Returns Typer's form of a parameter."""
+    kind, text, *rest = get_args(annotation)
+    [given] = rest or [Opt()]
+    info = given.info(parameter, text)
+    is_path = "Path" in str(kind)
+    info.rich_help_panel = panel_of(parameter, is_path, given.writes)
+    # With Annotated, Typer takes an option's first name for its default.
+    word = info.default if isinstance(given, Opt) else parameter
+    of_images = is_path and (parameter in ("images", "exposures", "rig_file") or "IMAGES" in (given.metavar or ""))
+    return Declared(Annotated[kind, info], word, is_path and not given.writes, given.writes, of_images)
 
 
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
@@ -65,6 +136,10 @@ JsonFile = Annotated[
 ]
 ReportFile = Annotated[
     Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
+]
+Device = Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."]
+Gain = Annotated[
+    float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
 ]
 Exclude = Annotated[
     list[str] | None,
@@ -194,11 +269,13 @@ def several_tables(
     return [each.table for each in joined]
 
 
-def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:
-    """Returns form and file of each FORM=FILE of --export."""
+def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, Path]]:
+    """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
+    from stcal.io.poses.controllers import require_form
+
     for word in words:
         form, _, path = word.partition("=")
-        require_form(form)
+        require_form(form, forms)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
     return _exports(words)

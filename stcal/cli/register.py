@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Arg, Opt
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import DegenerateError, InputError
 
@@ -44,9 +44,8 @@ def convert(
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
-    from stcal.robot.urdf.read import load_urdf
-    from stcal.robot.urdf.universal import read_universal
-    from stcal.robot.urdf.write import coupled, require_urdf_written, robot_urdf
+    from stcal.robot.universal import read_universal
+    from stcal.robot.urdf import coupled, load_urdf, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
@@ -403,13 +402,13 @@ def compensate(
 ) -> None:
     """Compute the joint values with which the real robot reaches the commanded poses."""
     from stcal.io.files import require_same
-    from stcal.robot.export import require_form, robot_program
+    from stcal.robot.export import FORMS, robot_program
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation
     from stcal.robot.use.report import compensation_report
     from stcal.robot.use.targets import read_targets
 
-    exports, pulses = shared.exports_of(export or [], require_form), _pulses(pulses_per_deg)
+    exports, pulses = shared.exports_of(export or [], FORMS), _pulses(pulses_per_deg)
     identified = load_robot(robot_file)
     source = shared.one_table(
         targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a

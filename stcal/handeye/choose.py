@@ -12,7 +12,7 @@ from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions, solved

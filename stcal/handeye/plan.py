@@ -1,9 +1,13 @@
-"""Robot poses to take next: those that would lower the worst σ of a hand-eye transform most."""
+"""Robot poses to take next: those that would lower the worst σ of a hand-eye transform most, and their report."""
 
+import csv
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
@@ -13,6 +17,10 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.result import HandEye
+from stcal.io.json import Part, Pose, ResultFile
+from stcal.io.table import POSE, pose_cells
+from stcal.report.document import Document, Section, Table
+from stcal.report.text import NONE, number
 
 CANDIDATES = 2000
 """Number of candidate views of the board for each pose that is planned."""
@@ -104,7 +112,7 @@ def plan_poses(
         raise InputError("E-PLAN-NO-SIGMA", f"plan: {result.method} gives no σ; give a result of pose or reprojection")
     inliers = np.flatnonzero(~result.outliers)
     loop = Loop.of(pairs, result.setup)[inliers]
-    errors, rng = _Errors.of(loop, result), np.random.default_rng(seed)
+    errors, rng = _errors(loop, result), np.random.default_rng(seed)
     x, z = result.mount_from_camera, result.stand_from_board
     normal = _information(loop, errors, result).sum(0)
     board_poses = loop.camera_from_board
@@ -161,33 +169,26 @@ def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Pose
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Errors:
-    """Covariances (6, 6) of a pose of the flange and of one of the board."""
-
-    robot: np.ndarray
-    camera: np.ndarray
-
-    @classmethod
-    def of(cls, loop: Loop, result: HandEye) -> "_Errors":
-        """Returns the means of the covariances stated with the poses, or those from the σ of the result."""
-        sigma = result.sigma
-        robot, camera = (
-            np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
-            for side in ("robot", "camera")
-        )
-        if loop.robot_covariance is not None and "robot_rad" not in sigma:
-            robot = loop.robot_covariance.mean(0)
-        if loop.camera_covariance is not None:
-            camera = sigma.get("camera_factor", 1.0) ** 2 * loop.camera_covariance.mean(0)
-        return cls(robot, camera)
+def _errors(loop: Loop, result: HandEye) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the covariances (6, 6) of a pose of the flange and of one of the board: the means of those stated with
+    the poses, or those from the σ of the result."""
+    sigma = result.sigma
+    robot, camera = (
+        np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
+        for side in ("robot", "camera")
+    )
+    if loop.robot_covariance is not None and "robot_rad" not in sigma:
+        robot = loop.robot_covariance.mean(0)
+    if loop.camera_covariance is not None:
+        camera = sigma.get("camera_factor", 1.0) ** 2 * loop.camera_covariance.mean(0)
+    return robot, camera
 
 
-def _information(loop: Loop, errors: _Errors, result: HandEye) -> np.ndarray:
+def _information(loop: Loop, errors: tuple[np.ndarray, np.ndarray], result: HandEye) -> np.ndarray:
     """Returns the information of each pose about X and Z, (m, 12, 12)."""
     x, scale = result.mount_from_camera, result.scale
     robot, camera = loop.by_robot(x, scale), loop.by_camera(x, scale)
-    spread = robot @ errors.robot @ np.swapaxes(robot, 1, 2) + camera @ errors.camera @ np.swapaxes(camera, 1, 2)
+    spread = robot @ errors[0] @ np.swapaxes(robot, 1, 2) + camera @ errors[1] @ np.swapaxes(camera, 1, 2)
     jacobian = loop.jacobian(x, scale)[:, :, :12]
     return np.swapaxes(jacobian, 1, 2) @ np.linalg.solve(spread, jacobian)
 
@@ -240,3 +241,109 @@ def _turned_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, np.einsum("ma,ma->m", first, second))
     return Rotation.from_rotvec(axis / np.maximum(sine, 1e-300)[:, None] * angle[:, None]).as_matrix()
+
+
+JOINT_DIGITS = 3
+"""Number of digits of joint values (deg or mm) on the terminal."""
+
+
+class PlannedPose(Part):
+    base_from_flange: Pose
+    camera_from_board: Pose
+    worst_sigma_mm: float
+    turn_rad: float
+    joints: dict[str, float] | None
+
+
+class HandEyePlanFile(ResultFile):
+    """Result file of ``handeye plan``."""
+
+    format: Literal["stcal handeye plan 1"] = Field(description="the file's form and its version")
+    setup: str = Field(description="`eye-in-hand` or `eye-to-hand`")
+    method: str = Field(description="that solved for the poses taken")
+    taken: list[str] = Field(description="names of the poses taken that the solution rests on")
+    worst_sigma_mm: float = Field(description="largest σ, in any direction, of a point at the board: now")
+    poses: list[PlannedPose] = Field(
+        description="to take, in order: `base_from_flange`, `camera_from_board` (how the board is seen there), "
+        "`worst_sigma_mm` with this pose and those before, `turn_rad` against the nearest pose taken, `joints` by "
+        "column (deg or mm; null without a robot file)"
+    )
+
+
+def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
+    """Returns the report of ``handeye plan``."""
+    taken = int((~result.outliers).sum())
+    rotvec = np.degrees([flange.log()[:3] for flange in planned.base_from_flange])
+    heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
+    rows = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]]
+    cells = []
+    for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
+        place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
+        rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
+        cells.append([f"next {k + 1}", *(f"{values[k]:.{JOINT_DIGITS}f}" for values in joints.values())])
+    last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
+    blocks = [
+        Table(heads, rows),
+        Table(["<joints", *joints], cells if joints else []),
+        "turn: relative to the nearest pose taken; rx, ry, rz: rotation vector. σ include only independent errors of "
+        f"the poses. Collisions are not checked, only {last}",
+    ]
+    return Document(
+        "Poses to take next",
+        f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
+        "point at the board with each",
+        [Section("Poses", blocks, terminal=True)],
+    )
+
+
+@require_arguments
+def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None) -> str:
+    """Returns the table of the poses to take next.
+
+    Parameters
+    ----------
+    planned : NextPoses
+        Of :func:`~stcal.handeye.plan_poses`, k poses.
+    joints : dict of (k,) array, optional
+        Joint values of the poses by the name of their column, ``q1_deg`` …, degrees or mm.
+
+    Returns
+    -------
+    str
+        CSV with base_from_flange and camera_from_board, mm (form: ``data_layout.md``).
+    """
+    joints = joints or {}
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}
+    writer.writerow(["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)])
+    for k, turn in enumerate(planned.turn_rad):
+        values = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
+        cells = [repr(float(value)) for value in values]
+        writer.writerow([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
+    return stream.getvalue()
+
+
+def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
+    """Returns the file of the planned poses, for programs."""
+    rows = [
+        {
+            "base_from_flange": planned.base_from_flange[k].matrix(),
+            "camera_from_board": planned.camera_from_board[k].matrix(),
+            "worst_sigma_mm": planned.sigma_mm[k + 1],
+            "turn_rad": turn,
+            "joints": {name: of[k] for name, of in joints.items()} or None,
+        }
+        for k, turn in enumerate(planned.turn_rad)
+    ]
+    taken = [name for name, out in zip(result.names, result.outliers, strict=True) if not out]
+    return HandEyePlanFile.model_validate(
+        {
+            "format": "stcal handeye plan 1",
+            "setup": result.setup,
+            "method": result.method,
+            "taken": taken,
+            "worst_sigma_mm": planned.sigma_mm[0],
+            "poses": rows,
+        }
+    )

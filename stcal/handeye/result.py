@@ -9,7 +9,7 @@ from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.judge.verdict import Verdict
+from stcal.handeye.judge.remarks import Verdict
 from stcal.handeye.methods.reprojection import Reprojection
 
 

@@ -11,13 +11,11 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
-from stcal.handeye.data.rig import RigPoses
-from stcal.handeye.data.views import Views
+from stcal.handeye.data.views import RigPoses, Views
 from stcal.handeye.judge import remarks
-from stcal.handeye.judge.conventions import check_conventions
+from stcal.handeye.judge.mistakes import check_conventions, repair, turned_view
 from stcal.handeye.judge.observability import LEAST_POSES, Observability, check, require_scale
 from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.judge.symmetry import repair, turned_view
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.joint import Adjusted, adjust_rig
 from stcal.handeye.methods.noise import Noise, kind
@@ -263,7 +261,7 @@ def of_places(names: tuple[str, ...], found: list[HandEye | None]) -> tuple[str,
             squared = float(difference @ np.linalg.solve(later.stand_covariance + earlier.stand_covariance, difference))
             apart[j, i] = squared > chi2.ppf(1 - BY_CHANCE, len(difference)), difference
     notes = []
-    for names_of, against, difference in _named({pair: far for pair, (far, _) in apart.items()}, len(names), apart):
+    for names_of, against, difference in _named(apart, len(names)):
         many = len(names_of) > 1
         accused, witnesses = ", ".join(names[k] for k in names_of), ", ".join(names[k] for k in against)
         where = f"{np.linalg.norm(difference[3:]):.2g} mm and {np.degrees(np.linalg.norm(difference[:3])):.2g}°"
@@ -274,18 +272,20 @@ def of_places(names: tuple[str, ...], found: list[HandEye | None]) -> tuple[str,
     return tuple(notes)
 
 
-def _named(apart: dict[tuple[int, int], bool], count: int, off: dict) -> list[tuple[list[int], list[int], np.ndarray]]:
+def _named(
+    apart: dict[tuple[int, int], tuple[bool, np.ndarray]], count: int
+) -> list[tuple[list[int], list[int], np.ndarray]]:
     """Explains contradicting pairs by few cameras: repeatedly names the camera with most contradictions.
 
     Returns per camera its number, the numbers of the cameras that it contradicts, and one difference of poses.
     """
-    unexplained, named = {pair for pair, far in apart.items() if far}, []
+    unexplained, named = {pair for pair, (far, _) in apart.items() if far}, []
     while unexplained:
         contradictions = [sum(k in pair for pair in unexplained) for k in range(count)]
         k = int(np.argmax(contradictions))
         pairs_of_camera = sorted(pair for pair in unexplained if k in pair)
         others = [pair[0] if pair[1] == k else pair[1] for pair in pairs_of_camera]
-        named.append(([k], others, off[pairs_of_camera[0]][1]))
+        named.append(([k], others, apart[pairs_of_camera[0]][1]))
         unexplained -= set(pairs_of_camera)
     return named
 
@@ -344,7 +344,7 @@ def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
                 difference = Poses.of([camera.z]).difference(Poses.of([earlier.z]))[0]
                 far = np.linalg.norm(difference[3:]) > GROSS_SHARE * max(reach[i], reach[j])
                 apart[j, i] = bool(far or np.linalg.norm(difference[:3]) > GROSS_RAD), difference
-    named = _named({pair: far for pair, (far, _) in apart.items()}, len(given.cameras), apart)
+    named = _named(apart, len(given.cameras))
     if not named:
         return
     (accused, *_), others, difference = named[0]

@@ -14,18 +14,15 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge import flips, remarks
-from stcal.handeye.judge.conventions import Guess, check_conventions
+from stcal.handeye.judge import remarks
+from stcal.handeye.judge.mistakes import Guess, check_conventions, flip_note, flipped, repair
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
-from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.arm import ArmModel
-from stcal.handeye.methods.camera_error import in_common, of_poses
-from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, solve_closed_form
-from stcal.handeye.methods.convex import convex
+from stcal.handeye.methods.bundle import ArmModel
+from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, convex, solve_closed_form
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
-from stcal.handeye.methods.joint import Adjusted, adjust_views
+from stcal.handeye.methods.joint import Adjusted, adjust_views, in_common, of_poses
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses
 from stcal.handeye.methods.reprojection import CAMERA_GAIN, resected
@@ -462,9 +459,9 @@ def _remarks(
     """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     z = closed_form.mean_pose(task.loop[~outliers].chain(x))
-    tilted = flips.flipped(task.loop, x, z, outliers)
+    tilted = flipped(task.loop, x, z, outliers)
     notes = remarks.of_still(task.pairs) + remarks.of_outliers(task.pairs.names, outliers, residuals, tilted)
-    notes += flips.note_of(task.pairs.names, tilted)
+    notes += flip_note(task.pairs.names, tilted)
     moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
     notes += moved or remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):

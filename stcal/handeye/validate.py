@@ -13,9 +13,9 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.data.views import View, Views, resect
+from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.judge.observability import check
 from stcal.handeye.judge.remarks import Aside, Grave
-from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import IN_COMMON, METHODS, HandEyeOptions, handeye, solved
@@ -265,7 +265,10 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
             [_beside(view, camera, pose) for view, pose in zip(adjusted_views, pose_by_robot, strict=True)]
         ),
         "pose_mm": np.array(
-            [_apart(view, *poses) for view, *poses in zip(adjusted_views, pose_by_robot, pose_by_view, strict=True)]
+            [
+                np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
+                for view, first, second in zip(adjusted_views, pose_by_robot, pose_by_view, strict=True)
+            ]
         ),
     }
 
@@ -371,11 +374,6 @@ def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
     return float(np.linalg.norm(camera_centre + length[:, None] * ray - view.xyz_board, axis=1).mean())
 
 
-def _apart(view: View, first: Rigid, second: Rigid) -> float:
-    """Returns the mean distance between the corners as placed by two poses."""
-    return float(np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean())
-
-
 def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
     """Returns a result with covariances by the delete-one jackknife (Quenouille 1956, Tukey 1958).
 
@@ -383,13 +381,21 @@ def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
     samples would have.
     """
     m, covariances = len(without_one), {}
-    for name, key in (("mount_from_camera", "covariance"), ("stand_from_board", "stand_covariance")):
-        poses = Poses.of([getattr(part, name) for part in without_one])
-        moved = poses.difference(Poses.of([getattr(result, name)] * m))
+    for key, moved in _differences(without_one, result).items():
         moved = moved - moved.mean(0)
         covariances[key] = (m - 1) / m * moved.T @ moved
     note = Aside(f"σ of both transforms are by the jackknife: the scatter of {result.method} without each of the poses")
     return replace(result, **covariances, notes=(*result.notes, note))
+
+
+def _differences(others: list[HandEye], result: HandEye) -> dict[str, np.ndarray]:
+    """Returns the differences (n, 6) of X and of Z of other results against ``result``, by the names of covariances."""
+    return {
+        key: Poses.of([getattr(other, name) for other in others]).difference(
+            Poses.of([getattr(result, name)] * len(others))
+        )
+        for key, name in (("covariance", "mount_from_camera"), ("stand_covariance", "stand_from_board"))
+    }
 
 
 def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, options: HandEyeOptions) -> HandEye:
@@ -404,11 +410,7 @@ def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, optio
         solved(replace(pairs, camera_from_board=seen.moved(step.copy())), setup, result.method, None, options).result
         for step in np.moveaxis(common, 2, 0)
     ]
-    covariances = {}
-    for name, key in (("mount_from_camera", "covariance"), ("stand_from_board", "stand_covariance")):
-        poses = Poses.of([getattr(part, name) for part in erring])
-        moved = poses.difference(Poses.of([getattr(result, name)] * len(erring)))
-        covariances[key] = moved.T @ moved
+    covariances = {key: moved.T @ moved for key, moved in _differences(erring, result).items()}
     return replace(
         result,
         covariance=result.covariance + covariances["covariance"],

@@ -1,5 +1,5 @@
-from .calibration.solve import CalibratedLayout as CalibratedLayout
-from .calibration.solve import calibrate as calibrate
+from .calibration import CalibratedLayout as CalibratedLayout
+from .calibration import calibrate as calibrate
 from .data.exposures import SceneFiles as SceneFiles
 from .data.exposures import capture as capture
 from .data.exposures import exposure_times as exposure_times
@@ -20,8 +20,8 @@ from .pose.patent import PatentOptions as PatentOptions
 from .pose.patent import PatentPose as PatentPose
 from .pose.verdict import Verdict as Verdict
 from .pose.verdict import VerdictOptions as VerdictOptions
-from .report.base import Goals as Goals
-from .report.base import goal_chain as goal_chain
-from .report.base import goals as goals
 from .report.chain import GoalChain as GoalChain
+from .report.chain import Goals as Goals
+from .report.chain import goal_chain as goal_chain
+from .report.chain import goals as goals
 from .report.page import poses_csv as poses_csv

@@ -17,11 +17,9 @@ from stcal.io.cameras.read import camera_model
 from stcal.io.images import decode, grey_8bit, grey_of, size_fault
 from stcal.locate.data.exposures import SceneFiles, SceneTags, detect, read_scenes
 from stcal.locate.data.layout import TargetLayout
-from stcal.locate.pose.estimate import ObjPose, locate
-from stcal.locate.pose.merge import Merged, Shift, merge
-from stcal.locate.pose.misread import likely_mistake
+from stcal.locate.pose.estimate import Merged, ObjPose, Shift, locate, merge
 from stcal.locate.pose.patent import PatentOptions, PatentPose, locate_as_patent
-from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge
+from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge, likely_mistake
 
 Method = Literal["joint", "patent"]
 MOVED_SIGMAS = 5.0

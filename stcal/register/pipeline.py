@@ -11,7 +11,6 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
-from stcal.register.core.covariance import covariance_of, shifted_too, sigma_within
 from stcal.register.core.liu2017 import Liu2017Options, liu2017
 from stcal.register.core.models import MODELS, parts, squares
 from stcal.register.core.pairs import Problem, noise_of
@@ -19,17 +18,19 @@ from stcal.register.core.result import Alternative, Registration, held_out
 from stcal.register.core.robust import (
     AS_GOOD,
     BY_CHANCE,
+    LEAST_SHARE,
     Fitted,
     alternative_fit,
     chance,
+    covariance_of,
     robust_fit,
     settled,
+    shifted_too,
+    sigma_within,
     turn_between,
 )
-from stcal.register.core.search import LEAST_SHARE
-from stcal.register.judge.degeneracy import by_chance, check_extent, check_supports, row_name
-from stcal.register.judge.groups import Shifted, shifted_rows, two_groups
 from stcal.register.judge.mistakes import (
+    Shifted,
     Wider,
     check_mirrored,
     check_units,
@@ -37,9 +38,11 @@ from stcal.register.judge.mistakes import (
     mirrored_ratio,
     moved_meanwhile,
     order_note,
+    shifted_rows,
+    two_groups,
     wider,
 )
-from stcal.register.judge.notes import Subject, notes_of
+from stcal.register.judge.notes import Subject, by_chance, check_extent, check_supports, notes_of, row_name
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9

@@ -16,10 +16,10 @@ from .kinematics.measurements import read_measurements as read_measurements
 from .kinematics.model import DHRow as DHRow
 from .kinematics.model import Joint as Joint
 from .kinematics.model import Robot as Robot
-from .urdf.read import UrdfRobot as UrdfRobot
-from .urdf.read import load_urdf as load_urdf
-from .urdf.universal import load_universal as load_universal
-from .urdf.write import robot_urdf as robot_urdf
+from .universal import load_universal as load_universal
+from .urdf import UrdfRobot as UrdfRobot
+from .urdf import load_urdf as load_urdf
+from .urdf import robot_urdf as robot_urdf
 from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
 from .use.compensation import compensated_csv as compensated_csv

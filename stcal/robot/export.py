@@ -24,11 +24,13 @@ from stcal.io.poses.controllers import (
     KUKA,
     MM_DIGITS,
     NUMBER,
+    REMARK,
     UNIT_DIGITS,
     UR,
     YASKAWA,
     YASKAWA_MM_DIGITS,
     PoseText,
+    require_form,
 )
 from stcal.io.table import read_table
 from stcal.robot.identification.prior import dh_values
@@ -38,8 +40,6 @@ from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated
 from stcal.robot.use.targets import poses_of
 
-REMARK = 32
-"""Largest number of characters of a remark, in a FANUC program and in a JBI file."""
 NOTHING = "9E9,9E9,9E9,9E9,9E9,9E9"
 """Values of ABB's external axes that do not exist."""
 QUARTER_DEG = 90.0
@@ -128,15 +128,11 @@ def _abb(points: Points, head: Sequence[str]) -> str:
             six = joined(np.pad(joints, (0, 6 - len(joints))), DEG_DIGITS)
             frame = f"jointtarget p{i + 1}:=[[{six}],[{NOTHING}]]"
         else:
-            quarters = ",".join(str(int(v)) for v in np.floor(_of_six(joints, (0, 3, 5)) / QUARTER_DEG))
+            all_six = np.pad(joints, (0, max(0, 6 - len(joints))))  # 0 for joints that an arm does not have
+            quarters = ",".join(str(int(v)) for v in np.floor(all_six[[0, 3, 5]] / QUARTER_DEG))
             frame = f"robtarget p{i + 1}:=[{ABB.write(points.poses[i])},[{quarters},0],[{NOTHING}]]"
         lines += [f"  ! {label}", f"  CONST {frame};"]
     return "\n".join([*lines, "ENDMODULE"]) + "\n"
-
-
-def _of_six(joints: np.ndarray, which: tuple[int, ...]) -> np.ndarray:
-    """Returns the values of some joints; 0 for joints that an arm does not have."""
-    return np.pad(joints, (0, max(0, 6 - len(joints))))[list(which)]
 
 
 def _abb_values(points: Points) -> tuple[np.ndarray, float]:
@@ -323,15 +319,6 @@ class Exported:
     notes: tuple[str, ...]
 
 
-def require_form(form: str) -> None:
-    """Refuses an unknown form.
-
-    Raises InputError: the form is unknown; the message names the known ones.
-    """
-    if form not in FORMS:
-        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
-
-
 @require_arguments
 def robot_program(
     result: Compensated,
@@ -371,7 +358,7 @@ def robot_program(
     StcalError
         The file does not give the points back.
     """
-    require_form(form)
+    require_form(form, FORMS)
     path = Path(path)
     where, controller = f"--export {form}={path}", FORMS[form]
     rows = np.flatnonzero(result.found.usable)

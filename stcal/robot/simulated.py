@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.residuals import State, tips
+from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import chain_parameters, moved_chain

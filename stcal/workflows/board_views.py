@@ -45,7 +45,7 @@ from stcal.io.images import (
     size_fault,
 )
 from stcal.labels import DotLabel
-from stcal.locate.calibration.solve import CalibrationImages
+from stcal.locate.calibration import CalibrationImages
 from stcal.parallel import Progress
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
@@ -130,7 +130,12 @@ def _placed(view: BoardView, own: str, common_from_board: Rigid, first: int) -> 
 
 def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> BoardView:
     """Returns the views of several boards as one view."""
-    covariances = [_covariance_px2(view) for view in views]
+    # A board whose detector states no covariances gets the default, since the other boards have theirs.
+    default_px2 = CORNER_SIGMA_PX**2 * np.eye(2)
+    covariances = [
+        np.tile(default_px2, (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
+        for view in views
+    ]
     return BoardView(
         name,
         np.concatenate([view.ids for view in views]),
@@ -142,20 +147,13 @@ def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> Bo
     )
 
 
-def _covariance_px2(view: BoardView) -> np.ndarray:
-    """Returns the covariances of a view. A board whose detector states none gets the default, since the other boards
-    have theirs."""
-    if view.covariance_px2 is not None:
-        return view.covariance_px2
-    return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
-
-
 def _find_flat(
     image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
 ) -> tuple[BoardView | None, str]:
     """Returns the view of a single board, or the reason why there is none."""
     if isinstance(board, BoardDesign):
-        return _find_dots(image, name, camera, board)
+        place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
+        return _find_circles(image, name, camera, board, board, place)
     if isinstance(board, AsymmetricCirclesDesign):
         return _find_asymmetric(image, name, camera, board)
     if isinstance(board, ChessboardDesign):
@@ -192,11 +190,6 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
         f"{few}, but {len(ids)} of its tags, as on a board of rows = {fits.rows}, columns = {fits.columns}{legacy}; "
         "correct its file"
     )
-
-
-def _find_dots(image: np.ndarray, name: str, camera: Camera, board: BoardDesign) -> tuple[BoardView | None, str]:
-    place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
-    return _find_circles(image, name, camera, board, board, place)
 
 
 def _find_asymmetric(

@@ -222,35 +222,27 @@ TAKEN = ("rig", "camchain")
 """Names that a camera must not have, as its files would overwrite other files."""
 
 
-@dataclass(frozen=True, slots=True)
-class Models:
-    """Lens models: ``own`` by camera, ``common`` for the other cameras."""
+def models_of(given: Sequence[str], default: str) -> tuple[dict[str, str], str]:
+    """Returns the lens models by camera, and the one of all other cameras, from words NAME=MODEL and one word MODEL.
 
-    own: Mapping[str, str]
-    common: str
-
-    @classmethod
-    def of(cls, given: Sequence[str], default: str) -> "Models":
-        """Returns the models from words NAME=MODEL, and one word MODEL.
-
-        Raises InputError: two models for one camera, or two words MODEL.
-        """
-        model_of: dict[str, str] = {}
-        common = [word for word in given if "=" not in word]
-        for word in given:
-            name, separator, model = word.rpartition("=")
-            if separator and name in model_of:
-                raise InputError(
-                    "E-OPTION-REPEATED", f"--model {word}: {name} has {model_of[name]} already; one for each camera"
-                )
-            if separator:
-                model_of[name] = model
-        if len(common) > 1:
+    Raises InputError: two models for one camera, or two words MODEL.
+    """
+    model_of: dict[str, str] = {}
+    common = [word for word in given if "=" not in word]
+    for word in given:
+        name, separator, model = word.rpartition("=")
+        if separator and name in model_of:
             raise InputError(
-                "E-OPTION-CONFLICT",
-                f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each",
+                "E-OPTION-REPEATED", f"--model {word}: {name} has {model_of[name]} already; one for each camera"
             )
-        return cls(model_of, common[0] if common else default)
+        if separator:
+            model_of[name] = model
+    if len(common) > 1:
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each",
+        )
+    return model_of, common[0] if common else default
 
 
 @require_arguments

@@ -31,7 +31,7 @@ from stcal.report.text import number
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.report import axes_file, axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
-from stcal.robot.identification.predicted import predicted_at
+from stcal.robot.identification.observability import predicted_at
 from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.result import Identified, IdentifyOptions, require_identified_written
 from stcal.robot.identification.solve import identify

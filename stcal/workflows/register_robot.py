@@ -23,7 +23,7 @@ from stcal.register.report.page import matrix_table
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
 from stcal.report.text import number
-from stcal.robot.identification.residuals import State, tips
+from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import read_conditions

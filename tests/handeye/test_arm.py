@@ -14,7 +14,7 @@ from stcal.handeye.data.pairs import SETUPS
 from stcal.handeye.solve import handeye
 from stcal.robot import forward, load_robot
 from stcal.robot.kinematics.file import save_robot
-from stcal.workflows.handeye.arm import Arm
+from stcal.workflows.handeye.robot_at_images import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
 from tests.outcome import ended, fails_with

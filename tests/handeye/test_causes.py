@@ -12,9 +12,8 @@ from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.report.outcome import judged
 from stcal.handeye.solve import handeye
-from stcal.workflows.handeye.calibrate import Splits, calibrate
+from stcal.workflows.handeye.calibrate import Splits, calibrate, lag_tried
 from stcal.workflows.handeye.inputs import HandEyeInput
-from stcal.workflows.handeye.offset import lag_tried
 from tests.outcome import fails_with
 from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, simulated
 from tests.support.handeye_stream import simulated_stream

@@ -14,9 +14,9 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import View, Views, pairs_of_views
+from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import of_size
-from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.solve import handeye
 from stcal.io.quaternions import INVERTED

@@ -9,8 +9,8 @@ import pytest
 import stcal
 from stcal import workflows
 from stcal.cli.main import main
+from stcal.handeye.plan import planned_file
 from stcal.handeye.report.file import HandEyeFile
-from stcal.handeye.report.planned import planned_file
 from stcal.io.files import json_text
 from stcal.io.table import POSE, pose_cells
 from tests.handeye.test_plan_cli import NOISE, poses_file

@@ -10,7 +10,7 @@ from stcal.io.design import load_target, target_toml
 from stcal.locate.data.layout import TargetLayout, layout_toml, load_layout, square
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.robot.urdf.read import load_urdf
+from stcal.robot.urdf import load_urdf
 from tests.outcome import fails_with
 
 TAGS = 'type = "tags"\n' + "".join(

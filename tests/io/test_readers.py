@@ -18,16 +18,16 @@ from stcal.boards.target import load_body
 from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, require_own
-from stcal.handeye.data.rig import read_rig_file
 from stcal.handeye.data.robot_poses import read_robot_poses
+from stcal.handeye.data.views import read_rig_file
 from stcal.io.design import load_target
 from stcal.io.files import text_of
 from stcal.io.poses.columns import read_mapped
 from stcal.io.table import read_table
 from stcal.locate.data.layout import load_plan
 from stcal.robot.kinematics.file import load_robot, robot_toml
-from stcal.robot.urdf.read import load_urdf
-from stcal.robot.urdf.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
+from stcal.robot.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
+from stcal.robot.urdf import load_urdf
 from stcal.sfm.budget.sources import StatedSize, statement_of
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))

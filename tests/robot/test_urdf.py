@@ -12,8 +12,7 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors
-from stcal.robot.urdf.read import load_urdf
-from stcal.robot.urdf.write import require_urdf_written, robot_urdf
+from stcal.robot.urdf import load_urdf, require_urdf_written, robot_urdf
 from tests.outcome import fails_with
 from tests.support.arms import two_arms
 

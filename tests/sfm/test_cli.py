@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import stcal
-from stcal.cli.main import main, main_sfm
+from stcal.cli.main import LIBRARIES, main, main_sfm
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
-from stcal.workflows import versions
 from tests.outcome import ended
 
 
@@ -257,7 +256,7 @@ def test_versions_for_reports_of_faults(command, monkeypatch):
     assert found["NumPy"] == np.__version__
     assert found["pycolmap"].startswith("4.2")
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setitem(versions.LIBRARIES, "OpenCV", "no_such_module")
+    monkeypatch.setitem(LIBRARIES, "OpenCV", "no_such_module")
     again = command("--versions")[1]
     assert "native colmap  not found" in again
     assert "OpenCV         does not load: No module named 'no_such_module'" in again

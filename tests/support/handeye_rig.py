@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import Setup
-from stcal.handeye.data.rig import RigCamera, RigPoses
-from stcal.handeye.data.views import View, Views
+from stcal.handeye.data.views import RigCamera, RigPoses, View, Views
 from stcal.io.cameras.model import CameraPrior
 from tests.support.handeye import CAMERA, board_corners, disturbed, simulated
 

@@ -11,10 +11,9 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, refine_planar_pose
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration.solve import CalibratedLayout, CalibrationImages, calibrate
+from stcal.locate.calibration import CalibratedLayout, CalibrationImages, calibrate
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
-from stcal.locate.pose.estimate import SeenTags, locate
-from stcal.locate.pose.merge import merge
+from stcal.locate.pose.estimate import SeenTags, locate, merge
 from stcal.locate.pose.patent import PatentOptions, locate_as_patent
 from stcal.locate.pose.verdict import Decision, VerdictOptions, judge
 

@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.sfm import budget, camera, capture, colmap, make, measure, run, simulate
+from stcal.cli.sfm import camera, capture, colmap, designs, measure, run
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -11,5 +11,5 @@ app = typer.Typer(
     cls=Commands,
     **PLAIN,
 )
-for part in (run, simulate, make, colmap, capture, camera, measure, budget):
+for part in (run, designs, colmap, capture, camera, measure):
     app.add_typer(part.app)

@@ -5,8 +5,18 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, designs_told, require_new, require_passed
+from stcal.cli.options import (
+    WRITES,
+    Arg,
+    Opt,
+    ReportFile,
+    Strict,
+    TargetFile,
+    Workers,
+    designs_told,
+    require_new,
+    require_passed,
+)
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
@@ -59,23 +69,23 @@ def calibrate_camera(
     from stcal.boards.file import load_flat_board
     from stcal.design import BoardDesign
     from stcal.io.design import board_of, target_of
-    from stcal.workflows.calibrate_camera import Models
+    from stcal.workflows.calibrate_camera import models_of
 
-    models = Models.of(model or [], "OPENCV")
+    models, common_model = models_of(model or [], "OPENCV")
     target_design = target_of(target)
     board_design = board_of(None) if board is None else load_flat_board(board)
     dots = isinstance(board_design, BoardDesign)
     common = (json_file, report, workers)
     with designs_told(target, board, with_target=dots):
         if rig:
-            failed = _rig(images, out or Path("rig"), target_design, board_design, models, *common)
-        elif models.own:
+            failed = _rig(images, out or Path("rig"), target_design, board_design, common_model, models, *common)
+        elif models:
             raise InputError(
                 "E-OPTION-NEEDS",
-                f"--model {next(iter(models.own))}=…: names a camera of a rig; give --rig, or a model alone",
+                f"--model {next(iter(models))}=…: names a camera of a rig; give --rig, or a model alone",
             )
         else:
-            failed = _one(images, out or Path("cameras.txt"), target_design, board_design, models.common, *common)
+            failed = _one(images, out or Path("cameras.txt"), target_design, board_design, common_model, *common)
     require_passed(strict, failed, report)
 
 
@@ -108,7 +118,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
     return ["split-half check"] if result.split is not None and result.split.verdict == "failed" else []
 
 
-def _rig(images: Path, out: Path, target, board, models, json_file, report, workers) -> list[str]:
+def _rig(images: Path, out: Path, target, board, common, models, json_file, report, workers) -> list[str]:
     """Calibrates the cameras of a rig, and returns the failed checks."""
     from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
@@ -117,7 +127,7 @@ def _rig(images: Path, out: Path, target, board, models, json_file, report, work
 
     require_new_folder(out, images)
     with StageProgress() as progress:
-        calibration = calibrate_rig(images, target, board, models.common, models.own, workers, progress)
+        calibration = calibrate_rig(images, target, board, common, models, workers, progress)
     files, missing = files_of(calibration)
     save_folder(out, files)
     require_rig_written(out, files, calibration)

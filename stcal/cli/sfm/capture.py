@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import Arg, Opt
+from stcal.cli.options import Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 
@@ -186,15 +186,13 @@ def capture(
     group: Annotated[str, "Name the group like this; only the camera may move between its photographs."],
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    device: Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."] = "0",
+    device: shared.Device = "0",
     exposure: Annotated[
         float | None,
         "Set this exposure, in the driver's unit; if not given, the camera chooses it.",
         Opt(min=1e-9, max=1e9),
     ] = None,
-    gain: Annotated[
-        float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
-    ] = None,
+    gain: shared.Gain = None,
     settle: Annotated[
         float, "Give the camera this time before each photograph, s.", Opt("--settle-s", min=0, max=60)
     ] = 0.3,
@@ -218,9 +216,8 @@ def capture(
     shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
     from stcal.sfm.runs.options import RunOptions
-    from stcal.workflows.growing import GrowingRun, WatchOptions
-    from stcal.workflows.photographs import Trigger
-    from stcal.workflows.photographs import capture as captured
+    from stcal.workflows.growing import GrowingRun, Trigger, WatchOptions
+    from stcal.workflows.growing import capture as captured
 
     run_options = RunOptions(
         refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers

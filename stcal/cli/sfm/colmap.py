@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import JsonFile, Run, Workers
+from stcal.cli.options import WRITES, Arg, JsonFile, Opt, Run, Workers
 from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError, MappingError
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Arg, Opt
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, verbose, write, write_if, write_out
 from stcal.errors import InputError
 

@@ -141,7 +141,7 @@ def read_two(
         return None
     sides = []
     for role, path, content, own in zip(FRAMES, (first, second), contents, keys, strict=True):
-        content_of_side = content or own_table(path, statements, own, quaternions)
+        content_of_side = content or _of_table(read_table(path, "table", quaternions), statements, own)
         sides.append(settled(_side(content_of_side, role, path), role, content_of_side, path, statements))
     robot, camera = sides
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
@@ -210,12 +210,8 @@ def require_own(path: Path, quaternions: Order = "wxyz") -> None:
         raise _no_poses(table)
 
 
-def own_table(path: Path, statements: Said, key: str, quaternions: Order) -> Content:
-    """Returns the poses of one of the package's own tables, of one side."""
-    return _of_table(read_table(path, "table", quaternions), statements, key)
-
-
 def _of_table(table: Table, statements: Said, key: str) -> Content:
+    """Returns the poses of one side in a table: a mapped one, or one of the package's own."""
     content = read_columns(table, key, statements)
     if content is None:
         raise _no_poses(table)

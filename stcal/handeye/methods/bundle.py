@@ -1,9 +1,10 @@
-"""Unknowns and residuals of a hand-eye adjustment with one camera or with several."""
+"""Unknowns and residuals of a hand-eye adjustment with one camera or several, and of an arm that is adjusted too."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,8 +14,81 @@ from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
 from stcal.handeye.data.views import project_jacobian
-from stcal.handeye.methods.arm import LinearArm
 from stcal.handeye.methods.equations import Equations, Part
+
+SETTLED_MM = 1e-3
+"""Largest motion of a flange in a round of linear steps, in mm, after which only squares of the motion are
+neglected."""
+ARM_ROUNDS = 10
+PARTS = ("arm_rad", "arm_mm")
+"""Groups of σ of the parameters about the arm's file: directions of axes, and places of axes."""
+
+
+@runtime_checkable
+class ArmModel(Protocol):
+    """An arm with k parameters and m joint vectors. The parameters are small motions of the axes, 0 where the arm is as
+    its file says."""
+
+    @property
+    def angles(self) -> np.ndarray:
+        """Boolean array (k,): True for parameters in rad, False for those in mm."""
+        ...
+
+    def poses(self, parameters: np.ndarray) -> Poses:
+        """Returns base_from_flange, m poses."""
+        ...
+
+    def slope(self, parameters: np.ndarray) -> np.ndarray:
+        """Returns the derivative (m, 6, k) of :meth:`poses`, left perturbation, by a small further motion of the axes
+        about their places at ``parameters``."""
+        ...
+
+    def __getitem__(self, rows: Any) -> "ArmModel":
+        """Returns the arm with these joint vectors alone."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearArm:
+    """An arm linearised about ``parameters`` (k,). ``slope`` : (m, 6, k) derivative of the flange's poses by the
+    parameters; ``angles`` : (k,)."""
+
+    parameters: np.ndarray
+    slope: np.ndarray
+    angles: np.ndarray
+
+    @classmethod
+    def about(cls, arm: ArmModel, parameters: np.ndarray) -> "LinearArm":
+        """Returns the linearisation of a model."""
+        return cls(parameters, arm.slope(parameters), arm.angles)
+
+    def __getitem__(self, rows) -> "LinearArm":
+        """Returns the linearisation with these poses alone."""
+        return LinearArm(self.parameters, self.slope[rows], self.angles)
+
+    def moved(self, base_from_flange: Poses, step: np.ndarray) -> Poses:
+        """Returns the poses (m) of the flange after a step (k,) from the parameters."""
+        motion = self.slope @ step
+        turn = Rotation.from_rotvec(motion[:, :3]).as_matrix()
+        return Poses(turn @ base_from_flange.rotation, base_from_flange.translation + motion[:, 3:])
+
+    def slope_after(self, step: np.ndarray) -> np.ndarray:
+        """Returns the derivative (m, 6, k) of :meth:`moved`, left perturbation. It depends on the step, since rotation
+        vectors do not add."""
+        turn = np.einsum("mak,k->ma", self.slope[:, :3], step)
+        cross = skew(turn)
+        to_left = np.eye(3) + cross / 2 + cross @ cross / 6  # series for rotations of some mrad
+        return np.concatenate([to_left @ self.slope[:, :3], self.slope[:, 3:]], axis=1)
+
+    def parts(self) -> dict[str, np.ndarray]:
+        """Returns the rows of the parameters in each of :data:`PARTS` that has any."""
+        rows_of_part = dict(zip(PARTS, (np.flatnonzero(self.angles), np.flatnonzero(~self.angles)), strict=True))
+        return {name: rows for name, rows in rows_of_part.items() if len(rows)}
+
+    def moves_mm(self, step: np.ndarray) -> float:
+        """Returns the largest motion of a flange by the step (k,), in mm."""
+        return float(np.linalg.norm(self.slope[:, 3:] @ step, axis=1).max())
+
 
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand has a weight below one."""
@@ -79,10 +153,6 @@ class Corners:
     def camera_parts(self) -> list[tuple[str, np.ndarray]]:
         """Returns :func:`camera_parts` of the intrinsics solved for."""
         return camera_parts(self.basis, self.information)
-
-    def no_step(self) -> np.ndarray:
-        """Returns zeros (k,) for the arm's parameters."""
-        return np.zeros(0 if self.arm is None else len(self.arm.parameters))
 
     def by_arm(self, step: np.ndarray) -> Poses:
         """Returns base_from_flange after a step (k,) of the arm's parameters; as reported without an arm."""
@@ -162,10 +232,6 @@ class Corners:
             robot=None if self.robot is None else self.robot[keep],
             arm=None if self.arm is None else self.arm[keep],
         )
-
-    def with_sigma(self, sigma: dict[str, float]) -> "Corners":
-        """Returns the same problem with other σ."""
-        return replace(self, sigma=sigma)
 
     def with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> "Corners":
         """Returns the same problem with intrinsics among the unknowns, about ``camera``. The factors of their prior σ
@@ -408,12 +474,8 @@ class RigCorners:
         """Returns the same problem with other σ."""
         problems = []
         for name, corners in zip(self.names, self.each, strict=True):
-            problems.append(corners.with_sigma({key: sigma[_renamed(key, name)] for key in corners.sigma}))
+            problems.append(replace(corners, sigma={key: sigma[_renamed(key, name)] for key in corners.sigma}))
         return replace(self, each=tuple(problems))
-
-    def with_board_scale(self) -> "RigCorners":
-        """Returns the same problem with the board's scale among the unknowns."""
-        return replace(self, each=tuple(replace(own, with_scale=True) for own in self.each))
 
     def with_intrinsics(self, known: dict[int, tuple[np.ndarray, np.ndarray]]) -> "RigCorners":
         """Returns the same problem with intrinsics of some cameras among the unknowns: basis and information, by number

@@ -11,8 +11,7 @@ from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, resect
-from stcal.handeye.methods.arm import LinearArm
-from stcal.handeye.methods.bundle import Bundle, Corners
+from stcal.handeye.methods.bundle import Bundle, Corners, LinearArm
 from stcal.handeye.methods.noise import LEAST_SIGMA, Noise
 from stcal.io.cameras.model import CameraPrior
 

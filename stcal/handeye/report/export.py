@@ -18,7 +18,7 @@ from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.result import HandEye
 from stcal.io.plain_yaml import load_yaml, opencv_matrix
 from stcal.io.poses.columns import program_name
-from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
+from stcal.io.poses.controllers import ABB, FANUC, KUKA, REMARK, UR, require_form
 from stcal.io.poses.static import (
     Static,
     fixed_joint,
@@ -119,15 +119,6 @@ def zivid_yaml(result: HandEye) -> str:
         "FloatMatrix": {"Data": result.mount_from_camera.matrix().tolist()},
     }
     return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
-
-
-def read_zivid(text: str) -> Rigid:
-    """Returns the transform in a file of :func:`zivid_yaml`, mm."""
-    return Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"])
-
-
-REMARK = 32
-"""Largest number of characters of a remark in a FANUC program."""
 
 
 def kuka_dat(result: HandEye, name: str) -> str:
@@ -299,22 +290,16 @@ ROS_FORMS = {
 }
 """Formats that hold names of frames, and the camera's link on demand."""
 FORMS = ROS_FORMS | {
-    "zivid": Form(lambda result, *_: zivid_yaml(result), read_zivid),
+    "zivid": Form(
+        lambda result, *_: zivid_yaml(result),
+        lambda text: Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"]),
+    ),
     "kuka": Form(lambda result, _, name: kuka_dat(result, program_name(name)), KUKA.first),
     "abb": Form(lambda result, _, name: abb_module(result, program_name(name)), ABB.first),
     "ur": Form(lambda result, *_: ur_script(result), UR.first),
     "fanuc": Form(lambda result, _, name: fanuc_program(result, program_name(name)), FANUC.first),
 }
 """All formats, by the word of ``--export``."""
-
-
-def require_form(form: str) -> None:
-    """Checks the name of a format.
-
-    Raises InputError: the format is unknown; the message lists all formats.
-    """
-    if form not in FORMS:
-        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
 
 
 def exported(
@@ -333,7 +318,7 @@ def exported(
 
     Raises InputError: the format is unknown, or cannot hold the name of a frame.
     """
-    require_form(form)
+    require_form(form, FORMS)
     transforms = tree(result, parent, child, camera_frame)
     text = FORMS[form].write(result, transforms, name)
     read_back = FORMS[form].read(text)

@@ -11,7 +11,7 @@ from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.judge.verdict import Verdict, Word
+from stcal.handeye.judge.remarks import Verdict, Word
 from stcal.handeye.methods.noise import kind
 from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, judged, rig_judged
 from stcal.handeye.result import HandEye

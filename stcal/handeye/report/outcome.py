@@ -11,10 +11,9 @@ from stcal.geometry.rigid import skew
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge.flips import flipped
+from stcal.handeye.judge.mistakes import flipped
 from stcal.handeye.judge.observability import COMMON_MM, in_words
-from stcal.handeye.judge.remarks import MANY, Aside, Grave, spoken
-from stcal.handeye.judge.verdict import BAD, CARE, GOOD, Finding, Verdict, Word
+from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, Verdict, Word, spoken
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig import Rig, RigHeldOut
 from stcal.handeye.time_offset import TimeOffset

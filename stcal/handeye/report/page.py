@@ -9,8 +9,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.judge.remarks import Aside, spoken
-from stcal.handeye.judge.verdict import Verdict
+from stcal.handeye.judge.remarks import Aside, Verdict, spoken
 from stcal.handeye.report.figures import (
     BAD,
     GOOD,

@@ -1,12 +1,13 @@
 """Poses in the form of robot controllers, written and read: KUKA, ABB, Universal Robots, FANUC, Yaskawa."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.poses.columns import fixed, joined, without_comments
 
@@ -16,6 +17,8 @@ MM_DIGITS, DEG_DIGITS, UNIT_DIGITS = 6, 9, 12
 """Digits of printed mm (to a nanometre), of degrees, and of quaternions, radians and metres."""
 YASKAWA_MM_DIGITS, YASKAWA_DEG_DIGITS = 3, 4
 """Digits of the fields of a JBI file."""
+REMARK = 32
+"""Largest number of characters of a remark, in a FANUC program and in a JBI file."""
 NUMBER = r"(-?\d+\.\d+)"
 
 
@@ -118,3 +121,12 @@ FANUC = PoseText(_fanuc, re.compile(r",\s+".join(rf"{axis} = {NUMBER} +(?:mm|deg
 """Form of FANUC: mm, and degrees W, P, R about the fixed X, Y, Z in this order: Rz(R) Ry(P) Rx(W)."""
 YASKAWA = PoseText(_yaskawa, re.compile(rf"^C\d+={','.join([NUMBER] * 6)}$", re.MULTILINE), _of_angles)
 """Form of Yaskawa: mm, and degrees Rx, Ry, Rz as FANUC's W, P, R; one C line of a JBI file."""
+
+
+def require_form(form: str, forms: Collection[str]) -> None:
+    """Refuses a form of ``--export`` that is not one of ``forms``.
+
+    Raises InputError: the form is unknown; the message names the known ones.
+    """
+    if form not in forms:
+        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(forms)} needed")

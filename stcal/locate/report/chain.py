@@ -1,4 +1,5 @@
-"""Chain base_from_goal = base_from_flange · flange_from_camera · camera_from_goal, and its plausibility."""
+"""Chain base_from_goal = base_from_flange · flange_from_camera · camera_from_goal, its plausibility, and the poses that
+``locate run`` gives in the base beside camera_from_obj."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -9,13 +10,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.join import table_of
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
 from stcal.io.quaternions import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS
+from stcal.locate.pipeline import Located
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
 ROBOT = "base_from_flange_"
@@ -136,44 +138,6 @@ class GoalChain(Brief):
                 "E-ROBOT-POSES-SCENE",
                 f"{self.poses_source}: none of scene {missing[0]}; add a row, or remove the scene",
             )
-
-
-def read_chain(
-    hand_eye: HandEyeResult | Rigid | str | Path,
-    robot_poses: Mapping[str, Rigid] | str | Path | None,
-    offset: Rigid | str | Path | None = None,
-    quaternions: Order = "wxyz",
-    key: str = "scene",
-    columns: str | Path | None = None,
-) -> GoalChain:
-    """Reads the hand-eye transform, the robot's poses by scene, and the offset, as far as they are given as files.
-
-    ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
-    ``key`` : column of the robot's poses that names the scenes; ``columns`` : map of their columns.
-
-    Raises InputError: a file does not follow ``data_layout.md``, or robot poses are missing, or are given for a fixed
-    camera.
-    """
-    name, mount = _mounted(hand_eye, robot_poses)
-    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
-    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
-    moving = name == MOVING
-    if moving and robot_poses is None:
-        raise InputError(
-            "E-OPTION-MISSING",
-            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
-        )
-    if not moving and robot_poses is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
-        )
-    if robot_poses is None:
-        return GoalChain(mount, moving, {}, _offset(offset), source)
-    if isinstance(robot_poses, str | Path):
-        flange = read_robot_poses(robot_poses, quaternions, key, columns)
-        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
-    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
-    return GoalChain(mount, moving, exact, _offset(offset), source)
 
 
 def _mounted(
@@ -337,3 +301,169 @@ def _varies(found: Poses) -> tuple[float, float]:
     rad = (turns.mean().inv() * turns).magnitude()
     mm = np.linalg.norm(found.translation - found.translation.mean(axis=0), axis=1)
     return float(np.sqrt((mm**2).mean())), float(np.sqrt((rad**2).mean()))
+
+
+def camera_from_obj(located: Located) -> Rigid | None:
+    """Returns camera_from_obj by the method that was asked for, or None."""
+    if located.patent is not None:
+        return located.patent.camera_from_obj
+    return None if located.pose is None else located.pose.camera_from_obj
+
+
+def uncertain(located: Located) -> UncertainRigid:
+    """Returns camera_from_obj with its covariance, which is zero for the patent's method."""
+    if located.pose is None:
+        pose = camera_from_obj(located)
+        if pose is None:
+            raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
+        return UncertainRigid.exact(pose)
+    return UncertainRigid(located.pose.camera_from_obj, located.pose.covariance)
+
+
+def accepted(results: Sequence[Located]) -> list[Located]:
+    """Returns the results whose pose may be used."""
+    return [each for each in results if each.verdict.decision == "accept"]
+
+
+@require_arguments
+def goal_chain(
+    hand_eye: HandEyeResult | Rigid | str | Path | None = None,
+    registration: RegistrationResult | str | Path | None = None,
+    *,
+    robot_poses: Mapping[str, Rigid] | str | Path | None = None,
+    offset: Rigid | str | Path | None = None,
+    key: str = "scene",
+    columns: str | Path | None = None,
+    quaternions: Order = "wxyz",
+) -> GoalChain:
+    """Returns the chain base_from_goal = base_from_flange · flange_from_camera · camera_from_obj · obj_from_goal.
+
+    For a fixed camera, base_from_camera stands in place of the first two.
+
+    Parameters
+    ----------
+    hand_eye : HandEye, Rigid, str or Path, optional
+        Result of :func:`stcal.handeye.handeye`, or its file; or an exact transform, mm: flange_from_camera with
+        ``robot_poses``, base_from_camera without.
+    registration : Registration, str or Path, optional
+        Result of :func:`stcal.register.register`, or its file, in place of ``hand_eye``. It must be rigid; a is the
+        frame of a fixed camera, b the robot's base.
+    robot_poses : dict of Rigid, str or Path, optional
+        base_from_flange of each scene by its name, mm, exact; or a table of them (CSV), whose covariances are used.
+        Needed for a camera on the flange only.
+    offset : Rigid, str or Path, optional
+        obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
+    key : str
+        Column of the table that names the scenes.
+    columns : str or Path, optional
+        File with the columns, delimiter … of the table (TOML).
+    quaternions : {"wxyz", "xyzw"}
+        Order of the table's quaternions: by the names of their columns, or x, y, z, w in the order of the columns.
+
+    Returns
+    -------
+    GoalChain
+        For :func:`~stcal.locate.goals` and :func:`~stcal.locate.poses_csv`.
+
+    Raises
+    ------
+    InputError
+        Neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not needed, the
+        registration is not rigid, or a file does not follow ``data_layout.md``.
+    """
+    if hand_eye is not None and registration is not None:
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"--hand-eye {_named(hand_eye)}, --registration {_named(registration)}: both lead to the base; give one",
+        )
+    if hand_eye is None and robot_poses is not None:
+        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
+    if registration is not None:
+        return read_registered(registration, offset)
+    if hand_eye is None and offset is not None:
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
+        )
+    if hand_eye is None:
+        raise InputError(
+            "E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base"
+        )
+    name, mount = _mounted(hand_eye, robot_poses)
+    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
+    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
+    moving = name == MOVING
+    if moving and robot_poses is None:
+        raise InputError(
+            "E-OPTION-MISSING",
+            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
+        )
+    if not moving and robot_poses is not None:
+        raise InputError(
+            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
+        )
+    if robot_poses is None:
+        return GoalChain(mount, moving, {}, _offset(offset), source)
+    if isinstance(robot_poses, str | Path):
+        flange = read_robot_poses(robot_poses, quaternions, key, columns)
+        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
+    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
+    return GoalChain(mount, moving, exact, _offset(offset), source)
+
+
+def _named(given: object) -> str:
+    return str(given) if isinstance(given, str | Path) else type(given).__name__
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Goals(Brief):
+    """Goals of the accepted scenes in the robot's base.
+
+    Parameters
+    ----------
+    base_from_goal : dict of Rigid
+        Pose by scene, mm.
+    covariance : dict of (6, 6) array
+        Covariance of each, of rotation (rad) and translation (mm), left perturbation in the base. It holds the errors
+        of all links of the chain; the patent's method states none of its own.
+    notes : tuple of str
+        Doubts about the robot's poses or the transform to it.
+    """
+
+    base_from_goal: dict[str, Rigid]
+    covariance: dict[str, np.ndarray]
+    notes: tuple[str, ...] = ()
+
+
+@require_arguments
+def goals(results: Sequence[Located], chain: GoalChain) -> Goals:
+    """Returns where the robot has to go: the goal's pose in the robot's base, of each accepted scene.
+
+    Parameters
+    ----------
+    results : sequence of Located
+        Results of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's poses are
+        found.
+    chain : GoalChain
+        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`.
+
+    Returns
+    -------
+    Goals
+        Of accepted poses only, so that no robot moves to a rejected one.
+
+    Raises
+    ------
+    InputError
+        A scene has no robot pose; or the target stands still between the scenes only in another unit or convention of
+        the robot's poses or the transform, which the message names.
+    """
+    chain.require_poses([each.name for each in results])
+    seen = {each.name: uncertain(each) for each in accepted(results)}
+    notes = on_chain(chain, seen)
+    found = {name: chain.base_from_goal(name, pose) for name, pose in seen.items()}
+    return Goals(
+        {name: each.rigid for name, each in found.items()},
+        {name: each.covariance for name, each in found.items()},
+        notes,
+    )

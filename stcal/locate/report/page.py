@@ -1,25 +1,27 @@
-"""The report of located tags, and their table."""
+"""Reports of located tags and of a layout's calibration: page, table, text, and the files that ``--json`` writes."""
 
 import base64
 import csv
 import io
 from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field, StringConstraints
 
-from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
-from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
+from stcal.io.json import Finite, Matrix, Matrix6, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.data.exposures import Exposure, SceneFiles
+from stcal.locate.calibration import CalibratedLayout
+from stcal.locate.data.exposures import Exposure, SceneFiles, Unreadable
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
-from stcal.locate.pose.patent import ASSUMED
-from stcal.locate.report.chain import GoalChain
+from stcal.locate.pose.estimate import ObjPose, Shift
+from stcal.locate.pose.patent import ASSUMED, PatentPose
+from stcal.locate.report.chain import GoalChain, accepted, camera_from_obj, uncertain
 from stcal.report.document import Block, Document, Html, Notes, Section, Table, Verdict, columns, macro, page_only
 from stcal.report.figure import AXIS_COLOURS, COLOURS
 from stcal.report.text import NONE, number
@@ -48,28 +50,6 @@ def _patent_blocks(located: Located) -> list[Block]:
         Table(["<exposure", "<", "tags", "area px²", "error px", "of the other", "det J 1/mm²"], rows),
         f"patent: {ASSUMED}",
     ]
-
-
-def camera_from_obj(located: Located) -> Rigid | None:
-    """Returns camera_from_obj by the method that was asked for, or None."""
-    if located.patent is not None:
-        return located.patent.camera_from_obj
-    return None if located.pose is None else located.pose.camera_from_obj
-
-
-def uncertain(located: Located) -> UncertainRigid:
-    """Returns camera_from_obj with its covariance, which is zero for the patent's method."""
-    if located.pose is None:
-        pose = camera_from_obj(located)
-        if pose is None:
-            raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
-        return UncertainRigid.exact(pose)
-    return UncertainRigid(located.pose.camera_from_obj, located.pose.covariance)
-
-
-def accepted(results: Sequence[Located]) -> list[Located]:
-    """Returns the results whose pose may be used."""
-    return [each for each in results if each.verdict.decision == "accept"]
 
 
 @require_arguments
@@ -257,3 +237,302 @@ def _axes(pose, layout: TargetLayout, camera: Camera) -> list[tuple]:
         return []
     start, *tips = camera.project(ends)
     return [(start, tip, colour, name) for tip, colour, name in zip(tips, AXIS_COLOURS, "XYZ", strict=True)]
+
+
+class LimitRow(Part):
+    name: str
+    value: Finite
+    at_least: float | None
+    at_most: float | None
+    unit: Annotated[str, StringConstraints(strip_whitespace=True)]
+    passed: bool
+
+
+class ExposureRow(Part):
+    image: str
+    tags: int | None
+    trouble: str | None
+
+
+class ShiftRow(Part):
+    between: tuple[str, str]
+    tags: int
+    shift_px: float
+
+
+class CornerRow(Part):
+    corner: str
+    residual_px: Pair
+    weight: float
+
+
+class PatentExposureRow(Part):
+    image: str
+    tags: int
+    area_px2: float | None
+    candidate: bool
+    kept: bool
+    errors_px: list[Finite] | None
+    det_j: float | None
+    camera_from_obj: Pose | None
+    twin: Pose | None
+
+
+class PatentRow(Part):
+    exposures: list[PatentExposureRow]
+    same_pose: bool
+    assumed: str
+
+
+class SceneRow(Part):
+    scene: str
+    verdict: str
+    reasons: list[str]
+    notes: list[str]
+    checks: list[LimitRow] = Field(
+        description="`name`, `value`, `at_least`, `at_most`, `unit`, `passed`; value null: no other pose"
+    )
+    exposures: list[ExposureRow] = Field(description="`image`, `tags`, `trouble`")
+    tags: list[int] = Field(description="seen")
+    differing_share: float | None = Field(
+        description="of the corners' stated variance, how much differs between exposures"
+    )
+    shifts: list[ShiftRow] = Field(
+        description="`between` two exposures, `tags` in common, `shift_px` the median shift of their middles"
+    )
+    camera_from_obj: Pose | None = Field(description="pose, also of rejected and ambiguous scenes")
+    covariance: Matrix6 | None = Field(None, description="its covariance; not with `--method patent`")
+    twin: Pose | None = Field(None, description="the other pose that fits, null where there is none")
+    errors_px: list[Finite] | None = Field(None, description="only with `--method patent`: of the two poses")
+    patent: PatentRow | None = Field(
+        None,
+        description="only with `--method patent`: `exposures`: `image`, `tags` used, `area_px2` of their triangles "
+        "(null where others show more tags), `candidate`, `kept`, and of candidates `errors_px` of both poses, `det_j` "
+        "(1/mm²), `camera_from_obj` and `twin`; `same_pose`: both poses are one; what was `assumed`",
+    )
+    delta_chi2: Finite = Field(
+        None, description="this and all below as in [measure](measure.md#out-what-measure-writes)"
+    )
+    rms_px: float | None = Field(None, description="of the residuals, per coordinate")
+    chi2: float | None = Field(None, description="of the residuals")
+    dof: int | None = Field(None, description="their degrees of freedom")
+    p_value: float | None = Field(None, description="of as much by chance")
+    outliers: list[int] = Field([], description="ids of tags that contradict the others")
+    corners: list[CornerRow] = Field([], description="`corner` as `id:0` … `id:3`, `residual_px`, `weight`")
+    base_from_goal: Pose | None = Field(None, description="with `--hand-eye` or `--registration`")
+    base_covariance: Matrix6 | None = Field(None, description="its covariance")
+
+
+class LocatedFile(ResultFile):
+    """Result file of ``locate run``, with rejected and ambiguous poses too."""
+
+    format: Literal["stcal located 1"] = Field(description="the file's form and its version")
+    unit: Literal["mm"] = Field(description="of all lengths")
+    layout: str = Field(description="the layout's name")
+    scenes: list[SceneRow] = Field(description="`scene`, `verdict`, `reasons`, `notes`, and")
+
+    @classmethod
+    def of(cls, results: Sequence[Located], layout: TargetLayout, chain: GoalChain | None = None) -> "LocatedFile":
+        """Returns the file of all scenes; ``chain`` : chain to the robot's base."""
+        scenes = [_scene_row(each, layout, chain) for each in results]
+        return cls(format="stcal located 1", unit="mm", layout=layout.name, scenes=scenes)
+
+
+def _scene_row(located: Located, layout: TargetLayout, chain: GoalChain | None) -> SceneRow:
+    verdict, merged, pose = located.verdict, located.merged, camera_from_obj(located)
+    content: dict[str, Any] = {
+        "scene": located.name,
+        "verdict": verdict.decision,
+        "reasons": verdict.reasons,
+        "notes": located.notes,
+        "checks": verdict.checks,
+        "exposures": [_exposure(own) for own in located.tags.exposures],
+        "tags": [layout.tags[row][1] for row in merged.seen.rows] if merged else [],
+        "differing_share": None if merged is None else merged.share,
+        "shifts": [_shift(own) for own in merged.shifts] if merged else [],
+        "camera_from_obj": pose,
+    }
+    if located.patent is not None:
+        content |= {
+            "twin": located.patent.second,
+            "errors_px": located.patent.errors_px,
+            "patent": _patent(located, located.patent),
+        }
+    if located.pose is not None:
+        content |= _fit(located.pose, layout)
+    if chain and pose is not None and not chain.without_pose([located.name]):
+        goal = chain.base_from_goal(located.name, uncertain(located))
+        content |= {"base_from_goal": goal.rigid, "base_covariance": goal.covariance}
+    return SceneRow.model_validate(content)
+
+
+def _exposure(own: Exposure | Unreadable) -> ExposureRow:
+    read = isinstance(own, Exposure)
+    return ExposureRow(image=own.name, tags=len(own.tags) if read else None, trouble=None if read else own.trouble)
+
+
+def _patent(located: Located, patent: PatentPose) -> PatentRow:
+    names = [exposure.name for exposure in located.tags.readable()]
+    rows = []
+    for exposure_result in patent.exposures:
+        first, second = exposure_result.poses or (None, None)
+        rows.append(
+            {
+                "image": names[exposure_result.exposure],
+                "tags": exposure_result.tags,
+                "area_px2": exposure_result.area_px2,
+                "candidate": exposure_result.candidate,
+                "kept": exposure_result.exposure == patent.exposure,
+                "errors_px": exposure_result.errors_px,
+                "det_j": exposure_result.det_j,
+                "camera_from_obj": first,
+                "twin": second,
+            }
+        )
+    return PatentRow.model_validate({"exposures": rows, "same_pose": patent.same, "assumed": ASSUMED})
+
+
+def _shift(own: Shift) -> ShiftRow:
+    return ShiftRow(between=own.exposures, tags=own.tags, shift_px=own.shift_px)
+
+
+def _fit(pose: ObjPose, layout: TargetLayout) -> dict[str, Any]:
+    names = [f"{layout.tags[row][1]}:{corner}" for row in pose.rows for corner in range(4)]
+    return {
+        "covariance": pose.covariance,
+        "twin": pose.second,
+        "delta_chi2": pose.delta_chi2,
+        "rms_px": pose.rms_px(),
+        "chi2": pose.chi2,
+        "dof": pose.redundancy,
+        "p_value": pose.p_value(),
+        "outliers": [layout.tags[row][1] for row in pose.outliers],
+        "corners": [
+            CornerRow(corner=name, residual_px=residual, weight=weight)
+            for name, residual, weight in zip(names, pose.residuals_px, pose.weights, strict=True)
+        ],
+    }
+
+
+class BoardImageRow(Part):
+    image: str
+    camera_from_board: Pose
+    tags_rms_px: float
+
+
+class TagRow(Part):
+    dictionary: str
+    id: int
+    images: int
+    corners_mm: Matrix
+    sigma_mm: Matrix
+    published_mm: Matrix
+    from_nominal_mm: float | None
+
+
+class CalibratedLayoutFile(ResultFile):
+    """Result file of ``locate calibrate``."""
+
+    format: Literal["stcal layout calibration 1"] = Field(description="the file's form and its version")
+    unit: Literal["mm"] = Field(description="of all lengths")
+    images: list[BoardImageRow] = Field(description="`image`, `camera_from_board` 4×4, `tags_rms_px`")
+    left_out: list[str] = Field(description="images without board or tags, and why")
+    board_from_obj: Pose = Field(description="where {obj} lies on the board")
+    board_rms_px: float = Field(description="residuals of the board's points per coordinate")
+    tag_rms_px: float = Field(description="residuals of the tags' corners per coordinate")
+    sigma_px: float = Field(description="as in the layout file")
+    tag_sigma_px: float = Field(description="as in the layout file")
+    tags: list[TagRow] = Field(
+        description="`dictionary`, `id`, `images` that show it, `corners_mm`, `sigma_mm`; `published_mm`: the corners "
+        "before the adjustment; `from_nominal_mm`: the largest distance of a corner from its nominal place, the "
+        "nominal target laid over the calibrated one (null without one)"
+    )
+
+
+FEW_IMAGES = 3
+
+
+def calibrated_text(result: CalibratedLayout) -> str:
+    """Returns the report as text: totals, and a line for each tag."""
+    layout, adjusted = result.layout, result.adjusted
+    lines = [
+        f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
+        f"{adjusted.tag_rms_px:.3f} px of the tags",
+        f"beside the corners' own σ: {adjusted.sigma_px:.3f} px each, {adjusted.tag_sigma_px:.3f} px a tag as a whole",
+        f"{'id':>5}  {'dictionary':<24} images   side_mm  sigma_um  adjusted by_um  from nominal_mm",
+    ]
+    moved = np.linalg.norm(layout.corners_mm - result.published, axis=2).max(1)
+    for row, ((dictionary, tag), count) in enumerate(zip(layout.tags, result.counts, strict=True)):
+        sigma = 1000 * np.sqrt((layout.sigma_mm()[row] ** 2).sum(1).mean())
+        nominal = result.deviation_mm[row]
+        cell = f"{nominal:15.3f}" if np.isfinite(nominal) else f"{'–':>15}"
+        side = sides_mm(layout.corners_mm[row]).mean()
+        mark = "  origin" if row == layout.origin else ""
+        lines.append(
+            f"{tag:>5}  {dictionary:<24} {count:>6}  {side:8.3f}  {sigma:8.1f}  {1000 * moved[row]:14.1f}  {cell}{mark}"
+        )
+    return "\n".join(lines)
+
+
+def sides_mm(corners: np.ndarray) -> np.ndarray:
+    """Returns the side lengths of a tag, (4,)."""
+    return np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+
+
+def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> list[str]:
+    """Returns warnings that the result may be worse than its σ; ``names`` : tags of the plan."""
+    messages = []
+    if result.unseen:
+        tags = ", ".join(str(names[row][1]) for row in result.unseen)
+        messages.append(f"tags that no image shows, left out of the layout: {tags}")
+    few = [tag[1] for tag, count in zip(result.layout.tags, result.counts, strict=True) if count < FEW_IMAGES]
+    if few:
+        messages.append(f"tags in fewer than {FEW_IMAGES} images, so that a misread one would not be noticed: {few}")
+    if result.adjusted.downweighted > 0.1:
+        messages.append(
+            f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; are target and board in one plane?"
+        )
+    if not result.adjusted.settled:
+        messages.append("the σ of board and tags still change at the end of the adjustment; add images")
+    return messages
+
+
+def calibrated_file(result: CalibratedLayout) -> CalibratedLayoutFile:
+    """Returns the result file, without the covariance, which the layout file holds."""
+    layout, adjusted = result.layout, result.adjusted
+    return CalibratedLayoutFile.model_validate(
+        {
+            "format": "stcal layout calibration 1",
+            "unit": "mm",
+            "images": [
+                {"image": name, "camera_from_board": pose, "tags_rms_px": float(rms)}
+                for name, pose, rms in zip(result.images, adjusted.poses, adjusted.image_rms_px, strict=True)
+            ],
+            "left_out": list(result.left_out),
+            "board_from_obj": result.board_from_obj,
+            "board_rms_px": adjusted.board_rms_px,
+            "tag_rms_px": adjusted.tag_rms_px,
+            "sigma_px": adjusted.sigma_px,
+            "tag_sigma_px": adjusted.tag_sigma_px,
+            "tags": [
+                {
+                    "dictionary": dictionary,
+                    "id": tag,
+                    "images": int(count),
+                    "corners_mm": corners,
+                    "sigma_mm": sigma,
+                    "published_mm": published,
+                    "from_nominal_mm": float(nominal) if np.isfinite(nominal) else None,
+                }
+                for (dictionary, tag), count, corners, sigma, published, nominal in zip(
+                    layout.tags,
+                    result.counts,
+                    layout.corners_mm,
+                    layout.sigma_mm(),
+                    result.published,
+                    result.deviation_mm,
+                    strict=True,
+                )
+            ],
+        }
+    )

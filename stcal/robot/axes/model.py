@@ -9,9 +9,20 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.axes.checks import LeaveOneOut, leave_one_out, of_order, off_mm, remarks, require_like_nominal
+from stcal.robot.axes.checks import (
+    LeaveOneOut,
+    Pair,
+    chain_through,
+    jacobian_by_axes,
+    leave_one_out,
+    of_order,
+    off_mm,
+    pairs_of,
+    remarks,
+    require_like_nominal,
+    sigma_of,
+)
 from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
-from stcal.robot.axes.pairs import Pair, chain_through, jacobian_by_axes, pairs_of, sigma_of
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements

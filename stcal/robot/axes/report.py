@@ -12,9 +12,9 @@ from stcal.io.json import ByName, Matrix, Part, Pose, ResultFile, Vector3
 from stcal.report.document import Document, Section, Table, bullets, legend, page_only, plot
 from stcal.report.figure import AXIS_COLOURS, INK, calm, new_figure
 from stcal.report.text import number
+from stcal.robot.axes.checks import Pair
 from stcal.robot.axes.fit import AxisFit
 from stcal.robot.axes.model import ROW_VALUES, AxesResult
-from stcal.robot.axes.pairs import Pair
 from stcal.robot.axes.sweeps import called
 from stcal.robot.kinematics.file import robot_toml
 

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.geometry.robust import ratio_limit
-from stcal.robot.identification.adjustment import Weighting, parameter_units
-from stcal.robot.identification.residuals import Observed, State, linear, moved
+from stcal.robot.identification.adjustment import Observed, State, Weighting, linear, moved, parameter_units
 
 SUBSETS, SEED = 1000, 0
 """Number of random subsets, each of as few rows as determine all parameters, and seed. With a quarter of 40 rows wrong,

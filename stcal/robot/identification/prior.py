@@ -9,8 +9,7 @@ from scipy.linalg import block_diag
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.adjustment import Held
-from stcal.robot.identification.residuals import Kind, State, moved, parameter_names
+from stcal.robot.identification.adjustment import Held, Kind, State, moved, parameter_names
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.forward import GRAVITY_M_S2, chain_parameters, elasticity_values, moved_chain

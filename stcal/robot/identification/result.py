@@ -10,18 +10,15 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields
 from stcal.io.files import require_written
 from stcal.robot.identification.adjustment import (
-    Solution,
-    Weighting,
-)
-from stcal.robot.identification.observability import ObservabilityIndices
-from stcal.robot.identification.predicted import Predicted
-from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed
-from stcal.robot.identification.residuals import (
     Kind,
     Observed,
+    Solution,
     State,
+    Weighting,
     residuals,
 )
+from stcal.robot.identification.observability import ObservabilityIndices, Predicted
+from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.identification.variances import Components
 from stcal.robot.kinematics.file import WRITTEN_MM, load_robot

@@ -12,30 +12,34 @@ from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import (
-    Solution,
-    Weighting,
-    huber_limit,
-    normal_rank,
-    parameter_units,
-    solve,
-    unseen,
-)
-from stcal.robot.identification.consensus import agreeing
-from stcal.robot.identification.observability import ObservabilityIndices, directions_named, parameter_scale
-from stcal.robot.identification.predicted import doubts, predicted, widened
-from stcal.robot.identification.prior import Deviations, NominalRows, bending, carries, placed
-from stcal.robot.identification.residuals import (
     WIDTH,
     Kind,
     Observed,
+    Solution,
     State,
+    Weighting,
+    huber_limit,
     jacobian,
+    normal_rank,
     observed,
     only_of,
     parameter_names,
+    parameter_units,
     residuals,
+    solve,
     tips_of,
+    unseen,
 )
+from stcal.robot.identification.consensus import agreeing
+from stcal.robot.identification.observability import (
+    ObservabilityIndices,
+    directions_named,
+    doubts,
+    parameter_scale,
+    predicted,
+    widened,
+)
+from stcal.robot.identification.prior import Deviations, NominalRows, bending, carries, placed
 from stcal.robot.identification.result import (
     LEAST_FOLDS,
     Adjustment,

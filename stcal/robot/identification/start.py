@@ -13,8 +13,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
-from stcal.robot.identification.adjustment import USELESS_MM
-from stcal.robot.identification.residuals import State, observed, residuals, tips_of
+from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
 from stcal.robot.kinematics.dh import FITS, require_convention
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
@@ -345,7 +344,8 @@ def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
     for i, k in combinations(range(n), 2):
         if n > MOST_JOINTS or robot.joints[i].type != robot.joints[k].type:
             continue
-        order = _exchanged(n, i, k)
+        order = list(range(n))
+        order[i], order[k] = k, i
         reason = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
         yield reason, robot, replace(data, q=data.q[:, order])
         if robot.tree is None:
@@ -420,13 +420,6 @@ def _inner(robot: Robot) -> list[int]:
 def _turned(rows: tuple[DHRow, ...], turns_deg: dict[int, int]) -> tuple[DHRow, ...]:
     """Returns the rows with θ larger by these angles."""
     return tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in enumerate(rows))
-
-
-def _exchanged(n: int, i: int, k: int) -> list[int]:
-    """Returns the order of n things with two exchanged."""
-    order = list(range(n))
-    order[i], order[k] = k, i
-    return order
 
 
 def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:

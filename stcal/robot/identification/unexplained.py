@@ -6,8 +6,16 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from stcal.geometry.rigid import Rigid, skew
-from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.residuals import WIDTH, Observed, State, as_seen, jacobian, residuals, tips_of
+from stcal.robot.identification.adjustment import (
+    WIDTH,
+    Observed,
+    State,
+    Weighting,
+    as_seen,
+    jacobian,
+    residuals,
+    tips_of,
+)
 from stcal.robot.identification.variances import GROSS
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.row_order import Change, changes_along

@@ -15,9 +15,19 @@ from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
-from stcal.robot.identification.adjustment import USELESS_MM, Bent, Solution, Weighting, curvature_of, huber_limit
+from stcal.robot.identification.adjustment import (
+    USELESS_MM,
+    WIDTH,
+    Bent,
+    Kind,
+    Observed,
+    Solution,
+    Weighting,
+    curvature_of,
+    huber_limit,
+    jacobian,
+)
 from stcal.robot.identification.prior import ACROSS, AXIS, DOUBT, MOMENT, Deviations, NominalRows
-from stcal.robot.identification.residuals import WIDTH, Kind, Observed, jacobian
 
 LEAST = 1e-9
 """Smallest σ, in mm or rad: that of data without noise."""

@@ -4,13 +4,16 @@ import csv
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
+from stcal.io.json import Part, ResultFile, Vector, Vector3
 from stcal.io.table import pose_values, read_table
 from stcal.parallel import one_thread
 from stcal.robot.kinematics.file import WRITTEN_MM
@@ -24,7 +27,6 @@ from stcal.robot.kinematics.inverse import (
     reach_mm,
 )
 from stcal.robot.kinematics.model import Joint, Robot
-from stcal.robot.use.files import CompensationFile
 from stcal.robot.use.targets import (
     Targets,
     joints_of,
@@ -39,6 +41,43 @@ LEAST_SHOWN_MM = 1e-6
 """Error below which its size says nothing."""
 ISOLATED = 6
 """Largest number of joints with isolated solutions, of which another one is another configuration."""
+
+
+ByStatus = Annotated[str, "status"]
+
+
+class CompensatedPose(Part):
+    line: int
+    target: str
+    commanded_mm: Vector3
+    commanded_quaternion: Vector
+    status: str
+    joints: dict[str, float] | None
+    error_mm: float
+    error_rad: float
+    payload_kg: float | None = None
+    nominal_status: str = ""
+    nominal_joints: dict[str, float] | None = None
+    nominal_error_mm: float | None = None
+    nominal_error_rad: float | None = None
+
+
+class CompensationFile(ResultFile):
+    """Result file of ``compensate``."""
+
+    format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
+    robot: str = Field(description="name")
+    counts: dict[ByStatus, int] = Field(description="number of poses")
+    poses: list[CompensatedPose] = Field(
+        description="the columns above: `line`, `target`, `commanded_mm`, `commanded_quaternion` (w first), `status`, "
+        "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, `payload_kg` (null: as the robot "
+        "file has it), and with `--nominal` "
+        "`nominal_status`, `nominal_joints`, `nominal_error_mm`, `nominal_error_rad`"
+    )
+    notes: list[str] = Field(
+        description="columns that were not read, angles by their convention, and the warnings: doubts of targets and "
+        "robots, and rows that are not simply reached"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

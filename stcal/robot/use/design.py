@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
+from stcal.io.json import ResultFile
 from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
@@ -29,7 +31,6 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import joint_values
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
-from stcal.robot.use.files import DesignFile
 
 RANDOM_SETS = 20
 """Number of random sets for comparison; their median is known to a quarter of their standard deviation."""
@@ -41,6 +42,27 @@ GAIN = 1e-9
 """Least growth of log det that counts as an improvement."""
 TEST_POSES = 200
 """Number of random poses at which the identified robot's position is predicted."""
+
+
+class DesignFile(ResultFile):
+    """Result file of ``design``."""
+
+    format: Literal["stcal pose design 1"] = Field(description="the file's form and its version")
+    count: int = Field(description="number of poses")
+    parameters: int = Field(description="of the robot and its tool")
+    seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
+    exchanges: int = Field(description="single poses exchanged after the greedy choice")
+    chosen: dict[str, float] = Field(
+        description="`O1` … `O5` of the chosen poses; defined and in units as `identify --json` has them"
+    )
+    random_median: dict[str, float] = Field(description="medians of `random`")
+    random: list[dict[str, float]] = Field(description="`O1` … `O5` of 20 random sets of as many poses")
+    predicted_sigma_mm: float = Field(
+        description="σ per axis of the position that the identified robot predicts, RMS over random poses"
+    )
+    random_predicted_sigma_mm: float | None = Field(
+        description="the same, median of the random sets (null where they leave parameters open)"
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)

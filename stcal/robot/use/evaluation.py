@@ -5,18 +5,19 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.stats import t as t_distribution
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.prior import Placed, base_name, tool_name
-from stcal.robot.identification.residuals import (
+from stcal.io.json import Part, ResultFile, Vector
+from stcal.robot.identification.adjustment import (
     WIDTH,
     Observed,
     State,
+    Weighting,
     as_seen,
     jacobian,
     observed,
@@ -25,6 +26,8 @@ from stcal.robot.identification.residuals import (
     residuals,
     tips_of,
 )
+from stcal.robot.identification.prior import Placed, base_name, tool_name
+from stcal.robot.identification.report import FoundLeft, PlacedPart
 from stcal.robot.identification.result import position_errors
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
@@ -43,6 +46,65 @@ UNSEEN = 1e-12
 """Relative visibility of a direction of parameters below which its σ is set to a huge value."""
 CHANCE = 0.05
 """Probability of calling one of two equal robots better."""
+
+
+class ErrorFigures(Part):
+    rows: int
+    mean: float
+    median: float
+    rms: float
+    p95: float
+    max: float
+
+
+class EvaluatedRobot(Part):
+    name: str
+    position_mm: ErrorFigures
+    good_mm: ErrorFigures
+    orientation_rad: ErrorFigures | None
+    placed: list[PlacedPart] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
+    left: list[FoundLeft] | None = Field(
+        description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
+        "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
+        "number of tests, `line` after a jump; null where rows are too few to tell"
+    )
+    beyond: list[FoundLeft] | None = Field(
+        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`) of what "
+        "parameters identified from these rows would leave"
+    )
+    residuals: list[Vector] = Field(
+        description="of each row: measured minus modelled position, mm, in the axes of the robot's base; or of the "
+        "distance"
+    )
+
+
+class RobotDifference(Part):
+    better: str
+    worse: str
+    mm: float
+    sigma_mm: float
+    p: float
+
+
+class EvaluationFile(ResultFile):
+    """Result file of ``evaluate``."""
+
+    format: Literal["stcal evaluation 1"] = Field(description="the file's form and its version")
+    refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
+    observed: str = Field(description="positions or distances")
+    lines: list[int] = Field(description="of the data file, of each row")
+    wrong: list[int] = Field(
+        description="lines that no robot explains (wrong, or something all models lack); nothing was fitted to them"
+    )
+    best: str | None = Field(description="the robot that is better than all others by more than chance; null: none is")
+    robots: list[EvaluatedRobot] = Field(
+        description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "
+        "the wrong ones, `orientation_rad` where measured: `rows`, `mean`, `median`, `rms`, `p95`, `max`"
+    )
+    differences: list[RobotDifference] = Field(
+        description="`mm`: mean error of the `worse` robot less that of the `better` on the same rows without the "
+        "wrong ones, its `sigma_mm`, and `p` times the number of comparisons"
+    )
 
 
 @dataclass(frozen=True, slots=True)

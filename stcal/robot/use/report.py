@@ -17,17 +17,16 @@ from stcal.io.table import read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
 from stcal.report.figure import COLOURS, INK, SMALL, calm, locator, new_figure, plane
 from stcal.report.text import NONE, number
+from stcal.robot.identification.adjustment import tips_of
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.report import placed_parts, placed_table
-from stcal.robot.identification.residuals import tips_of
 from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
 from stcal.robot.use.design import PoseDesign
-from stcal.robot.use.evaluation import Evaluated, Evaluation, Figures
-from stcal.robot.use.files import EvaluationFile
+from stcal.robot.use.evaluation import Evaluated, Evaluation, EvaluationFile, Figures
 from stcal.robot.use.verification import Verification
 
 
@@ -446,20 +445,19 @@ def _cells(values) -> list[str]:
 
 def evaluation_file(result: Evaluation) -> EvaluationFile:
     """Returns the complete result in machine-readable form (keys: ``data_layout.md``)."""
-    robots = []
-    for each in result.robots:
-        robots.append(
-            {
-                "name": each.robot.name,
-                "position_mm": Figures.of(each.errors_mm),
-                "good_mm": Figures.of(each.errors_mm[~result.wrong]),
-                "orientation_rad": Figures.of(each.rotation_rad) if len(each.rotation_rad) else None,
-                "placed": placed_parts(each.placed),
-                "left": each.left,
-                "beyond": each.beyond,
-                "residuals": list(each.residuals),
-            }
-        )
+    robots = [
+        {
+            "name": each.robot.name,
+            "position_mm": Figures.of(each.errors_mm),
+            "good_mm": Figures.of(each.errors_mm[~result.wrong]),
+            "orientation_rad": Figures.of(each.rotation_rad) if len(each.rotation_rad) else None,
+            "placed": placed_parts(each.placed),
+            "left": each.left,
+            "beyond": each.beyond,
+            "residuals": list(each.residuals),
+        }
+        for each in result.robots
+    ]
     content = {
         "format": "stcal evaluation 1",
         "refit": result.refit,

@@ -7,15 +7,17 @@ instrument. They all carry the error of the first position; the distances of all
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
+from stcal.io.json import Part, ResultFile, Vector
 from stcal.io.table import Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
-from stcal.robot.use.files import VerificationFile
 
 WHAT = "measured positions"
 SAME_MM = 1e-6
@@ -28,6 +30,46 @@ SCALE_WITHIN = 0.01
 
 Arms are off by parts of a thousand; more indicates another unit or other poses.
 """
+
+
+BySet = Annotated[str, "set"]
+
+
+class ErrorReduction(Part):
+    mean_percent: float | None
+    std_percent: float | None
+    max_percent: float | None
+    all_pairs_rms_percent: float | None
+
+
+class MeasuredSet(Part):
+    set: str
+    mean_mm: float
+    std_mm: float
+    max_mm: float
+    all_pairs_rms_mm: float
+    scale: float
+    reduced: ErrorReduction | None = Field(
+        description="each figure's reduction from the first set: `mean_percent`, `std_percent`, `max_percent`, "
+        "`all_pairs_rms_percent`; null for the first"
+    )
+    error_mm: Vector
+
+
+class VerificationFile(ResultFile):
+    """Result file of ``verify``."""
+
+    format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
+    poses: list[str] = Field(description="names, the first being the one that distances start from")
+    distance_mm: Vector = Field(description="commanded distances of the others from it")
+    sets: list[MeasuredSet] = Field(
+        description="`set`; `mean_mm`, `std_mm` (sample), `max_mm` of the absolute errors of those distances, "
+        "`error_mm` measured minus commanded; `all_pairs_rms_mm` of the distance errors of all pairs; `scale` measured "
+        "over commanded distances of all pairs by least squares; `reduced`"
+    )
+    missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
+    warnings: list[str] = Field(description="what to look at")
+    notes: list[str] = Field(description="columns that were not read")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,33 +1,44 @@
-"""Hand-eye calibration from a file of poses or from images of any board, for ``stcal handeye``. It composes three
+"""Hand-eye calibration from a file of poses or from images of any board, for ``stcal handeye``, and the poses to take
+next within an arm's reach. The offset of the clocks and parameters of the arm may be unknowns too. It composes three
 systems."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from functools import partial
 
 import numpy as np
 
-from stcal.errors import StcalError
+from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
-from stcal.handeye import HandEyeOptions
-from stcal.handeye.data.pairs import Setup
-from stcal.handeye.judge.remarks import Grave
-from stcal.handeye.judge.symmetry import repair
+from stcal.geometry.normal_equations import generalised_inverse
+from stcal.geometry.rigid import Poses
+from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
+from stcal.handeye.judge.mistakes import repair
+from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.pipeline import Validated, validated
-from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import handeye
+from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
     compare,
+    cross_validate,
     predict_motions,
     splits,
     widened_by_scatter,
 )
-from stcal.parallel import Progress
-from stcal.workflows.handeye.arm import with_arm
-from stcal.workflows.handeye.inputs import HandEyeInput
-from stcal.workflows.handeye.offset import at_offset, lag_tried, with_offset
+from stcal.io.cameras.model import CameraPrior
+from stcal.parallel import Progress, one_thread
+from stcal.robot import Robot, inverse
+from stcal.robot.kinematics.inverse import REACHED
+from stcal.robot.use.compensation import joint_columns
+from stcal.workflows.handeye.inputs import HandEyeInput, naming_left_out
+from stcal.workflows.handeye.robot_at_images import Arm
 
 ALL, AUTO = "all", "auto"
 """Words in place of a method's name: all methods, compared; the way of solving that predicts best."""
@@ -111,37 +122,6 @@ def calibrate_handeye(
     return with_offset(calibrate(given, setup, method, options, validation, told, time_offset), offset)
 
 
-def calibrate(
-    given: HandEyeInput,
-    setup: Setup,
-    method: str | None,
-    options: HandEyeOptions,
-    validation: Splits,
-    progress: Progress = lambda *_: None,
-    offset_known: bool = False,
-) -> Outcome:
-    """Returns the result and its errors on poses held out.
-
-    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
-
-    All methods are compared where ``method`` is :data:`ALL`;
-    the way of solving that predicts best is used where it is :data:`AUTO`.
-
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
-    """
-    try:
-        return _outcome(given, setup, method, options, validation, progress, offset_known)
-    except StcalError as error:
-        if not given.left_out:
-            raise
-        name, reason = given.left_out[0]
-        error.append(f"; {len(given.left_out)} left out before, first {name}: {reason}")
-        raise
-
-
 FAR_MM, TOO_FAR_MM = 600.0, 1000.0
 """Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
 stated; brackets are shorter."""
@@ -165,64 +145,401 @@ def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, 
     return (Grave(said) if away > TOO_FAR_MM else said,)
 
 
-def _outcome(
+def calibrate(
     given: HandEyeInput,
     setup: Setup,
     method: str | None,
     options: HandEyeOptions,
     validation: Splits,
-    progress: Progress,
-    offset_known: bool,
+    progress: Progress = lambda *_: None,
+    offset_known: bool = False,
 ) -> Outcome:
-    pairs, views = given.pairs, given.views
-    if options.camera is None:
-        options = replace(options, camera=given.prior)
-    compared, rows = (), np.zeros((0, 0), int)
-    if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
-        rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
-    if method == ALL:
-        result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
-        compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
-        held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
-        solution = Validated(result if held_out is None else widened_by_scatter(result, held_out), held_out, options)
-    else:
-        prior, done = given.prior if views is not None else None, partial(progress, "held out")
-        asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
-        solution = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
-    result, options, notes = solution.result, solution.options, solution.notes
-    if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
-        notes = (*notes, meant)
-    notes = (*notes, *_of_setup(given, setup, result))
-    if not offset_known:
-        result, lagging = lag_tried(given, setup, options, result)
-        notes = (*notes, *lagging)
-    motions = None
-    if validation.motions is not None:
-        motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
-    model = options.intrinsics.colmap_model if options.intrinsics else ""
-    own_sigmas = views is not None and all(view.covariance is not None for view in views.views)
+    """Returns the result and its errors on poses held out.
+
+    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
+
+    All methods are compared where ``method`` is :data:`ALL`;
+    the way of solving that predicts best is used where it is :data:`AUTO`.
+
+    Raises
+    ------
+    StcalError
+        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    """
+    with naming_left_out(given.left_out):
+        pairs, views = given.pairs, given.views
+        if options.camera is None:
+            options = replace(options, camera=given.prior)
+        compared, rows = (), np.zeros((0, 0), int)
+        if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
+            rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
+        if method == ALL:
+            result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
+            compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
+            held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
+            solution = Validated(
+                result if held_out is None else widened_by_scatter(result, held_out), held_out, options
+            )
+        else:
+            prior, done = given.prior if views is not None else None, partial(progress, "held out")
+            asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
+            solution = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
+        result, options, notes = solution.result, solution.options, solution.notes
+        if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
+            notes = (*notes, meant)
+        notes = (*notes, *_of_setup(given, setup, result))
+        if not offset_known:
+            result, lagging = lag_tried(given, setup, options, result)
+            notes = (*notes, *lagging)
+        motions = None
+        if validation.motions is not None:
+            motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
+        model = options.intrinsics.colmap_model if options.intrinsics else ""
+        own_sigmas = views is not None and all(view.covariance is not None for view in views.views)
+        if options.symmetries:
+            mended = repair(pairs, setup, options.symmetries, views)
+            pairs, views = mended.pairs, mended.views
+        outcome = Outcome(
+            given.where,
+            result,
+            solution.held_out,
+            compared,
+            given.pitch_mm,
+            model,
+            own_sigmas,
+            given.left_out,
+            notes,
+            motions,
+            solution.choice,
+            understood=given.understood,
+            unit_mm=given.unit_mm,
+            pairs=pairs,
+            views=views,
+            folder=given.folder,
+        )
+        if given.arm is None:
+            return outcome
+        done = partial(progress, "with the arm")
+        return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)
+
+
+def with_arm(
+    outcome: Outcome,
+    arm: Arm,
+    options: HandEyeOptions,
+    prior: CameraPrior | None,
+    rows: np.ndarray,
+    workers: int | None,
+    progress: Callable[[int, int], None],
+) -> Outcome:
+    """Returns the calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
+
+    Parameters
+    ----------
+    outcome : calibration of the same poses, by the robot's file
+    arm : the arm at the joint values of these poses
+    options : options of the outcome
+    prior : prior of the intrinsics
+    rows : (s, k) poses to hold out; none where empty
+    workers, progress : as in :func:`stcal.handeye.cross_validate`
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    StcalError
+        For the reasons given in :func:`stcal.handeye.handeye`.
+    """
+    pairs, views, setup = outcome.pairs, outcome.views, outcome.result.setup
+    if pairs is None or views is None:
+        raise InputError("E-OPTION-NEEDS", "--with-kinematics: only with images, whose corners show the arm's errors")
+    options, method = replace(options, arm=arm, intrinsics=prior, symmetries=()), "reprojection"
+    result = handeye(pairs, setup, method, views, options)
+    held_out, notes = None, outcome.notes
+    if len(rows):
+        held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
+        result = widened_by_scatter(result, held_out)
+    adjusted = result.reprojection
+    if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
+        raise ValueError("reprojection with an arm has its parameters")
+    sigma = np.sqrt(np.diag(adjusted.arm_covariance))
+    arm_found = ArmFound(arm.robot.name, arm.names(), adjusted.arm, sigma, outcome.held_out)
+    if held_out is not None and outcome.held_out is not None:
+        now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
+        if now >= before:
+            notes = (
+                *notes,
+                f"the arm's parameters gain nothing on poses held out ({now:.3g} mm with, {before:.3g} mm without "
+                "them): leave --with-kinematics out, or take more poses",
+            )
+    model = prior.colmap_model if prior else ""
+    return replace(outcome, result=result, held_out=held_out, colmap_model=model, notes=notes, arm=arm_found)
+
+
+HINT_T, SURE_SIGMAS = 3.0, 4.0
+"""Student's t of a first test from which an offset is solved for, and number of its σ from which it is reported: one
+sound set in 16,000 is beyond the latter."""
+FALLS = 0.98
+"""Largest ratio of the mean squares of residuals with and without an offset at which the offset is reported although it
+does no harm."""
+HARMFUL = 1.0
+"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong."""
+ROW_S = 0.05
+"""Time assumed between rows if poses have no times but follow one another smoothly: a scan of ±1 s then covers ±20
+rows."""
+SMOOTH, LEAST_ROWS = 0.2, 20
+"""Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
+their order counts as that of a motion; and least number of such poses."""
+
+
+@one_thread()
+def at_offset(
+    given: HandEyeInput, setup: Setup, options: HandEyeOptions
+) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
+    """Returns the same input with the robot's poses at the estimated offset.
+
+    Numberings of a symmetric board are corrected.
+
+    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: for the reasons given in
+    :func:`~stcal.handeye.time_offset.estimate_offset`.
+    """
+    timed = given.timed
+    if timed is None:
+        raise InputError(
+            "E-POSES-UNTIMED",
+            f"{given.where}: --time-offset needs times of both, of the robot's poses (a column time_s, or TUM) and of "
+            "the images (their names, or --image-times)",
+        )
+    if options.four_dof:
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out",
+        )
+    pairs, views, notes = given.pairs, given.views, ()
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views = mended.pairs, mended.views
-    outcome = Outcome(
-        given.where,
-        result,
-        solution.held_out,
-        compared,
-        given.pitch_mm,
-        model,
-        own_sigmas,
-        given.left_out,
-        notes,
-        motions,
-        solution.choice,
-        understood=given.understood,
-        unit_mm=given.unit_mm,
-        pairs=pairs,
-        views=views,
-        folder=given.folder,
+        pairs, views, notes = mended.pairs, mended.views, mended.notes()
+    offset = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
+    rows = np.flatnonzero(offset.kept)
+    outside = [
+        (name, "outside of the robot's times at the time offset")
+        for name, k in zip(pairs.names, offset.kept, strict=True)
+        if not k
+    ]
+    given = replace(
+        given,
+        pairs=replace(pairs[rows], base_from_flange=offset.base_from_flange),
+        views=None if views is None else views[rows],
+        symmetries=(),
+        left_out=(*given.left_out, *outside),
+        understood=(*given.understood, *notes),
     )
-    if given.arm is None:
+    return given, replace(options, symmetries=()), offset
+
+
+def with_offset(outcome: Outcome, offset: TimeOffset | None) -> Outcome:
+    """Returns the outcome with the offset in the report, and its σ in those of the transforms."""
+    if offset is None:
         return outcome
-    done = partial(progress, "with the arm")
-    return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)
+    return replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
+
+
+@one_thread()
+def lag_tried(
+    given: HandEyeInput, setup: Setup, options: HandEyeOptions, result: HandEye
+) -> tuple[HandEye, tuple[str, ...]]:
+    """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
+    with the lag is then taken from the result's notes.
+
+    The poses are those of ``given`` and ``result``, with no offset applied. Where poses have no times, their order
+    gives velocities if they follow one another smoothly.
+    """
+    pairs = given.pairs
+    timed = _moving(given)
+    if timed is None or options.four_dof or len(result.outliers) != len(pairs):
+        return result, ()
+    try:
+        if abs(_lag_t(pairs, timed, setup, result)) < HINT_T:
+            return result, ()
+        plain = replace(options, arm=None, intrinsics=None, camera=None, symmetries=())
+        lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
+        shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
+        before, after = (handeye(each, setup, "pose", None, plain) for each in (pairs[lag.kept], shifted))
+    except StcalError:  # the motions tell no offset
+        return result, ()
+    fits = [float((_lengths(each) ** 2).mean()) for each in (before, after)]
+    harmful = _shift(result, lag) > HARMFUL
+    if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
+        return result, ()
+    old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
+    if given.timed is not None:
+        order = "ahead of" if lag.seconds > 0 else "behind"
+        said = (
+            f"by the motions the robot's clock is {1e3 * abs(lag.seconds):.3g} ± {1e3 * lag.sigma_s:.2g} ms {order} "
+            f"the camera's, with which residuals fall from {old} to {new}: solve with --time-offset"
+        )
+    else:
+        order = "later" if lag.seconds > 0 else "earlier"
+        said = (
+            f"by the motions the board's poses are {abs(lag.seconds) / ROW_S:.2g} ± {lag.sigma_s / ROW_S:.1g} rows "
+            f"{order} than the robot's, with which residuals fall from {old} to {new}: give both with times, and "
+            "--time-offset"
+        )
+    if not any(isinstance(note, SizeDoubt) for note in after.notes):
+        result = replace(result, notes=tuple(note for note in result.notes if not isinstance(note, SizeDoubt)))
+    return result, (Grave(said) if harmful else said,)
+
+
+def _moving(given: HandEyeInput) -> Timed | None:
+    """Returns the robot's poses as a stream that tells its velocities at the images, by times or by the order of the
+    rows; None where neither does.
+
+    Where there is about one sample for each image, the poses must follow one another smoothly.
+    """
+    pairs, timed = given.pairs, given.timed
+    if timed is not None and not _close(timed):
+        return None
+    if timed is not None and timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
+        return timed
+    if len(pairs) < LEAST_ROWS:
+        return None
+    if timed is None:
+        seconds = ROW_S * np.arange(len(pairs))
+        timed = Timed(Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where), seconds)
+    poses = timed.stream.base_from_flange
+    steps = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
+    steps_rms = np.sqrt((steps**2).sum(2).mean(0))
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps_rms, strict=True))
+    return timed if smooth else None
+
+
+def _close(timed: Timed) -> bool:
+    """Returns True if samples of the stream are so close about most images that poses between them are known."""
+    samples = timed.stream.seconds
+    after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
+    return float(np.median(samples[after] - samples[after - 1])) <= LONGEST_S
+
+
+def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
+    """Returns Student's t of an offset that is solved for with X and Z, to first order, from the poses that are not
+    outliers."""
+    good = np.flatnonzero(~result.outliers)
+    loop, x = Loop.of(pairs[good], setup), result.mount_from_camera
+    residuals = loop.residuals(x, result.stand_from_board, result.scale)
+    by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
+    columns = 12 + (result.sigma_scale is not None)
+    jacobian = np.concatenate([loop.jacobian(x, result.scale)[:, :, :columns], by_time], axis=2)
+    size = np.sqrt((residuals.reshape(-1, 2, 3) ** 2).mean((0, 2)))
+    weight = 1 / np.repeat(np.maximum(size, 1e-12), 3)
+    flat, left = (jacobian * weight[:, None]).reshape(-1, columns + 1), (residuals * weight).ravel()
+    covariance = generalised_inverse(flat.T @ flat)
+    step = -covariance @ (flat.T @ left)
+    variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
+    return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
+
+
+def _lengths(result: HandEye) -> np.ndarray:
+    """Returns the translation residuals (m,) of the poses that are no outliers, mm."""
+    return np.linalg.norm(result.residuals[~result.outliers, 3:], axis=1)
+
+
+def _shift(result: HandEye, lag: TimeOffset) -> float:
+    """Returns the largest change of X by the offset, in σ of X; infinite where X has no σ."""
+    if result.covariance is None:
+        return float("inf")
+    return float((np.abs(lag.seconds * lag.slope[:6]) / np.sqrt(np.diag(result.covariance))).max())
+
+
+LEAST_REACHED = 0.5
+"""Share of the poses taken that the arm of a robot file must reach to be accepted as this robot."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planned:
+    """``result`` : from the poses taken; ``poses`` : poses to take; ``joints`` : joint values (k,) of these by column,
+    deg or mm, with a robot file; ``notes`` : on the poses."""
+
+    result: HandEye
+    poses: NextPoses
+    joints: dict[str, np.ndarray]
+    notes: tuple[str, ...]
+
+
+@require_arguments
+@one_thread()
+def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None, seed: int = 0) -> Planned:
+    """Returns the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration.
+
+    Parameters
+    ----------
+    given : HandEyeInput
+        Poses taken so far, of :func:`stcal.workflows.read_handeye`.
+    count : int
+        Number of poses to plan.
+    robot : Robot, optional
+        Robot within whose joint limits the poses are to be, from its own base to its flange, no tool.
+    seed : int
+        Seed of the candidates.
+
+    Returns
+    -------
+    Planned
+        ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
+
+    Raises
+    ------
+    InputError
+        For the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of the poses taken.
+    DegenerateError
+        For the reasons given in :func:`stcal.handeye.handeye`.
+    """
+    setup = given.setup or "eye-in-hand"
+    options = HandEyeOptions(with_scale=given.unit_mm is not None, symmetries=given.symmetries)
+    result = handeye(given.pairs, setup, None, given.views, options)
+    camera = outline = None
+    if given.views is not None:
+        camera = given.views.camera
+        outline = np.unique(np.concatenate([view.xyz_board for view in given.views.views]), axis=0)
+    if robot is None:
+        return Planned(result, plan_poses(given.pairs, result, count, outline, camera, None, seed), {}, ())
+    near, notes = _taken(robot, given)
+    planned = plan_poses(given.pairs, result, count, outline, camera, _reach(robot, near), seed)
+    return Planned(result, planned, _joints(robot, planned.base_from_flange, near), notes)
+
+
+def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Returns the joint values (n,) of the last pose taken that the robot reaches, and notes on poses that it does
+    not."""
+    flange = given.pairs.base_from_flange
+    solutions = inverse(robot, flange, _middle(robot))
+    beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
+    message = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
+    if len(beyond) > (1 - LEAST_REACHED) * len(flange):
+        raise InputError(
+            "E-PLAN-ROBOT",
+            f"{message}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
+            "poses are",
+        )
+    notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
+    return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes
+
+
+def _middle(robot: Robot) -> np.ndarray:
+    """Returns the middle (n,) of the joint limits, 0 where there are none."""
+    middle = robot.limits().mean(1)
+    return np.where(np.isfinite(middle), middle, 0.0)
+
+
+def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
+    def reachable(flange: Poses) -> np.ndarray:
+        """Returns True where a pose is within the limits and its joint values are determined."""
+        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
+
+    return reachable
+
+
+def _joints(robot: Robot, flange: Poses, near: np.ndarray) -> dict[str, np.ndarray]:
+    q = inverse(robot, flange, near).q
+    return dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))

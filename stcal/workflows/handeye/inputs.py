@@ -1,6 +1,7 @@
 """Inputs of a hand-eye calibration: pose pairs of one file or two, or images of a board with the robot's poses."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.several import load_boards
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
@@ -17,7 +18,7 @@ from stcal.handeye.data.inputs import Told, mapped_pairs, own_told, read_pairs, 
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
-from stcal.handeye.judge.flips import flipped, tilted
+from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
 from stcal.handeye.solve import handeye
@@ -29,8 +30,7 @@ from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.workflows.board_views import Board, detect_boards, kind_of
-from stcal.workflows.handeye.arm import Arm, read_arm
-from stcal.workflows.handeye.times import Timing, robot_at_images
+from stcal.workflows.handeye.robot_at_images import Arm, Timing, read_arm, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
@@ -69,44 +69,46 @@ class HandEyeInput:
     notes: tuple[str, ...] = ()
 
 
-def two_files(
-    first: Path,
-    second: Path,
+def one_source(
+    source: Path,
+    second: Path | None,
     key: str,
     statements: Said,
     quaternions: Order = "wxyz",
     timing: Timing = WITHOUT_OPTIONS,
     columns: Maps = (None, None),
-) -> Told | None:
-    """Returns the robot's poses and the camera's, joined.
+) -> tuple[Source, tuple[str, ...]]:
+    """Returns the poses of two files, the robot's and the camera's, or of one, as one source; and notes on rows left
+    out.
 
-    The result is None for two tables of the package's own, which are joined as tables. ``columns`` : maps of the
-    columns of both, where they are tables of other programs.
+    Two tables of the package's own are joined as tables. ``columns`` : maps of the columns of both files, or the second
+    that of the only one, where they are tables of other programs.
 
     Raises InputError: as in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
-    told = read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset, columns)
-    if told is None:
-        for path in (first, second):
-            require_own(path, quaternions)
-        _require_unsaid(statements, f"{first}, {second}")
-    return told
+    if second is None:
+        if columns[1] is not None and source.is_file():
+            return mapped_pairs(source, columns[1], statements, key, quaternions), ()
+        return source, ()
+    told = read_two(source, second, statements, key, quaternions, timing.tolerance_s, timing.offset, columns)
+    if told is not None:
+        return told, ()
+    for path in (source, second):
+        require_own(path, quaternions)
+    _require_unsaid(statements, f"{source}, {second}")
+    joined = join_tables(str(source), str(second), key, PREFIXES, quaternions, columns[1], columns[0])
+    return joined.table, joined.notes
 
 
-def one_source(
-    source: Path, second: Path | None, key: str, statements: Said, quaternions: Order, timing: Timing, columns: Maps
-) -> tuple[Source, tuple[str, ...]]:
-    """Returns the poses of two files, or of one with the second map of ``columns``, as one source, and notes on rows
-    left out. Arguments and errors as :func:`two_files`."""
-    if second is not None:
-        told = two_files(source, second, key, statements, quaternions, timing, columns)
-        if told is not None:
-            return told, ()
-        joined = join_tables(str(source), str(second), key, PREFIXES, quaternions, columns[1], columns[0])
-        return joined.table, joined.notes
-    if columns[1] is not None and source.is_file():
-        return mapped_pairs(source, columns[1], statements, key, quaternions), ()
-    return source, ()
+@contextmanager
+def naming_left_out(left_out: Sequence[tuple[str, str]]) -> Iterator[None]:
+    """Adds to the message of an error what was left out before: (image or row, why)."""
+    try:
+        yield
+    except StcalError as error:
+        if left_out:
+            error.append(f"; {len(left_out)} left out before, first {left_out[0][0]}: {left_out[0][1]}")
+        raise
 
 
 @require_arguments

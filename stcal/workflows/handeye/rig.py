@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.several import load_boards
-from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses, read_rig_file
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S
+from stcal.handeye.data.views import RigCamera, RigFiles, RigPoses, read_rig_file
 from stcal.handeye.report.outcome import Outcome, RigOutcome
 from stcal.handeye.rig import (
     Rig,
@@ -30,8 +30,8 @@ from stcal.handeye.rig import (
 from stcal.handeye.validate import LEAST_LEFT, splits
 from stcal.io.cameras.read import read_camera
 from stcal.parallel import Progress, one_thread
-from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
-from stcal.workflows.handeye.times import Timing
+from stcal.workflows.handeye.inputs import Photographed, naming_left_out, photographed, pitch_of
+from stcal.workflows.handeye.robot_at_images import Timing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,17 +231,9 @@ def calibrate_handeye_rig(
     progress = progress or (lambda *_: None)
     options = RigOptions(refine=refine_camera, with_scale=with_scale, symmetries=given.symmetries)
     poses, setup = given.given, given.files.setup
-    try:
+    left_out = zip(given.files.cameras, given.left_out, strict=True)
+    with naming_left_out([(f"{camera.name}: {what}", why) for camera, items in left_out for what, why in items]):
         rig = handeye_rig(poses, setup, options)
-    except StcalError as error:
-        dropped = [
-            (camera.name, *item)
-            for camera, items in zip(given.files.cameras, given.left_out, strict=True)
-            for item in items
-        ]
-        if dropped:
-            error.append(f"; {len(dropped)} left out before, first {dropped[0][0]}: {dropped[0][1]}: {dropped[0][2]}")
-        raise
     poses, options = same_numbering(poses, setup, given.symmetries), replace(options, symmetries=())
     notes, errors, factor = given.notes, None, 1.0
     if repeats and (held_out or len(poses) > LEAST_LEFT):

@@ -8,7 +8,7 @@ from stcal.boards.design import BoardView, ChessboardDesign, view_of
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration.solve import CalibratedLayout, _by_board_corners, calibrate, plane_points
+from stcal.locate.calibration import CalibratedLayout, _by_board_corners, calibrate, plane_points
 from stcal.locate.data.layout import LayoutPlan, obj_from_plane
 from tests.outcome import fails_with
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose

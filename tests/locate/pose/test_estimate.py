@@ -9,8 +9,7 @@ from stcal.boards.tags import Tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraPrior
-from stcal.locate.pose.estimate import SeenTags, covering_both, locate
-from stcal.locate.pose.merge import merge
+from stcal.locate.pose.estimate import SeenTags, covering_both, locate, merge
 from stcal.locate.pose.verdict import VerdictOptions, judge
 from tests.outcome import fails_with
 from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures

@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.report.chain import read_chain, read_registered
+from stcal.locate.report.chain import goal_chain, read_registered
 
 MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
 FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
@@ -17,6 +17,10 @@ SEEN = UncertainRigid(Rigid.exp([0.2, 0, 0, 5, 6, 700]), np.diag([1e-6] * 3 + [0
 OFFSET = Rigid.exp([0, 0, 0.5, 0, 0, -100])
 
 NEGATIVE = np.diag([1e-8, 1e-8, 1e-8, 1e-4, -250_000.0, 1e-4]).tolist()
+
+
+def read_chain(hand_eye, poses=None, offset=None, **options):
+    return goal_chain(hand_eye, robot_poses=poses, offset=offset, **options)
 
 
 @pytest.fixture

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.register import register
-from stcal.register.core.covariance import covariance_of, kept_share, kept_variance, sigma_within
 from stcal.register.core.models import MODELS
 from stcal.register.core.pairs import PointNoise, Problem, noise_of
+from stcal.register.core.robust import covariance_of, kept_share, kept_variance, sigma_within
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, make_scene, parameter_error

@@ -9,9 +9,8 @@ from stcal.geometry.align import align_rigid
 from stcal.register import register
 from stcal.register.core.models import MODELS, fit
 from stcal.register.core.pairs import PointNoise, Problem
-from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, deletion_squares
-from stcal.register.core.search import by_scale, chernoff, search
-from stcal.register.judge.groups import lies_together, sphericity, two_groups, wilks_bound
+from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
+from stcal.register.judge.mistakes import lies_together, sphericity, two_groups, wilks_bound
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, directions, make_scene
 

@@ -6,7 +6,7 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.core.models import MODELS
-from stcal.register.judge.degeneracy import WIDER_THAN, single_supports, spreads, symmetry
+from stcal.register.judge.notes import WIDER_THAN, single_supports, spreads, symmetry
 from tests.outcome import fails_with
 
 B_FROM_A = Rigid.exp([0.2, -0.7, 1.0, 500, 100, -900])

@@ -12,9 +12,8 @@ from stcal.io.files import json_text
 from stcal.parallel import _limited
 from stcal.register import register, workspace
 from stcal.register.report import page
-from stcal.register.report.drawings import MOST_LABELS, space_figure
 from stcal.register.report.file import GRID, RegistrationFile
-from stcal.register.report.page import FEW_ROWS, registration_report
+from stcal.register.report.page import FEW_ROWS, MOST_LABELS, registration_report, space_figure
 from stcal.register.workspace import findings
 from stcal.report.document import Section
 

@@ -10,10 +10,9 @@ from typer.testing import CliRunner
 
 from stcal.cli.robot import app
 from stcal.geometry.rigid import Rigid
-from stcal.robot.axes.checks import _shape
+from stcal.robot.axes.checks import _shape, pairs_of
 from stcal.robot.axes.fit import fit_axes
 from stcal.robot.axes.model import robot_from_sweeps
-from stcal.robot.axes.pairs import pairs_of
 from stcal.robot.axes.report import axes_file
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.kinematics.file import load_robot, robot_toml

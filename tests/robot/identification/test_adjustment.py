@@ -7,8 +7,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification import adjustment
-from stcal.robot.identification.adjustment import Weighting, huber_limit, solve
-from stcal.robot.identification.residuals import jacobian, moved, observed, residuals
+from stcal.robot.identification.adjustment import Weighting, huber_limit, jacobian, moved, observed, residuals, solve
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import Weighting
+from stcal.robot.identification.adjustment import State, Weighting, jacobian, observed
 from stcal.robot.identification.report import identified_file, identified_report
-from stcal.robot.identification.residuals import State, jacobian, observed
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.identification.unexplained import left

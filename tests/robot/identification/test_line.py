@@ -7,7 +7,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import inverse
-from stcal.robot.identification.residuals import State, tips
+from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80

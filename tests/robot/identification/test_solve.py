@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
+from stcal.robot.identification.adjustment import jacobian, moved, observed, residuals, tips
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.report import identified_file, identified_report
-from stcal.robot.identification.residuals import jacobian, moved, observed, residuals, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot, robot_toml

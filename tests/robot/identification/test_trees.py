@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.drawings import Drawn, joints_figure
-from stcal.robot.identification.residuals import (
+from stcal.robot.identification.adjustment import (
     State,
     curvature,
     jacobian,
@@ -18,6 +17,7 @@ from stcal.robot.identification.residuals import (
     residuals,
     tips,
 )
+from stcal.robot.identification.drawings import Drawn, joints_figure
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.dh import robot_from_chain

@@ -17,7 +17,7 @@ from stcal.sfm.camera.equations import Setting, derivatives
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, design_shapes, model_parameters
 from stcal.sfm.camera.report import rig_report
 from stcal.sfm.camera.rig import _sightings, _start, adjust_rig, gathered, rig_of, symmetries
-from stcal.workflows.calibrate_camera import Models, camera_names, files_of
+from stcal.workflows.calibrate_camera import camera_names, files_of, models_of
 from tests.outcome import fails_with
 from tests.sfm.camera.rigs import alone, calibrated_alone, seen_by_rig
 from tests.sfm.camera.test_intrinsics import BOARD
@@ -247,8 +247,8 @@ def test_lenses_that_kalibr_has_not(rig):
 )
 def test_models_that_contradict_each_other(words, message):
     with fails_with(message):
-        Models.of(words, "OPENCV")
-    assert Models.of(["a=b=RADIAL", "PINHOLE"], "OPENCV") == Models({"a=b": "RADIAL"}, "PINHOLE")
+        models_of(words, "OPENCV")
+    assert models_of(["a=b=RADIAL", "PINHOLE"], "OPENCV") == ({"a=b": "RADIAL"}, "PINHOLE")
 
 
 def test_folders_that_are_no_rig(tmp_path, stcal_sfm):

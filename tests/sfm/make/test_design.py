@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from stcal.cli.sfm.make import design as command
+from stcal.cli.sfm.designs import design as command
 from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.design import load_board, load_target, target_toml

@@ -8,8 +8,7 @@ import pytest
 import stcal
 from stcal import workflows
 from stcal.io.device import SimulatedSource
-from stcal.workflows.growing import GrowingRun, Update, WatchOptions
-from stcal.workflows.photographs import Trigger, capture
+from stcal.workflows.growing import GrowingRun, Trigger, Update, WatchOptions, capture
 from tests.outcome import fails_with
 from tests.shared import own_copy
 

@@ -1,7 +1,9 @@
-"""Recognises the format of a file of poses by its content, whatever its name; read this first."""
+"""Recognises the format of a file of poses by its content, whatever its name; read this first. Also reads programs of
+controllers, and the images of a COLMAP model: camera_from_world, in lengths without a unit."""
 
 import json
 import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,16 +12,89 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order
-from stcal.handeye.data.formats import colmap
-from stcal.handeye.data.formats.arrays import NPY, NPZ, load_npy, load_npz
-from stcal.handeye.data.formats.numeric import TABLE, read_columns, read_numbers, todays
-from stcal.handeye.data.formats.record import Content, Said, Side, Unit, require_each_once
+from stcal.handeye.data.formats.numeric import NPY, NPZ, TABLE, load_npy, load_npz, read_columns, read_numbers, todays
+from stcal.handeye.data.formats.record import Content, Frames, Said, Side, Unit, require_each_once
 from stcal.handeye.data.formats.tree import read_tree
-from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
+from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.plain_yaml import load_yaml
+from stcal.io.poses.colmap_images import floats_of, image_lines
 from stcal.io.poses.columns import without_comments
-from stcal.io.poses.rotations import turned_values
+from stcal.io.poses.rotations import of_quaternions, require_finite, turned_values
 from stcal.io.table import is_comment, read_table, separator_stated
+
+IMAGES_TEXT, IMAGES_BINARY = "images.txt", "images.bin"
+_IMAGE = re.compile(r"\d+(?:\s+\S+){7}\s+\d+\s+\S.*")
+_IMAGE_HEAD = struct.Struct("<I7dI")
+_POINT_BYTES = 24
+MODEL_FORM = "COLMAP model"
+
+
+def model_file(folder: Path) -> Path | None:
+    """Returns the file of the images in a folder that is a model; None for other folders."""
+    return next((folder / name for name in (IMAGES_TEXT, IMAGES_BINARY) if (folder / name).is_file()), None)
+
+
+def is_model(text: str) -> bool:
+    """True if these are the lines of images.txt."""
+    first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    if not _IMAGE.fullmatch(first.strip()) or floats_of(first.split()) is not None:
+        return False
+    return floats_of(first.split()[1:8]) is not None
+
+
+def read_model(text: str, where: str) -> Content:
+    """Returns the poses in images.txt, which has two lines for each image; the second holds its points.
+
+    Raises InputError: a line does not have the form of the format.
+    """
+    images = image_lines(text, where)
+    places = [f"line {image.number}" for image in images]
+    return _content_of_model([image.pose for image in images], [image.name for image in images], places, where)
+
+
+def read_model_binary(path: Path, where: str) -> Content:
+    """Returns the poses in images.bin.
+
+    Raises InputError: the file ends too early, or has bytes after its end.
+    """
+    try:
+        data = read_bytes(path, MODEL_BYTES)
+    except OSError as error:
+        raise InputError("E-MODEL-UNREADABLE", f"{where}: {error.strerror or error}; give a readable model") from error
+    rows, names, at = [], [], 8
+    try:
+        (count,) = struct.unpack_from("<Q", data, 0)
+        while len(rows) < count:
+            _, *row, _ = _IMAGE_HEAD.unpack_from(data, at)
+            at += _IMAGE_HEAD.size
+            end = data.index(b"\0", at)
+            names.append(data[at:end].decode("utf-8"))
+            (points,) = struct.unpack_from("<Q", data, end + 1)
+            at = end + 9 + points * _POINT_BYTES
+            rows.append(row)
+            if at > len(data):
+                raise ValueError("it ends too early")
+        if at != len(data):
+            raise ValueError(f"{len(data) - at} bytes too many")
+    except (struct.error, ValueError) as error:
+        raise InputError(
+            "E-MODEL-UNREADABLE", f"{where}: not a COLMAP model's images.bin ({error}); export the model anew"
+        ) from error
+    return _content_of_model(rows, names, [f"image {name}" for name in names], where)
+
+
+def _content_of_model(rows: list, names: list[str], places: list[str], where: str) -> Content:
+    if not rows:
+        raise InputError("E-MODEL-EMPTY", f"{where}: a model without images; map them first")
+    require_each_once(names, places, where)
+    values = np.array(rows, dtype=float)
+    require_finite(values, places, where)
+    rotation = of_quaternions(values[:, :4], places, where)
+    frames = Frames("camera_from_board", "the model's camera_from_world, its world for the board", False)
+    turned = "quaternions w, x, y, z"
+    side = Side(rotation, values[:, 4:], tuple(places), turned, None, frames, tuple(names), scaled=True)
+    return Content(MODEL_FORM, (side,))
+
 
 _N = r"([+-]?\d+\.?\d*(?:[eE][+-]?\d+)?)"
 
@@ -97,11 +172,11 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
 def _read(path: Path, statements: Said, key: str, quaternions: Order) -> Content | None:
     where = str(path)
     if path.is_dir():
-        model = colmap.model_file(path)
+        model = model_file(path)
         return read_content(model, statements) if model is not None else _of_folder(path, statements)
     try:
-        if path.name == colmap.BINARY:
-            return colmap.read_binary(path, where)
+        if path.name == IMAGES_BINARY:
+            return read_model_binary(path, where)
         data = read_bytes(path, TABLE_BYTES)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
@@ -132,8 +207,8 @@ def _of_text(text: str, path: Path, statements: Said, key: str, quaternions: Ord
         return _required(read_tree(content, "JSON", statements, where), where)
     if (content := read_program(text, where)) is not None:
         return content
-    if colmap.is_text(text):
-        return colmap.read_text(text, where)
+    if is_model(text):
+        return read_model(text, where)
     content = read_numbers(text, statements, where)
     if content is not None:
         return content

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
 from stcal.handeye.data.robot_poses import read_robot_poses
-from stcal.workflows.handeye.inputs import read_input, two_files
+from stcal.workflows.handeye.inputs import one_source, read_input
 from tests.handeye.written import easy_handeye, in_metres, line, matrices, message, moveit, ros_csv, tum
 from tests.outcome import fails_with
 from tests.support.handeye import simulated
@@ -376,7 +376,7 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     with fails_with("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm"):
         read_input(path, statements=said)
     with fails_with("E-POSES-NOT-FOUND … u … --columns"):
-        two_files(path, path, "image", said)
+        one_source(path, path, "image", said)
     with fails_with("E-POSES-NOT-FOUND … u … --columns"):
         read_robot_poses(path, statements=said)
 
@@ -396,7 +396,7 @@ def test_maps_of_columns(tmp_path):
     )
     table = written(tmp_path, text, "robot.csv")
     np.save(tmp_path / "camera.npy", GOOD)
-    found = two_files(table, tmp_path / "camera.npy", "image", Said(), columns=(map_file, None))
+    found, _ = one_source(table, tmp_path / "camera.npy", "image", Said(), columns=(map_file, None))
     np.testing.assert_array_equal(found.pairs.base_from_flange.translation, GOOD[:, :3, 3])
     robot = read_robot_poses(table, statements=Said(columns=map_file))
     np.testing.assert_array_equal(robot.base_from_flange.translation, GOOD[:, :3, 3])

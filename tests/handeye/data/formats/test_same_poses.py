@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.handeye.data.formats.record import Said
-from stcal.workflows.handeye.inputs import read_input, two_files
+from stcal.workflows.handeye.inputs import one_source, read_input
 from tests.handeye.written import FORMATS
 from tests.support.handeye import simulated
 
@@ -24,7 +24,7 @@ def read(arguments, path=None):
     said = Said.of_options(options["--rotation"], options["--length-unit"], options["--poses-are"])
     if source is not None:
         return read_input(Path(source), statements=said)
-    told = two_files(Path(options["--a"][0]), Path(options["--b"][0]), "image", said)
+    told, _ = one_source(Path(options["--a"][0]), Path(options["--b"][0]), "image", said)
     return read_input(told, statements=said)
 
 

@@ -1,22 +1,104 @@
-"""Command ``stcal handeye``: the pose of a camera on the robot's flange, or beside the robot, with its uncertainty."""
+"""Commands ``stcal handeye``, ``handeye plan`` and ``handeye rig``: where cameras are on or beside a robot, with σ, and
+which robot poses to take next."""
 
 import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import stcal.cli.handeye.inputs as params
+import typer
+
 from stcal.cli import options as shared
-from stcal.cli.declare import WRITES, Opt
+from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
+from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
+    from stcal.geometry.rigid import Order
     from stcal.handeye import EvolutionOptions
+    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.pairs import Setup
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export import CameraFrame
     from stcal.handeye.report.outcome import Outcome
+    from stcal.workflows.handeye.inputs import Source
+    from stcal.workflows.handeye.robot_at_images import Timing
+
+
+SetupName = Literal["eye-in-hand", "eye-to-hand"]
+"""Name of the setup, by the carrier of the camera."""
+
+
+SourceFile = Annotated[
+    Path | None,
+    "Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), or "
+    "samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
+    Arg("POSES|IMAGES"),
+]
+PosesFile = Annotated[
+    Path | None,
+    "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS …; or "
+    "from this folder, with a file for each image.",
+]
+OwnCamera = Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."]
+OwnBoard = Annotated[
+    Path | None,
+    "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
+    "circles, tags, or several boards.",
+]
+SetupOption = Annotated[
+    SetupName | None,
+    "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file decides; "
+    "if it does not say, eye-in-hand.",
+]
+RotationOption = Annotated[
+    list[str] | None,
+    "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
+    "xyz (fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
+]
+LengthUnit = Annotated[
+    list[str] | None,
+    "Take lengths in this unit, if the file does not name it: mm, m, cm, um, in; robot=… or camera=… for one side.",
+]
+PosesAre = Annotated[
+    list[str] | None,
+    "Take poses in this direction, if the file does not name it: base_from_flange or flange_from_base, and "
+    "camera_from_board or board_from_camera; once for each side.",
+]
+TimeTolerance = Annotated[
+    float,
+    "Take the robot's nearest pose within this time, s, if none can be interpolated.",
+    Opt(min=0, max=3600),
+]
+
+
+def source_of(
+    source: Path | None,
+    first: Path | None,
+    second: Path | None,
+    key: str,
+    statements: "Said",
+    quaternions: "Order",
+    timing: "Timing | None" = None,
+    columns: Path | None = None,
+    columns_a: Path | None = None,
+) -> "Source":
+    """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
+    from stcal.workflows.handeye.inputs import one_source
+    from stcal.workflows.handeye.robot_at_images import Timing
+
+    maps = columns_a, columns
+    if source is None and first is not None and second is not None:
+        told, notes = one_source(first, second, key, statements, quaternions, timing or Timing(), maps)
+        print_each("note", notes)
+        return told
+    if source is not None and columns is not None and source.is_file():
+        return one_source(source, None, key, statements, quaternions, timing or Timing(), maps)[0]
+    if source is not None and source.is_dir():
+        columns = None  # of the robot's poses
+    return shared.one_table(source, first, second, key, "POSES|IMAGES", columns=columns, columns_a=columns_a)
+
 
 EVOLVED = ("de", "de-polished")
 """Methods that take the options ``--de-…``."""
@@ -29,14 +111,14 @@ CameraFrameName = Literal["optical", "link"]
 
 
 def handeye(
-    source: params.SourceFile = None,
-    poses: params.PosesFile = None,
-    camera: params.OwnCamera = None,
-    board: params.OwnBoard = None,
-    setup: params.SetupOption = None,
-    rotation: params.RotationOption = None,
-    length_unit: params.LengthUnit = None,
-    poses_are: params.PosesAre = None,
+    source: SourceFile = None,
+    poses: PosesFile = None,
+    camera: OwnCamera = None,
+    board: OwnBoard = None,
+    setup: SetupOption = None,
+    rotation: RotationOption = None,
+    length_unit: LengthUnit = None,
+    poses_are: PosesAre = None,
     dry_run: Annotated[bool, "Print how the files were understood; solve and write nothing."] = False,
     method: Annotated[
         str | None,
@@ -91,7 +173,7 @@ def handeye(
     times_columns: Annotated[
         Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
     ] = None,
-    time_tolerance: params.TimeTolerance = 0.02,
+    time_tolerance: TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
         "Hold out this many motions at the end, and predict them from the motions before, as the paper on "
@@ -161,10 +243,10 @@ def handeye(
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.export import (
+        FORMS,
         exported,
         opencv_yaml,
         require_export_written,
-        require_form,
         ros_yaml,
         urdf_joint,
     )
@@ -176,7 +258,7 @@ def handeye(
     from stcal.workflows.handeye.calibrate import calibrate_handeye
     from stcal.workflows.handeye.inputs import dry_run as understood
     from stcal.workflows.handeye.inputs import read_handeye, without_flips
-    from stcal.workflows.handeye.times import Timing
+    from stcal.workflows.handeye.robot_at_images import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
@@ -187,13 +269,13 @@ def handeye(
             f"--times-columns {times_columns}: it describes a table of image times; give --image-times",
         )
     timing = Timing(time_tolerance, image_times, time_offset, times_columns)
-    pairs = params.source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
+    pairs = source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     statements = replace(statements, columns=columns) if folder else statements
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = shared.exports_of(export or [], require_form)
+    exports = shared.exports_of(export or [], FORMS)
     _require_frames(ros or urdf, exports, setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
@@ -396,3 +478,147 @@ def _save_camera(path: Path, outcome: "Outcome") -> None:
 
 def _radians(degrees: float | None) -> float | None:
     return None if degrees is None else math.radians(degrees)
+
+
+def plan(
+    source: SourceFile = None,
+    poses: PosesFile = None,
+    camera: OwnCamera = None,
+    board: OwnBoard = None,
+    setup: SetupOption = None,
+    rotation: RotationOption = None,
+    length_unit: LengthUnit = None,
+    poses_are: PosesAre = None,
+    robot_file: Annotated[
+        Path | None,
+        "Plan only poses that this robot reaches within its joint limits (TOML), and give their joint values.",
+        Opt("--robot"),
+    ] = None,
+    count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3,
+    seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    quaternions: shared.Quaternions = "wxyz",
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
+) -> None:
+    """Name further robot poses that would lower the worst σ of a hand-eye calibration, at the board, most."""
+    from stcal.handeye.data.formats.record import Said
+    from stcal.handeye.plan import planned_csv, planned_file, planned_report
+    from stcal.io.table import require_pose_table_written
+    from stcal.robot import load_robot
+    from stcal.workflows.handeye.calibrate import plan_handeye
+    from stcal.workflows.handeye.inputs import read_handeye
+
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
+    pairs = source_of(source, first, second, key, statements, quaternions, None, columns, columns_a)
+    statements = replace(statements, columns=columns) if isinstance(pairs, Path) and pairs.is_dir() else statements
+    robot = load_robot(robot_file) if robot_file else None
+    with StageProgress() as progress:
+        inputs = read_handeye(
+            pairs,
+            poses,
+            camera,
+            board,
+            setup=setup,
+            rotation=rotation or (),
+            length_unit=length_unit or (),
+            poses_are=poses_are or (),
+            quaternions=quaternions,
+            columns=statements.columns,
+            workers=workers,
+            progress=progress,
+        )
+    for line in inputs.understood:
+        say(line)
+    planned = plan_handeye(inputs, count, robot, seed)
+    say(planned_report(planned.result, planned.poses, planned.joints).text())
+    for name, reason in inputs.left_out:
+        say(f"left out {name}: {reason}")
+    print_each("note", planned.notes)
+    write_if(out, lambda: planned_csv(planned.poses, planned.joints))
+    if out:
+        frames = ("base_from_flange", "camera_from_board")
+        require_pose_table_written(out, {f"{name}_": getattr(planned.poses, name) for name in frames})
+    write_if(json_file, lambda: planned_file(planned.result, planned.poses, planned.joints))
+
+
+def rig(
+    rig_file: Annotated[
+        Path,
+        "Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file (TOML).",
+        Arg("RIG.toml"),
+    ],
+    refine_camera: Annotated[
+        bool, "Adjust the intrinsics of each camera too, starting from its file and weighted by their σ."
+    ] = False,
+    with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
+    rotation: RotationOption = None,
+    length_unit: LengthUnit = None,
+    poses_are: PosesAre = None,
+    quaternions: shared.Quaternions = "wxyz",
+    time_tolerance: TimeTolerance = 0.02,
+    held_out: Annotated[
+        int | None,
+        "Hold out this many of the robot's poses in each split; a quarter of them if not given.",
+        Opt(min=1, max=100_000),
+    ] = None,
+    splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+    strict: shared.Strict = False,
+) -> None:
+    """Find where several cameras are on one flange, or in one base, and relative to each other, in one adjustment."""
+    from stcal.handeye.data.views import read_rig_file
+    from stcal.handeye.report.file import HandEyeRigFile
+    from stcal.handeye.report.outcome import rig_judged
+    from stcal.handeye.report.rig_page import rig_report
+    from stcal.workflows.handeye.rig import calibrate_handeye_rig, read_handeye_rig
+
+    files = read_rig_file(rig_file)
+    written = {"--out": out, "--json": json_file, "--report": report}
+    keep_apart([(name, path) for name, path in written.items() if path], files.read())
+    with StageProgress() as progress:
+        inputs = read_handeye_rig(
+            files,
+            rotation=rotation or (),
+            length_unit=length_unit or (),
+            poses_are=poses_are or (),
+            quaternions=quaternions,
+            tolerance_s=time_tolerance,
+            workers=workers,
+            progress=progress,
+        )
+        print_each("understood", inputs.understood)
+        outcome = calibrate_handeye_rig(
+            inputs,
+            refine_camera,
+            with_scale,
+            repeats=splits,
+            held_out=held_out,
+            seed=seed,
+            workers=workers,
+            progress=progress,
+        )
+    document = rig_report(outcome)
+    say(document.text())
+    for name, what, why in outcome.left_out():
+        say(f"left out {name}: {what}: {why}")
+    print_each("note", outcome.all_notes())
+    write_if(out, lambda: HandEyeRigFile.of(outcome))
+    write_if(report, document.page)
+    write_if(json_file, lambda: HandEyeRigFile.of(outcome, whole=True))
+    shared.require_passed(strict, rig_judged(outcome).failed(), report, rig_judged(outcome).doubt())
+
+
+app = typer.Typer()
+app.command("handeye")(handeye)
+app.command("handeye plan")(plan)
+app.command("handeye rig")(rig)

@@ -22,7 +22,7 @@ from stcal.robot.kinematics.dh import robot_between
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import fixed_values, forward
 from stcal.robot.kinematics.model import Convention, DHRow, Joint, Robot
-from stcal.robot.urdf.read import UrdfJoint, require_near, robot_of
+from stcal.robot.urdf import UrdfJoint, require_near, robot_of
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 JOINTS = 6

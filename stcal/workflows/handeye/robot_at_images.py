@@ -1,4 +1,4 @@
-"""The robot's poses at the times of images, and the options of the offset between the clocks of both."""
+"""The robot's poses at images: at the times of the images, or by joint values of an arm that is to be adjusted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,9 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.handeye.data.formats.record import require_each_once
+from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import table_of
+from stcal.io.table import read_table
+from stcal.robot import Robot
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.forward import chain_jacobian, chain_parameters, flange_poses, moved_chain
+from stcal.robot.kinematics.measurements import joint_values
+from stcal.robot.kinematics.model import Chain
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,3 +159,71 @@ def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples
         raise InputError(
             "E-POSES-UNTIMED", f"{robot.where}: no times of its poses{first}; give a column time_s, or a TUM trajectory"
         )
+
+
+COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """A robot at joint values (m, n), moved by small motions of its axes: a model of an arm as in
+    :class:`stcal.handeye.methods.bundle.ArmModel`.
+
+    Its base and flange frames stay where they are: X and Z absorb the error of their places.
+    """
+
+    robot: Robot
+    q: np.ndarray
+
+    @property
+    def angles(self) -> np.ndarray:
+        """Boolean array (k,): True for parameters in rad."""
+        return np.array([component < 3 for _, component in chain_parameters(self._chain())])
+
+    def poses(self, parameters: np.ndarray) -> Poses:
+        """Returns base_from_flange, m poses."""
+        return flange_poses(moved_chain(self._chain(), parameters), self.q)
+
+    def slope(self, parameters: np.ndarray) -> np.ndarray:
+        """Returns the derivative (m, 6, k) of :meth:`poses` by a step of the parameters."""
+        chain = moved_chain(self._chain(), parameters)
+        return chain_jacobian(chain, self.q, flange_poses(chain, self.q))
+
+    def __getitem__(self, rows) -> "Arm":
+        """Returns the arm at these joint values alone."""
+        return Arm(self.robot, self.q[rows])
+
+    def identified(self, parameters: np.ndarray) -> Robot:
+        """Returns the robot with these parameters, as D-H rows; base and tools stay as they were."""
+        moved = robot_from_chain(moved_chain(self._chain(), parameters), dict(self.robot.tools), self.robot)
+        return replace(moved, world_from_base=self.robot.world_from_base)
+
+    def names(self) -> tuple[str, ...]:
+        """Returns the names (k,) of the parameters: J2 rx in rad, J2 x in mm, in the frame of the joint."""
+        return tuple(f"J{joint + 1} {COMPONENTS[c]}" for joint, c in chain_parameters(self._chain()))
+
+    def _chain(self) -> Chain:
+        return replace(self.robot, world_from_base=Rigid()).chain()
+
+
+def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[RobotPoses, Arm]:
+    """Returns the robot's poses by its file, from a table with columns ``image`` and ``q1_deg`` … (CSV).
+
+    Where the table has base_from_flange_… too, ``understood`` says how far these poses are off.
+
+    Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
+    """
+    table = read_table(path, "robot poses", quaternions)
+    arm = Arm(robot, joint_values(table, robot))
+    images, places = tuple(table.text("image")), tuple(f"line {line}" for line in table.lines)
+    require_each_once(images, places, table.where, "image ")
+    flange = arm.poses(np.zeros(len(arm.angles)))
+    understood = f"{path.name}: joint values of {len(images)} images; poses by the file of {robot.name}"
+    if any(name.startswith(side) for side in SIDES[0] for name in table.columns):
+        reported, *_ = read_side(table, *SIDES[0])
+        apart = (reported.inverse() @ flange).difference((reported.inverse() @ flange)[[0] * len(flange)])
+        understood += (
+            f"; its flange moves against the one reported by up to {np.linalg.norm(apart[:, 3:], axis=1).max():.3g} mm "
+            f"and {np.degrees(np.linalg.norm(apart[:, :3], axis=1).max()):.2g}°"
+        )
+    return RobotPoses(images, flange, None, places, table.where, understood, own=False), arm

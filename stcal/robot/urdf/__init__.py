@@ -1,1 +1,0 @@
-"""Robots as URDF, in metres and rad."""
