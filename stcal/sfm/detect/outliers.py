@@ -20,8 +20,8 @@ Centres of clear circles are good to hundredths, designs to tenths.
 """
 BEYOND = 4.0
 """Factor on the median deviation of the plane's circles: 4.7 σ of normal errors, exceeded by one in 60 000."""
-BEYOND_SIGMA = 6.0
-"""Smallest outlying distance in σ of the centre."""
+BEYOND_SIGMA = 5.0
+"""Smallest outlying distance in σ of the centre; one normal error in 270 000 is larger (two coordinates)."""
 MIN_USUAL = 6
 """Least number of circles for a plane's own pose and median. Circles of other planes
 are judged by the poses and the median of all."""
