@@ -12,6 +12,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.text import join, number, significant
 
@@ -448,9 +449,10 @@ def _by_sigma(report: dict) -> _Cause:
         if name not in (worst, report["reference_face"]) and row["translation_sigma_um"] is not None
     ]
     if others and sigma > TAIL * median(others):
+        of_groups = "" if face["groups"] == [TOP_GROUP] else f", of group {join(face['groups'])}"
         return _Cause(
             f"Face {worst}: {number(sigma, 1)} µm along {'xyz'[axis]}, where the others have "
-            f"{number(median(others), 1)} µm; {face['images']} images show it, of group {join(face['groups'])}.",
+            f"{number(median(others), 1)} µm; {face['images']} images show it{of_groups}.",
             f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
         )
     return _by_images(report, sigma, photographs, of_all)

@@ -132,6 +132,9 @@ def test_the_face_that_stands_out_limits():
     limit, remedy = (getattr(judgement_of(report(f4=[6.0, 3.0, 2.0])), key) for key in ("limit", "next"))
     assert limit == "Face 4: 6.0 µm along x, where the others have 2.0 µm; 2 images show it, of group a."
     assert remedy.startswith("Add images that show face 4;")
+    of_one_folder = report(f4=[6.0, 3.0, 2.0])
+    of_one_folder["faces"]["4"]["groups"] = ["."]
+    assert judgement_of(of_one_folder).limit.endswith("; 2 images show it.")
     assert judgement_of(report(f4=[3.9, 2.0, 2.0])).limit.startswith("The centring")  # less than twice 2.0 µm
 
 
