@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from stcal.design import KnownDistance, ScaleReference, StatedSize
 from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board
+from stcal.io.files import RUN_MARKER, json_text
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.file import BudgetFile
 from stcal.sfm.budget.lengths import against_stated
@@ -17,9 +18,10 @@ from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
 from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.transaction import MarkerFile, digest_of
 from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error
-from tests.shared import own_copy
+from tests.shared import own_copy, unsealed_copy
 
 STATEMENT = """
 [fields]
@@ -294,6 +296,9 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     title = report["checks"][1]["title"]
     report["checks"][1]["verdict"] = "failed"
     (copy / "report.json").write_text(json.dumps(report))
+    marker = MarkerFile.model_validate_json((copy / RUN_MARKER).read_text())
+    sealed = marker.sealed(marker.sha256 | {"report.json": digest_of(copy / "report.json")})
+    (copy / RUN_MARKER).write_text(json_text(sealed))
     code, text, error = stcal_sfm("budget", copy)
     assert (code, "--no-strict" in error) == (4, True)
     assert title in error or "No" in error
@@ -342,7 +347,7 @@ def test_fields_that_are_none(stcal_sfm, small_run):
 
 def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
     copy = tmp_path / "run"
-    own_copy(small_run, copy)
+    unsealed_copy(small_run, copy)
     faces = json.loads((copy / "faces.json").read_text())
     (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
     assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")

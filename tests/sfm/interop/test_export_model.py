@@ -19,7 +19,7 @@ from stcal.errors import InputError
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_model import export_model
-from tests.shared import own_copy
+from tests.shared import unsealed_copy
 
 AGAIN_PX = 5e-5
 """The eccentricity, settled group by group in ``labels.csv``, is computed again in the joint adjustment: nanometres."""
@@ -278,7 +278,7 @@ def refusal(run, out) -> str:
 
 def test_two_focal_lengths_become_one(small_run, tmp_path, keypoints):
     own = tmp_path / "run"
-    own_copy(small_run, own)
+    unsealed_copy(small_run, own)
     model = read_camera(own / "cameras.txt")
     camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
     write_cameras_txt(own / "cameras.txt", camera)
@@ -315,7 +315,7 @@ def test_labels_carry_group_and_sigma(exported, known):
 
 def test_a_chained_run_has_no_sigma(small_run, tmp_path):
     own = tmp_path / "run"
-    own_copy(small_run, own)
+    unsealed_copy(small_run, own)
     faces = json.loads((own / "faces.json").read_text(encoding="utf-8"))
     del faces["circle_covariance_mm2"]
     (own / "faces.json").write_text(json.dumps(faces), encoding="utf-8")
@@ -325,7 +325,7 @@ def test_a_chained_run_has_no_sigma(small_run, tmp_path):
 
 def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(small_run, tmp_path):
     own = tmp_path / "run"
-    own_copy(small_run, own)
+    unsealed_copy(small_run, own)
     for name in ("labels.csv", "report.json"):
         text = (own / name).read_text(encoding="utf-8")
         (own / name).write_text(text.replace("IMG_1000", "IMG 1000"), encoding="utf-8")
@@ -406,7 +406,7 @@ def test_errors(small_run, stcal_sfm, tmp_path):
     assert "format obj: unknown; give one of colmap-bin" in refused(small_run, out, "obj")
     assert "not a run's folder" in refused(tmp_path, out)
     own = tmp_path / "run"
-    own_copy(small_run, own)
+    unsealed_copy(small_run, own)
     model = own / "target_model"
     labels = (own / "labels.csv").read_text(encoding="utf-8")
     head, *rows = labels.splitlines(keepends=True)

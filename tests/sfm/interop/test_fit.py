@@ -9,14 +9,14 @@ import pytest
 
 from stcal.sfm.interop.export_model import export_model
 from tests.outcome import fails_with
-from tests.shared import own_copy
+from tests.shared import own_copy, unsealed_copy
 
 
 @pytest.fixture(scope="module")
 def own_run(small_run, tmp_path_factory):
     """A copy of the small run; every test writes its model anew."""
     folder = tmp_path_factory.mktemp("fit") / "run"
-    own_copy(small_run, folder, ignore=shutil.ignore_patterns("cache", "overlays"))
+    unsealed_copy(small_run, folder, ignore=shutil.ignore_patterns("cache", "overlays"))
     return folder
 
 

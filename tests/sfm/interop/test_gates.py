@@ -14,7 +14,7 @@ from stcal.sfm.interop.gates import group_gates, limits_text, own_gates
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import seeded_mapping
 from stcal.sfm.mapping.pairs import PairOptions, PairScore
-from tests.shared import own_copy
+from tests.shared import unsealed_copy
 
 
 def turned(camera_from_target: Rigid, centre: np.ndarray, axis: np.ndarray, degrees: float) -> Rigid:
@@ -217,7 +217,7 @@ def test_errors(small_run, stcal_sfm, tmp_path):
     assert stcal_sfm("pairs", small_run, "--group", "99")[2].startswith("error: group 99: not in run")
     assert "not a run's folder" in stcal_sfm("pairs", tmp_path)[2]
     own = tmp_path / "run"
-    own_copy(small_run, own)
+    unsealed_copy(small_run, own)
     report = json.loads((own / "report.json").read_text(encoding="utf-8"))
     report["groups"][0]["pairs"][-1]["first"] = "12/none.jpg"
     (own / "report.json").write_text(json.dumps(report), encoding="utf-8")

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import asdict
 from importlib import import_module
@@ -19,7 +20,7 @@ from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error, fails_with
-from tests.shared import own_copy
+from tests.shared import own_copy, unsealed_copy
 
 FRAME = ("id", "ids", "origin", "x", "y")
 UNLABELLED = "12/IMG_1001.jpg"
@@ -346,12 +347,26 @@ def test_a_damaged_copy_of_what_the_run_was_given(own_run, stcal_sfm, name, cont
     assert_error(stcal_sfm(*faces_of(own_run)), INPUT, f"file {own_run / name}: ", part)
 
 
-def test_rows_of_the_images_in_another_order_are_the_same(own_run, small_run):
+def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
     """Rows name their image; what counts is their order in it."""
-    rows(lambda body: sorted(body, key=lambda row: (-int(row[0]), int(row[1]))))(own_run / "labels.csv")
-    found, known = load_run(own_run), load_run(small_run)
+    run = unsealed_copy(small_run, tmp_path / "run")
+    rows(lambda body: sorted(body, key=lambda row: (-int(row[0]), int(row[1]))))(run / "labels.csv")
+    found, known = load_run(run), load_run(small_run)
     assert [image.labels for image in found.observations] == [image.labels for image in known.observations]
     assert all(np.array_equal(a, b) for a, b in zip(found.corrected_px, known.corrected_px, strict=True))
+
+
+def nudge(path):
+    """Changes a digit of a number, which stays readable."""
+    text = path.read_text(encoding="utf-8")
+    place = max(match.start() for match in re.finditer(r"(?<=\d\.\d)\d", text))
+    path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["labels.csv", "faces.json", "report.json", "cameras.txt", "target.toml"])
+def test_a_file_with_another_digit_is_refused(own_run, stcal_sfm, name):
+    nudge(own_run / name)
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-CHANGED", str(own_run / name), "run it again")
 
 
 def test_reading_writes_nothing(own_run):
