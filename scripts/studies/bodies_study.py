@@ -8,7 +8,9 @@ face's pose against the reference face over its covariance, of 6, mean over face
 """
 
 import argparse
+import multiprocessing
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +21,9 @@ from stcal.boards.target import printed_face
 from stcal.design import TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
-from stcal.sfm import pipeline
-from stcal.sfm.report.compare import compare
+from stcal.parallel import one_thread
+from stcal.sfm import RunOptions, pipeline
+from stcal.sfm.report.compare import FaceErrors, compare
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import second_design, tag_cube, tag_dodecahedron
 
@@ -51,6 +54,27 @@ BODIES = {
 WIDTH = 900
 
 
+@one_thread()
+def draw(name: str, seed: int) -> list[FaceErrors] | str:
+    """Returns the errors of one draw's faces, or why its run failed."""
+    target, distance_mm, images = BODIES[name]
+    options = BodyOptions(images=images, distance_mm=distance_mm, seed=seed, print_errors=1.0)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        write_body(folder / "set", make_body_scene(target, body_camera(WIDTH), options), workers=1)
+        try:
+            pipeline.run(
+                folder / "set/images",
+                None,
+                folder / "run",
+                folder / "set/target.toml",
+                options=RunOptions(workers=1),
+            )
+            return list(compare(folder / "run", folder / "set/truth.json").faces.values())
+        except StcalError as error:
+            return str(error)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -60,38 +84,29 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     print("| body | draws | faces found | error of a position, µm RMS | of a rotation, mdeg RMS | NEES |")
-    print("|---|---|---|---|---|---|")
-    for name, (target, distance_mm, images) in BODIES.items():
-        if arguments.body not in f"{name}, {target.name}":
-            continue
-        position, rotation, normalised, found, lost = [], [], [], 0, 0
-        for seed in range(arguments.draws):
-            scene = make_body_scene(
-                target,
-                body_camera(WIDTH),
-                BodyOptions(images=images, distance_mm=distance_mm, seed=seed, print_errors=1.0),
-            )
-            with tempfile.TemporaryDirectory() as scratch:
-                folder = Path(scratch)
-                write_body(folder / "set", scene)
-                try:
-                    pipeline.run(folder / "set/images", None, folder / "run", folder / "set/target.toml")
-                    errors = compare(folder / "run", folder / "set/truth.json")
-                except StcalError as error:
-                    print(f"draw {seed}: {error}", flush=True)
-                    lost += 1
-                    continue
-            found += len(errors.faces)
-            of_faces = [face for face in errors.faces.values() if face.normalised_error is not None]
-            position += [face.translation_um for face in of_faces]
-            rotation += [face.rotation_mdeg for face in of_faces]
-            normalised += [face.normalised_error for face in of_faces]
-        wanted = len(target.faces) * arguments.draws
-        rms = [float(np.sqrt(np.mean(np.square(values)))) for values in (position, rotation)]
-        nees = float(np.mean(np.square(normalised)))
+    print("|---|---|---|---|---|---|", flush=True)
+    names = [name for name in BODIES if arguments.body in f"{name}, {BODIES[name][0].name}"]
+    seeds = range(arguments.draws)
+    pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
+    answers = pool.map(draw, *zip(*[(name, seed) for name in names for seed in seeds], strict=True))
+    for name in names:
+        faces, lost = [], 0
+        for seed in seeds:
+            answer = next(answers)
+            if isinstance(answer, str):
+                print(f"draw {seed}: {answer}", flush=True)
+                lost += 1
+            else:
+                faces += answer
+        judged = [face for face in faces if face.normalised_error is not None]
+        position, rotation, sigmas = (
+            float(np.sqrt(np.mean([getattr(face, key) ** 2 for face in judged])))
+            for key in ("translation_um", "rotation_mdeg", "normalised_error")
+        )
+        wanted = len(BODIES[name][0].faces) * arguments.draws
         print(
-            f"| {name} | {arguments.draws - lost} of {arguments.draws} | {found} of {wanted} | {rms[0]:.0f} | "
-            f"{rms[1]:.0f} | {nees:.2f} |",
+            f"| {name} | {arguments.draws - lost} of {arguments.draws} | {len(faces)} of {wanted} | {position:.0f} | "
+            f"{rotation:.0f} | {sigmas**2:.2f} |",
             flush=True,
         )
 

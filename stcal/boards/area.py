@@ -67,15 +67,38 @@ def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[n
     return (inverse @ products(design, weight, right[..., None]))[..., 0], inverse
 
 
-def of_sampling(phase: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Return the gradients (m, p, s, 2) by a displacement of 1 px that follows the cosine, or the sine, of the phase.
+def passed_by_blur(rise: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Return the displacements (m,) of edges by sampling, relative to that of an edge along the rows.
 
-    Sampling displaces an edge by an amount that depends on its place between two pixels, ``phase`` (m, p, s) in pixels,
-    and comes again from pixel to pixel: in an edge along the rows it is one for all profiles, in a turned one it
-    averages out. Its first harmonic is what is modelled.
+    They come from what the image contains at the frequency of the pixels across the edge: 1/px along the rows, √2/px
+    along the diagonals, where all profiles of an edge have one phase too. A Gaussian blur of variance σ² passes
+    exp(−2π²σ²f²) of a frequency f.
+
+    ``rise`` : (m,) change of the distance from the edge from one pixel to the next; ``variance`` : (m,) of the blur.
     """
-    angle = 2 * np.pi * phase
-    return gradient[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.exp(-2 * np.pi**2 * variance * (rise**-2 - 1))
+
+
+def of_sampling(distance: np.ndarray, rise: np.ndarray, variance: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Return the gradients (m, p, s, 2) by a displacement that follows the cosine, or the sine, of the phase.
+
+    The displacement is 1 px in an edge along the rows.
+    Sampling displaces an edge by an amount that depends on its place between two pixels and comes again from pixel to
+    pixel: in an edge along the rows it is one for all profiles, in a turned one it averages out. Its first harmonic is
+    what is modelled.
+
+    Parameters
+    ----------
+    distance : (m, p, s) array
+        Distances of the pixels from the edges.
+    rise, variance : (m,) arrays
+        As of :func:`passed_by_blur`.
+    gradient : (m, p, s) array
+        Derivative of the grey values by the place of the edge.
+    """
+    rise, passed = (value[:, None, None] for value in (rise, passed_by_blur(rise, variance)))
+    angle = -2 * np.pi * distance / rise
+    return (passed * gradient)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +249,7 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
         step, slope = integrated_step(sign * away, pieces.normal, blur)[:2]
         design = np.stack([-own[:, 2] * sign * slope, np.ones_like(step), step], axis=-1)
         residual = level - own[:, 1] - own[:, 2] * step
-        sampling = of_sampling(-away / rise[:, None, None], design[..., 0])
+        sampling = of_sampling(away, rise, blur, design[..., 0])
         rows = products(design, used, np.concatenate([design, sampling, residual[..., None]], -1))
         total = np.zeros((len(value), 3, 6))
         np.add.at(total, group, rows)

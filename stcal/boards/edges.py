@@ -14,6 +14,7 @@ from stcal.boards.area import (
     displacement_variance,
     integrated_step,
     of_sampling,
+    passed_by_blur,
     products,
     reach_of,
     solved,
@@ -330,7 +331,7 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
     shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
     noise = _noise_of(residual, distance, weight)
     factor = noise * _growth_of_tags(residual, design[..., 0], weight, noise, good, shape)
-    sampling = of_sampling(-distance / pixels.rise[:, None, None], design[..., 0])  # whole pixels do not count
+    sampling = of_sampling(distance, pixels.rise, value[:, 2], design[..., 0])
     pull = products(design, weight, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
     by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
@@ -532,8 +533,9 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
     near = np.where(np.abs(distance[0]) <= np.abs(distance[1]), place[0], place[1] + 4 * half)
     growth = _growth(pull, residual, near, noise, 2 * half + 1, float(np.median(value[:, 4])))
     covariance = growth * noise[:, None, None] * inverse[:, :2, :2]
-    for displaced, apart in ((first, distance[0]), (second, distance[1])):
-        covariance += PRIOR_PX**2 * _common(pull * displaced[..., None], apart, half)
+    for e, displaced in enumerate((first, second)):
+        passed = passed_by_blur(np.abs(normal[:, e]).max(1), value[:, 4])
+        covariance += (PRIOR_PX * passed[:, None, None]) ** 2 * _common(pull * displaced[..., None], distance[e], half)
     seen = (
         inside
         & (redundancy > q)

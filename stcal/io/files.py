@@ -2,6 +2,7 @@
 
 import codecs
 import errno
+import hashlib
 import json
 import os
 import tempfile
@@ -215,6 +216,26 @@ def save_folder(out: Path, files: dict[str, str]) -> None:
             raise InputError(
                 "E-OUTPUT-UNWRITABLE", f"{out}: cannot be written: {error.strerror or error}; give another place"
             ) from error
+
+
+def require_unchanged(path: str | Path) -> None:
+    """Refuses a file of a run's folder that is not as the run left it, by the hash that the run's marker holds.
+
+    Files elsewhere, and those of runs without hashes, pass.
+    """
+    path = Path(path)
+    if path.name == RUN_MARKER:
+        return
+    try:
+        known = json.loads(text_of(read_bytes(path.parent / RUN_MARKER, TABLE_BYTES)))["sha256"][path.name]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return
+    with open(path, "rb") as stream:
+        if hashlib.file_digest(stream, "sha256").hexdigest() == known:
+            return
+    raise InputError(
+        "E-RUN-CHANGED", f"{path}: changed since its run ended; take a copy that is whole, or run it again"
+    )
 
 
 def json_text(content) -> str:

@@ -18,7 +18,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
-from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, text_of
+from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, require_unchanged, text_of
 
 LONGEST = 80
 """Largest number of characters of a value that a message shows."""
@@ -213,12 +213,14 @@ def checked(content: dict[str, Any], model: type[F]) -> F:
 
 
 def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
-    """Read a result file; errors are those of :func:`read_json` and :func:`checked`."""
+    """Read a result file; errors are those of :func:`read_json`, :func:`checked` and :func:`require_unchanged`."""
     content = read_json(path, what, remedy)
     try:
-        return checked(content, model)
+        result = checked(content, model)
     except InputError as error:
         raise InputError(error.code, f"{what} {path}: {error}; {remedy}") from error
+    require_unchanged(path)
+    return result
 
 
 def require_result_written(path: str | Path, content: ResultFile) -> None:

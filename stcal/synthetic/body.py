@@ -361,8 +361,10 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarr
 
 def _off_at(places: np.ndarray, xy_mm: np.ndarray, off_mm: np.ndarray) -> np.ndarray:
     """Returns how far places (…, 2) are off: linear between the points ``xy_mm``, beyond them as the nearest one."""
-    between = LinearNDInterpolator(xy_mm, off_mm)(places)
-    return np.where(np.isnan(between), NearestNDInterpolator(xy_mm, off_mm)(places), between)
+    off = LinearNDInterpolator(xy_mm, off_mm)(places)
+    beyond = np.isnan(off).reshape(*places.shape[:-1], -1).any(-1)
+    off[beyond] = NearestNDInterpolator(xy_mm, off_mm)(places[beyond])
+    return off
 
 
 def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.io.files import RUN_MARKER
 from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged
 from tests.fuzzing.judged import OUT, Outcome, failures, hashes, in_process, lay_out
@@ -41,7 +42,7 @@ def of_kept(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     calls = [call for call in CALLS if _reads_kept(call) and call.seconds <= LONGEST_CALL_S and not call.code]
     call = pick(rng, calls)
     clean = _clean(stock, folder, call)
-    read, written = lay_out(stock, folder, call, earlier=False)
+    read, written = _laid_out(stock, folder, call)
     files = [path for below in (read, written) for place in KEPT_IN for path in _kept(below / place)]
     laid_out = hashes(folder)
     said = [_spoil(files, rng) for _ in range(1 + int(rng.integers(2)))]
@@ -59,6 +60,15 @@ def of_kept(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     return Judged(
         f"s{number}", f"{call.command}: {'; '.join(said)}", tuple(found), outcome.code, outcome.seconds, call.command
     )
+
+
+def _laid_out(stock: Path, folder: Path, call: Call) -> tuple[Path, Path]:
+    """As :func:`lay_out`; a single file of a run has the run's marker beside it."""
+    read, written = lay_out(stock, folder, call, earlier=False)
+    for place in KEPT_IN:
+        if (read / place).is_dir() and not (read / place / RUN_MARKER).exists():
+            shutil.copyfile(stock / place / RUN_MARKER, read / place / RUN_MARKER)
+    return read, written
 
 
 def _all_said(call: Call, folder: Path, outcome: Outcome) -> str:
@@ -85,7 +95,7 @@ def _clean(stock: Path, folder: Path, call: Call) -> dict[str, str]:
     """Digests of the answers on good data, of those that two calls make alike."""
     found = []
     for _ in range(2):
-        lay_out(stock, folder, call, earlier=False)
+        _laid_out(stock, folder, call)
         in_process(call, "stcal", folder)
         found.append(_answers(call, folder))
     return {name: digest for name, digest in found[0].items() if found[1].get(name) == digest}

@@ -13,7 +13,8 @@ _ROOM = 1024
 _handlers: dict[int, ctypes.Array] = {}
 if os.name == "posix":
     _system = ctypes.CDLL(None)
-    _blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # it waits until the import ends
+    # They wait until the import ends: NumPy, which it may load, would make another error of an interrupt.
+    _blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     for _number in signal.valid_signals():
         _before = ctypes.create_string_buffer(_ROOM)
         if _system.sigaction(int(_number), None, _before) == 0:

@@ -14,7 +14,7 @@ from stcal.errors import DegenerateError, InputError, InputNote
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import TABLE_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.io.table import FARTHEST, LENGTHS
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
@@ -184,6 +184,7 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
     """
     try:
         rows = list(csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())))
+        require_unchanged(path)
         measured: dict[str, dict[str, tuple[float, float]]] = {}
         for row in rows:
             measured.setdefault(row["image"], {})[parse_label(row["label"])] = (float(row["x_px"]), float(row["y_px"]))

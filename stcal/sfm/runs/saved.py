@@ -20,7 +20,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
-from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
+from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes, require_unchanged
 from stcal.io.json import Part, checked, read_json
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
@@ -36,7 +36,7 @@ from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.transaction import MarkerFile, complete_interrupted, digest_of
+from stcal.sfm.runs.transaction import MarkerFile, complete_interrupted
 
 AGAIN = "run it again"
 ReportPart = TypeVar("ReportPart", bound=Part)
@@ -222,7 +222,9 @@ def load_run(folder: str | Path) -> SavedRun:
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
         board = with_edge_sigma(board, observations)
-    _require_as_written(folder, marker_file)
+    for name in needed:
+        if name != "database.db":  # SQLite writes to it when it is read
+            require_unchanged(folder / name)
     return SavedRun(
         folder=folder,
         images=images,
@@ -236,16 +238,6 @@ def load_run(folder: str | Path) -> SavedRun:
         report=report,
         sha256=marker_file.sha256 or {},
     )
-
-
-def _require_as_written(folder: Path, marker: MarkerFile) -> None:
-    """Raises InputError if a file that was read, and can be, has not the hash that the run gave it."""
-    for name in (CAMERA, TARGET, BOARD, "labels.csv", "faces.json", "report.json"):
-        known = (marker.sha256 or {}).get(name)
-        if known is not None and digest_of(folder / name) != known:
-            raise InputError(
-                "E-RUN-CHANGED", f"{folder / name}: changed since the run ended; take a copy that is whole, or {AGAIN}"
-            )
 
 
 def _options(stored: dict) -> RunOptions:

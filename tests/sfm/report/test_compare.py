@@ -11,7 +11,7 @@ from stcal.errors import InputError, InputNote
 from stcal.sfm.measurement.target import read_target
 from stcal.sfm.report.compare import compare, comparison_table
 from tests.outcome import fails_with
-from tests.shared import own_copy
+from tests.shared import own_copy, unsealed_copy
 
 COVARIANCE = "target_from_face_covariance"
 
@@ -101,7 +101,7 @@ def test_labels_that_cannot_be_compared_are_said(small_run, small_dataset, tmp_p
 
 
 def test_images_without_labels_are_counted(small_run, small_dataset, tmp_path):
-    run = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    run = unsealed_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     known = compare(run, small_dataset / "truth.json")
     head, *rows = (run / "detections.csv").read_text().splitlines(keepends=True)
     lost = rows[0].split(",")[0]

@@ -16,6 +16,7 @@ from stcal.errors import InputError
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.measurement.target import read_target
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
@@ -367,6 +368,12 @@ def nudge(path):
 def test_a_file_with_another_digit_is_refused(own_run, stcal_sfm, name):
     nudge(own_run / name)
     assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-CHANGED", str(own_run / name), "run it again")
+
+
+def test_faces_of_a_run_with_another_digit_are_refused_by_what_reads_them_alone(own_run):
+    nudge(own_run / "faces.json")
+    with fails_with("E-RUN-CHANGED"):
+        read_target(own_run / "faces.json", own_run / "target.toml")
 
 
 def test_reading_writes_nothing(own_run):
