@@ -9,9 +9,11 @@ The folder holds ``images/`` of a 7×5 board of DICT_6X6_250 (squares of 36.195 
 """
 
 import argparse
+import multiprocessing
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -182,26 +184,38 @@ def edges(count: int) -> None:
     print(f"three tags of 30 to 130 px, rendered with noise of 1 % of the contrast, {count} scenes a row\n")
     print("| rendered | blur, px | turned | tilted | mean of e'C^-1 e / 6 | largest | accepted |")
     print("|---|---|---|---|---|---|---|")
+    views = [(turn, 0) for turn in (0, 1, 2, 5, 20, 45)] + [(0, 20), (0, 40), (0, 60), (20, 60)]
+    rows = [
+        (kind, blur, turn, tilt, count)
+        for kind, blur in (("by area", 0.5), ("by area", 1.0), ("warped sheet", 0.5))
+        for turn, tilt in views
+    ]
+    pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))
+    for row, (squares, accepted) in zip(rows, pool.map(_edge_scenes, *zip(*rows, strict=True)), strict=True):
+        kind, blur, turn, tilt, _ = row
+        figures = f"{np.mean(squares):.2f} | {np.max(squares):.1f}"
+        print(f"| {kind} | {blur} | {turn}° | {tilt}° | {figures} | {accepted} of {count} |", flush=True)
+
+
+@one_thread()
+def _edge_scenes(kind: str, blur: float, turn: float, tilt: float, count: int) -> tuple[list[float], int]:
+    """Normalised squared errors of the poses in as many scenes, and how many of them are accepted."""
     sheet, sheet_from_mm = _drawn_sheet()
     matrix = np.array([[1100.0, 0, 319.5], [0, 1100.0, 279.5], [0, 0, 1]])
-    views = [(turn, 0) for turn in (0, 1, 2, 5, 20, 45)] + [(0, 20), (0, 40), (0, 60), (20, 60)]
-    for kind, blur in (("by area", 0.5), ("by area", 1.0), ("warped sheet", 0.5)):
-        for turn, tilt in views:
-            rng, squares, accepted = np.random.default_rng(7), [], 0
-            for _ in range(count):
-                truth = _edge_pose(rng, turn, tilt)
-                place, size = homography(matrix, truth.rotation, truth.translation), (640, 560)
-                if kind == "by area":
-                    image = rendered(EDGE_LAYOUT, place, size, rng, blur)
-                else:
-                    image = warped(sheet, place @ np.linalg.inv(sheet_from_mm), size, rng, blur)
-                result = locate_image(image, EDGE_LAYOUT, EDGE_CAMERA)
-                accepted += result.verdict.decision == "accept"
-                if result.pose is not None:
-                    error = Poses.of([result.pose.camera_from_obj]).difference(Poses.of([truth]))
-                    squares.append(squares_nees(error, result.pose.covariance[None])[0])
-            figures = f"{np.mean(squares):.2f} | {np.max(squares):.1f}"
-            print(f"| {kind} | {blur} | {turn}° | {tilt}° | {figures} | {accepted} of {count} |", flush=True)
+    rng, squares, accepted = np.random.default_rng(7), [], 0
+    for _ in range(count):
+        truth = _edge_pose(rng, turn, tilt)
+        place, size = homography(matrix, truth.rotation, truth.translation), (640, 560)
+        if kind == "by area":
+            image = rendered(EDGE_LAYOUT, place, size, rng, blur)
+        else:
+            image = warped(sheet, place @ np.linalg.inv(sheet_from_mm), size, rng, blur)
+        result = locate_image(image, EDGE_LAYOUT, EDGE_CAMERA)
+        accepted += result.verdict.decision == "accept"
+        if result.pose is not None:
+            error = Poses.of([result.pose.camera_from_obj]).difference(Poses.of([truth]))
+            squares.append(squares_nees(error, result.pose.covariance[None])[0])
+    return squares, accepted
 
 
 def _edge_pose(rng: np.random.Generator, turn_deg: float, tilt_deg: float) -> Rigid:
