@@ -415,8 +415,11 @@ def robot_urdf(robot: Robot) -> str:
     Raises
     ------
     InputError
-        An elastic robot.
+        An elastic robot, or a name with control characters, which XML cannot hold.
     """
+    for name in (robot.name, *robot.tools):
+        if not name.isprintable():
+            raise InputError("E-ROBOT-NAME", f"robot: name {name!r} has control characters; give a name in letters")
     if robot.elasticity is not None:
         raise InputError(
             "E-ROBOT-ELASTICITY",

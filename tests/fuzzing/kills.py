@@ -51,7 +51,12 @@ PROGRAM = (sys.executable, "-P", "-c", "from stcal.cli.entry import main; main()
 
 
 def killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
-    """Case ``number`` of this seed."""
+    """Case ``number`` of this seed. One that ends late is tried again: other cases run beside it."""
+    judged = _killed(stock, folder, seed, number)
+    return _killed(stock, folder, seed, number) if "hang" in dict(judged.failures) else judged
+
+
+def _killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     rng = np.random.default_rng([seed, STREAM + number])
     calls = [call for call in CALLS if re.search(r"(^| )[>+~]", call.words) and call.seconds < 20 and not call.code]
     call = pick(rng, calls)
