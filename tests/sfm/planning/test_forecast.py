@@ -43,7 +43,7 @@ from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
 from tests.outcome import fails_with
-from tests.shared import own_copy
+from tests.shared import own_copy, unsealed_copy
 
 NOISE = CentreNoise(0.1, 3.0)
 """Of centres: about 0.013 px, so that image and a board of 20 µm matter alike."""
@@ -439,7 +439,7 @@ def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
 def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(
     stcal_sfm, small_run, tmp_path, coarse, file, change, warning
 ):
-    own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("overlays", "cache"))
+    unsealed_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("overlays", "cache"))
     content = json.loads((tmp_path / "run" / file).read_text())
     change(content)
     (tmp_path / "run" / file).write_text(json.dumps(content))
