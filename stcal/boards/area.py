@@ -62,8 +62,14 @@ def products(left: np.ndarray, weight: np.ndarray, right: np.ndarray) -> np.ndar
 
 
 def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares solutions (m, q) and inverse normal matrices (m, q, q)."""
-    inverse = np.linalg.inv(products(design, weight, design) + 1e-9 * np.eye(design.shape[-1]))
+    """Return the least-squares solutions (m, q) and inverse normal matrices (m, q, q), NaN where they are singular."""
+    normal = products(design, weight, design) + 1e-9 * np.eye(design.shape[-1])
+    try:
+        inverse = np.linalg.inv(normal)
+    except np.linalg.LinAlgError:  # one of them is enough
+        regular = np.linalg.matrix_rank(normal, hermitian=True) == normal.shape[-1]
+        inverse = np.full_like(normal, np.nan)
+        inverse[regular] = np.linalg.inv(normal[regular])
     return (inverse @ products(design, weight, right[..., None]))[..., 0], inverse
 
 

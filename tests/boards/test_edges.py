@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
+from stcal.boards.area import solved
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard
 from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
@@ -96,3 +97,12 @@ def test_sigma_of_a_crossing_grows_with_edges_that_are_not_straight(ragged_px, l
     assert found.seen.all()
     assert 0.4 < squares.mean() < 1.4  # below 1 without raggedness, as a prior σ of the profile is kept
     assert np.sqrt(found.covariance_px2[:, 0, 0]).min() > least_sigma_px
+
+
+def test_an_edge_whose_equations_are_singular_leaves_the_others():
+    design = np.random.default_rng(1).normal(size=(2, 3, 4, 2))
+    design[1] = 1e12  # two unknowns that move all pixels alike
+    values, inverse = solved(design, np.ones((2, 3, 4)), np.ones((2, 3, 4)))
+    assert np.isfinite(inverse[0]).all()
+    assert np.isfinite(values[0]).all()
+    assert np.isnan(inverse[1]).all()
