@@ -85,10 +85,14 @@ def own_copy(source: Path, to: Path, ignore: Callable | None = None) -> Path:
 
 def unsealed_copy(run: Path, to: Path, ignore: Callable | None = None) -> Path:
     """Copy a run without the hashes of its files, as old versions left it: an edited file is then read; as above."""
-    own_copy(run, to, ignore)
-    marker = json.loads((to / "stcal-run.json").read_text(encoding="utf-8"))
-    (to / "stcal-run.json").write_text(json.dumps(marker | {"sha256": None}), encoding="utf-8")
+    unseal(own_copy(run, to, ignore))
     return to
+
+
+def unseal(run: Path) -> None:
+    """Remove the hashes of a run's files, so that edited ones are read."""
+    marker = json.loads((run / "stcal-run.json").read_text(encoding="utf-8"))
+    (run / "stcal-run.json").write_text(json.dumps(marker | {"sha256": None}), encoding="utf-8")
 
 
 @contextmanager

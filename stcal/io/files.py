@@ -5,6 +5,7 @@ import errno
 import hashlib
 import json
 import os
+import stat
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -218,6 +219,14 @@ def save_folder(out: Path, files: dict[str, str]) -> None:
             ) from error
 
 
+def digest_of(path: Path) -> str:
+    """Returns the SHA-256 of a file, read piece by piece; empty for a link, a folder, a pipe, or nothing."""
+    if not (os.path.lexists(path) and stat.S_ISREG(path.lstat().st_mode)):
+        return ""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
 def require_unchanged(path: str | Path) -> None:
     """Refuses a file of a run's folder that is not as the run left it, by the hash that the run's marker holds.
 
@@ -230,12 +239,10 @@ def require_unchanged(path: str | Path) -> None:
         known = json.loads(text_of(read_bytes(path.parent / RUN_MARKER, TABLE_BYTES)))["sha256"][path.name]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return
-    with open(path, "rb") as stream:
-        if hashlib.file_digest(stream, "sha256").hexdigest() == known:
-            return
-    raise InputError(
-        "E-RUN-CHANGED", f"{path}: changed since its run ended; take a copy that is whole, or run it again"
-    )
+    if digest_of(path) != known:
+        raise InputError(
+            "E-RUN-CHANGED", f"{path}: changed since its run ended; take a copy that is whole, or run it again"
+        )
 
 
 def json_text(content) -> str:

@@ -15,6 +15,7 @@ from stcal.io.cameras.forms import written
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import target_toml
+from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.conditions import Conditions
@@ -27,7 +28,7 @@ from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
 from stcal.sfm.pipeline import RunOptions, run
-from stcal.sfm.runs.transaction import MarkerFile, digest_of
+from stcal.sfm.runs.transaction import MarkerFile
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import socket
-import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -25,6 +24,7 @@ from stcal.io.files import (
     RUN_ENTRIES,
     RUN_MARKER,
     UNFINISHED,
+    digest_of,
     json_text,
     real_place,
     save,
@@ -76,14 +76,6 @@ def files_below(folder: Path) -> Iterator[str]:
     for place, folders, files in os.walk(folder):
         for name in (*files, *(subfolder for subfolder in folders if os.path.islink(os.path.join(place, subfolder)))):
             yield (Path(place) / name).relative_to(folder).as_posix()
-
-
-def digest_of(path: Path) -> str:
-    """Returns the SHA-256 of a file, read piece by piece; empty for a link, a folder, a pipe, or nothing."""
-    if not (os.path.lexists(path) and stat.S_ISREG(path.lstat().st_mode)):
-        return ""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 COMPARISON = "compare.json"

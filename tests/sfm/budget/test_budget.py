@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from stcal.design import KnownDistance, ScaleReference, StatedSize
 from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board
-from stcal.io.files import RUN_MARKER, json_text
+from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.file import BudgetFile
 from stcal.sfm.budget.lengths import against_stated
@@ -18,7 +18,7 @@ from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.transaction import MarkerFile, digest_of
+from stcal.sfm.runs.transaction import MarkerFile
 from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error
 from tests.shared import own_copy, unsealed_copy

@@ -31,7 +31,7 @@ from stcal.sfm.runs.folder import write_report
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.verify import verify
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
-from tests.shared import own_copy, unsealed_copy
+from tests.shared import own_copy, unseal
 
 INSTALL = "install it with `sudo apt-get install colmap`"
 
@@ -45,7 +45,7 @@ def state_of(folder) -> dict[str, str]:
 @pytest.fixture
 def own_run(small_run, tmp_path):
     """A copy of the small run to add to."""
-    return unsealed_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
 @pytest.fixture(autouse=True)
@@ -607,6 +607,7 @@ def edit(run, change) -> None:
     report = json.loads((run / "report.json").read_text(encoding="utf-8"))
     change(report)
     (run / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    unseal(run)
 
 
 @pytest.mark.parametrize("case", SPOILT_REPORTS)
