@@ -227,19 +227,25 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def own_digest(content: dict) -> str:
+    """Returns the SHA-256 of a marker's content without its own entry among the hashes."""
+    others = {name: value for name, value in content["sha256"].items() if name != RUN_MARKER}
+    return hashlib.sha256(json.dumps(content | {"sha256": others}, sort_keys=True).encode()).hexdigest()
+
+
 def require_unchanged(path: str | Path) -> None:
     """Refuses a file of a run's folder that is not as the run left it, by the hash that the run's marker holds.
 
     Files elsewhere, and those of runs without hashes, pass.
     """
     path = Path(path)
-    if path.name == RUN_MARKER:
-        return
     try:
-        known = json.loads(text_of(read_bytes(path.parent / RUN_MARKER, TABLE_BYTES)))["sha256"][path.name]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        marker = json.loads(text_of(read_bytes(path.parent / RUN_MARKER, TABLE_BYTES)))
+        known = marker["sha256"][path.name]
+        found = own_digest(marker) if path.name == RUN_MARKER else digest_of(path)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return
-    if digest_of(path) != known:
+    if found != known:
         raise InputError(
             "E-RUN-CHANGED", f"{path}: changed since its run ended; take a copy that is whole, or run it again"
         )

@@ -222,7 +222,7 @@ def load_run(folder: str | Path) -> SavedRun:
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
         board = with_edge_sigma(board, observations)
-    for name in needed:
+    for name in (RUN_MARKER, *needed):
         if name != "database.db":  # SQLite writes to it when it is read
             require_unchanged(folder / name)
     return SavedRun(

@@ -1,7 +1,5 @@
 """The folder of a run as a transaction, with the marker that holds the hashes of its files."""
 
-import hashlib
-import json
 import os
 import shutil
 import socket
@@ -26,6 +24,7 @@ from stcal.io.files import (
     UNFINISHED,
     digest_of,
     json_text,
+    own_digest,
     real_place,
     save,
 )
@@ -63,12 +62,6 @@ class MarkerFile(ResultFile):
         others = {name: value for name, value in digests.items() if name != RUN_MARKER}
         content = self.model_copy(update={"sha256": others}).content()
         return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
-
-
-def own_digest(content: dict[str, Any]) -> str:
-    """Returns the SHA-256 of a marker's content without its own entry among the hashes."""
-    others = {name: value for name, value in content["sha256"].items() if name != RUN_MARKER}
-    return hashlib.sha256(json.dumps(content | {"sha256": others}, sort_keys=True).encode()).hexdigest()
 
 
 def files_below(folder: Path) -> Iterator[str]:

@@ -8,7 +8,7 @@ from pydantic import Field
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.io.files import ADDED, CACHE, READY, RUN_MARKER, UNFINISHED, digest_of
+from stcal.io.files import ADDED, CACHE, READY, RUN_MARKER, UNFINISHED, digest_of, own_digest
 from stcal.io.json import ResultFile, checked, read_json
 from stcal.sfm.runs.saved import AnyRun, folder_of
 from stcal.sfm.runs.transaction import (
@@ -17,7 +17,6 @@ from stcal.sfm.runs.transaction import (
     MarkerFile,
     complete_interrupted,
     files_below,
-    own_digest,
 )
 
 SHOWN = 20

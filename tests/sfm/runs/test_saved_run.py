@@ -364,7 +364,9 @@ def nudge(path):
     path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["labels.csv", "faces.json", "report.json", "cameras.txt", "target.toml"])
+@pytest.mark.parametrize(
+    "name", ["labels.csv", "faces.json", "report.json", "cameras.txt", "target.toml", "stcal-run.json"]
+)
 def test_a_file_with_another_digit_is_refused(own_run, stcal_sfm, name):
     nudge(own_run / name)
     assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-CHANGED", str(own_run / name), "run it again")
