@@ -44,7 +44,7 @@ def test_the_notebook_runs(tmp_path, monkeypatch):
     ]
     assert len(pictures) == 2
     whole = "\n".join(texts.values())
-    assert re.search(r"<p>may I use it\? Yes, for face 1, .*face 3 .* seen in no image", whole)
+    assert re.search(r"<p>may I use it\? Yes, for faces? 1.*face 3 .* seen in no image", whole)
     off_um = [float(value) for value in re.findall(r"(\d+) µm, \d+ mdeg off the truth", whole)]
     assert len(off_um) >= 3
     assert max(off_um) < 100  # circles are placed to 20 µm per axis; a frame at 138 mm follows by some of it

@@ -20,7 +20,6 @@ NOT_YET = {
     "docs/accuracy/published.md: trial published as published + centres of blurred ed",  # reproduce_paper.py
     "docs/accuracy/published.md: face as published + centres of blurred edges + eccen",
     "docs/accuracy/published.md: face position, µm predicted σ, µm rotation, mdeg",
-    "docs/accuracy/time.md: 40 images of [5184, 3456] px, 150 MB, 2 workers, 5 rounds",  # bench_run.py, times
     "docs/accuracy/time.md: images pairs mapped pairs matched ms an image graph + map",  # scale_study.py
 }
 """Printed by scripts that take long and whose output is not stored yet; to become fewer."""

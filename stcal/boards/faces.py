@@ -19,9 +19,10 @@ from stcal.labels import BOARD
 
 LOOKED_AT = 5
 """Number of images in which other tags are looked for."""
-LEAST_COSINE = float(np.cos(np.radians(70)))
-"""Cosine of the tilt beyond which the corners of a tag are left out, as its edges meet at sharp angles: drawn tags had
-errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px at most, beyond."""
+MOST_TILT_DEG = 70.0
+LEAST_COSINE = float(np.cos(np.radians(MOST_TILT_DEG)))
+"""Largest tilt, and its cosine, beyond which the corners of a tag are left out, as its edges meet at sharp angles:
+drawn tags had errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px at most, beyond."""
 
 
 def find_on_faces(
@@ -39,10 +40,11 @@ def find_on_faces(
     views: dict[str, BoardView] = {}
     notes: list[str] = []
     for face, board in boards.items():
-        view, why = None, ""
+        view, why, oblique = None, "", ""
         try:
             if isinstance(board, TagLayout):
-                view = _straightened(_not_oblique(view_of_tags(name, tags, board)), camera)
+                view, oblique = _not_oblique(view_of_tags(name, tags, board))
+                view = _straightened(view, camera)
             elif isinstance(board, CharucoDesign):
                 if any((board.dictionary, tag) in read for tag in board.tag_ids()):
                     view = find_charuco(image, name, board)
@@ -53,10 +55,12 @@ def find_on_faces(
                 why = "" if view else why_no_chessboard(image, board)
             elif isinstance(board, AprilGridDesign):
                 view, why = find_aprilgrid(image, name, board, camera)
-                view = _straightened(_not_oblique(view), camera)
+                view, oblique = _not_oblique(view)
+                view = _straightened(view, camera)
         except StcalError as error:  # corners on a line, say
             why = f"left out, {error}"
         where = BOARD if face == BOARD else f"face {face}"
+        notes += [f"{where}: {oblique}"] if oblique else []
         if view is not None:
             views[face] = view
             notes += [f"{where}: {reason}" for reason in view.unused]
@@ -65,20 +69,26 @@ def find_on_faces(
     return views, notes
 
 
-def _not_oblique(view: BoardView | None) -> BoardView | None:
-    """Returns the view of tags without those that are tilted too far; None if none is left."""
+def _not_oblique(view: BoardView | None) -> tuple[BoardView | None, str]:
+    """Returns the view of tags without those that are tilted too far, None if none is left, and why."""
     if view is None:
-        return None
+        return None, ""
     corners = view.xy_px.reshape(-1, 4, 2)
     across = corners[:, 1] + corners[:, 2] - corners[:, 0] - corners[:, 3]
     down = corners[:, 2] + corners[:, 3] - corners[:, 0] - corners[:, 1]
     shape = np.linalg.svd(np.stack([across, down], axis=2), compute_uv=False)
-    keep = np.repeat(shape[:, 1] >= LEAST_COSINE * shape[:, 0], 4)
+    cosine = shape[:, 1] / shape[:, 0]
+    keep = np.repeat(cosine >= LEAST_COSINE, 4)
+    if keep.all():
+        return view, ""
+    count, tilt_deg = int((~keep).sum()) // 4, float(np.degrees(np.arccos(cosine.min())))
+    tags = "a tag is" if count == 1 else f"{count} tags are"
+    why = f"{tags} tilted by {tilt_deg:.0f}°, up to {MOST_TILT_DEG:g}° is measured; turn the face towards the camera"
     if not keep.any():
-        return None
+        return None, why
     covariance = None if view.covariance_px2 is None else view.covariance_px2[keep]
     place = {"ids": view.ids[keep], "xyz_board": view.xyz_board[keep], "xy_px": view.xy_px[keep]}
-    return replace(view, **place, covariance_px2=covariance)
+    return replace(view, **place, covariance_px2=covariance), why
 
 
 def _straightened(view: BoardView | None, camera: Camera) -> BoardView | None:

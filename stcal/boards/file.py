@@ -254,11 +254,15 @@ def keys_of(board: FlatBoard) -> list[str]:
 
 
 def tag_rows(layout: TagLayout) -> list[str]:
-    """Return a line of a file for each tag of a layout, with its corners."""
+    """Return a line of a file for each tag of a layout: size and place of an upright square, else the corners."""
     rows = []
-    for (dictionary, tag), corners in zip(layout.tags, layout.corners_mm.tolist(), strict=True):
-        places = ", ".join(f"[{x!r}, {y!r}]" for x, y in corners)
-        rows.append(f"  {{ dictionary = {toml_string(dictionary)}, id = {tag}, corners_mm = [{places}] }},")
+    for (dictionary, tag), corners in zip(layout.tags, layout.corners_mm, strict=True):
+        (x, y), size = corners.mean(0).tolist(), float(corners[1, 0] - corners[0, 0])
+        if np.array_equal(size * UNIT_SQUARE + [x, y], corners):
+            place = f"size_mm = {size!r}, x_mm = {x!r}, y_mm = {y!r}"
+        else:
+            place = f"corners_mm = [{', '.join(f'[{x!r}, {y!r}]' for x, y in corners.tolist())}]"
+        rows.append(f"  {{ dictionary = {toml_string(dictionary)}, id = {tag}, {place} }},")
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -29,6 +30,8 @@ SATURATION_POINTS = 8
 WHITE_PX = 3
 """Side of the window of the dilation, px. Without dilation, a blurred corner at which two black squares meet joins them
 to one outline."""
+WINDOWS_PX = (5, 21)
+"""Sides of the windows of the threshold, px, each of which is searched with by itself."""
 GROWN_LOOKS = ((2, 4e7), (3, 1e7), (1, 5e8))
 """Scales of the dilated images, each with the largest number of pixels up to which it is used. Dilation by a pixel at
 the original scale grows the white too far into tags of 50 px and less."""
@@ -81,8 +84,11 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
             for tag, place in find_family(grey, name):
                 places_of.setdefault((name, tag), []).append(place.astype(np.float32))
             continue
-        detector = cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits))
-        for look in _looks(grey, joined):
+        detectors = [
+            cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits, (window,)))
+            for window in WINDOWS_PX
+        ]
+        for look, detector in product(_looks(grey, joined), detectors):
             corners, ids, _ = detector.detectMarkers(look.grey)
             places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
             earlier = {tag: list(known_places) for tag, known_places in places_of.items()}
@@ -172,18 +178,22 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
     return replace(view, unused=tuple(f"tag {tag[1]} is in view more than once" for tag in tags.repeated if tag in row))
 
 
-def detector_settings(name: str, border_bits: int = 1):
-    """Return the settings of the detector.
+def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ...] = (5, 25)):
+    """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows.
 
     The default settings lose small tags: only the middle of a cell keeps its colour, blur mixes the rest with the
     neighbours, and four pixels per cell are too few to separate them. Of 272 real tags of 19 to 60 px a side the
-    default settings read 86 %, these 97 %. Two sizes of the threshold window find as much as three.
+    default settings read 86 %, these 97 %. Two sizes of the threshold window find as much as three, and more if each
+    has a search of its own: of the outlines that both find of one tag, the detector keeps a single one, which need not
+    be that which can be read.
     """
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = border_bits
     settings.perspectiveRemovePixelPerCell = 10
     settings.perspectiveRemoveIgnoredMarginPerCell = 0.35
-    settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax, settings.adaptiveThreshWinSizeStep = 5, 25, 20
+    first, last = windows_px[0], windows_px[-1]
+    settings.adaptiveThreshWinSizeMin, settings.adaptiveThreshWinSizeMax = first, last
+    settings.adaptiveThreshWinSizeStep = max(last - first, 1)
     if "APRILTAG" in name.upper():
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return settings

@@ -409,6 +409,13 @@ def _protected(command: Callable) -> Callable:
                     "E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give the name of a file"
                 )
         written = [each for each in written if each[1] != STANDARD_OUTPUT]
+        for option, path in written:
+            if option == "--report" and path.suffix.lower() == ".pdf":
+                also = ", and --pdf for the PDF" if "pdf" in given else "; a browser prints it as PDF"
+                raise InputError(
+                    "E-OUTPUT-SUFFIX",
+                    f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}",
+                )
         keep_apart(written, read)
         token = _replacing.set(overwrite)
         try:

@@ -182,6 +182,9 @@ def drawn_text(drawn: Drawn) -> str:
         lines.append("lengths are mm; PATTERN and GROUND are inked or milled, CUT is cut, the other layers are to read")
     else:
         lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
+    if bare := sum(sheet.bare for sheet in drawn.sheets):
+        which = "the sheet is" if sheets == 1 else f"{bare} of {sheets} sheets are"
+        lines.append(f"{which} without dimensions and table, with which more would be needed")
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"

@@ -1,7 +1,7 @@
 """Pages of drawings: as large as their content, or of a paper, with parts split over several pages."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -24,11 +24,14 @@ BAR, SHORT_BAR = 100.0, 50.0
 """Lengths of scale bars, mm."""
 
 
-def framed(part: Part) -> list[Shape]:
-    """Return the part with its name above, cut marks, and dimensions below and to the left."""
+def framed(part: Part, bare: bool = False) -> list[Shape]:
+    """Return the part with cut marks and, unless it is to be ``bare``, its name above and dimensions below and to the
+    left."""
     box = np.array([part.outline.min(0), part.outline.max(0)])
     lines = part.lines or (Line(part.outline, "CUT", width=0.1, closed=True),)
     shapes: list[Shape] = [*part.shapes, *lines, *([] if part.lines else _cut_marks(box))]
+    if bare:
+        return shapes
     for axis in (0, 1):
         spans = [span for span in part.spans if span[0] == axis]
         outer = (axis, float(box[0, axis]), float(box[1, axis]), said_mm(box[1, axis] - box[0, axis]))
@@ -166,13 +169,15 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A page with its origin at the bottom left; ``cuts`` : whether a seam runs through the pattern of its part."""
+    """A page with its origin at the bottom left; ``cuts`` : whether a seam runs through the pattern of its part;
+    ``bare`` : whether the part is without dimensions and table, with which it would take more sheets."""
 
     title: str
     width: float
     height: float
     placed: tuple[Placed, ...]
     cuts: bool = False
+    bare: bool = False
 
     def shapes(self) -> list[Shape]:
         """Return all shapes of the page."""
@@ -201,9 +206,11 @@ def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
 def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
     """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
 
+    A part that is larger than a sheet only by its dimensions and its table is drawn without them.
+
     Raises InputError: there would be more than :data:`MOST_SHEETS`.
     """
-    split = [min(_ways(part, paper), key=lambda way: (way.cuts(), way.count())) for part in parts]
+    split = [min(_ways(part, paper), key=lambda way: (way.cuts(), way.count(), way.bare)) for part in parts]
     total = sum(way.count() for way in split)
     if total > MOST_SHEETS:
         raise InputError(
@@ -225,6 +232,7 @@ class _Way:
     size: tuple[float, float]
     seams: tuple[list[float], list[float]]
     pattern: np.ndarray
+    bare: bool
 
     def cuts(self) -> bool:
         """Return True if a seam runs through a circle, square or tag; ``pattern`` : their boxes, (n, 2, 2)."""
@@ -240,21 +248,25 @@ class _Way:
 
 
 def _ways(part: Part, paper: str) -> list[_Way]:
-    """Return the layouts of a part: portrait and landscape, with the table beside and below."""
+    """Return the layouts of a part: portrait and landscape, with the table beside and below, or bare on one sheet."""
     ways = []
     boxes = np.array([shape.box() for shape in part.pattern()])
-    for below, turned in product((True, False), (False, True)):
+    drawn = [(False, [*framed(part), *table(part, below)]) for below in (True, False)]
+    if not part.lines:  # the pieces of a net need their names
+        drawn.append((True, framed(part, bare=True)))
+    for (bare, shapes), turned in product(drawn, (False, True)):
         width, height = PAPERS[paper]
         size = (height, width) if turned else (width, height)
-        shapes = [*framed(part), *table(part, below)]
         box = extent(shapes)
         room = np.array(size) - FURNITURE
-        words = np.array([shape.box() for shape in shapes if isinstance(shape, Text)])
+        words = np.array([shape.box() for shape in shapes if isinstance(shape, Text)]).reshape(-1, 2, 2)
         across, down = (
             seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k], words[:, :, k])
             for k in (0, 1)
         )
-        ways.append(_Way(shapes, box, size, (across, down), boxes))
+        way = _Way(shapes, box, size, (across, down), boxes, bare)
+        if not bare or way.count() == 1:
+            ways.append(way)
     return ways
 
 
@@ -291,7 +303,8 @@ def _free(last: float, first: float, taken: np.ndarray) -> float | None:
 def _tiles(way: _Way, title: str) -> list[Sheet]:
     if way.count() == 1:
         shift = [EDGE + SIDE - float(way.box[0, 0]), way.size[1] - EDGE - float(way.box[1, 1])]
-        return [_sheet(title, *way.size, tuple(moved(shape, *shift) for shape in way.shapes))]
+        sheet = _sheet(title, *way.size, tuple(moved(shape, *shift) for shape in way.shapes))
+        return [replace(sheet, bare=way.bare)]
     pieces = [_pieces(float(way.box[0, k]), float(way.box[1, k]), way.seams[k]) for k in (0, 1)]
     shapes = [*way.shapes, *_registration(way)]
     boxes = [shape.box() for shape in shapes]

@@ -315,6 +315,7 @@ def _by_poses(task: _Task) -> Solved:
         require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, normal)
+    inverse = covariance
     notes += _remarks(task, x, solution.outliers, solution.residuals, solution.scale_hint)
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
@@ -325,12 +326,11 @@ def _by_poses(task: _Task) -> Solved:
             covariance = covariance * solution.variance_factor
     common = None
     if task.loop.camera_common is not None:
-        alone = covariance[:12, :12]
-        covariance = in_common(task.loop, solution, task.loop.camera_common).covariance(alone)
-        common, notes = (covariance - alone)[:6, :6], (*notes, Aside(IN_COMMON))
+        added = in_common(task.loop, solution, task.loop.camera_common).covariance(inverse) - inverse
+        common, notes, covariance = added[:6, :6], (*notes, Aside(IN_COMMON)), covariance + added
     if task.views is not None and options.camera is not None:
         error = of_poses(task.loop, solution, task.views, options.camera)
-        covariance = error.covariance(covariance[:12, :12])
+        covariance = covariance + error.covariance(inverse) - inverse
     stated = {name: getattr(noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
     result = HandEye(
         method="pose",

@@ -195,15 +195,21 @@ def _say_mosaic(files: Sequence[ImageFile]) -> None:
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
     """Return the image files below ``folder``, sorted by group and name, and the files that are skipped.
 
+    ``folder`` : it may also be a single image.
+
     Raises InputError: the folder is missing, or holds no image.
     """
     root = Path(folder)
+    files: list[ImageFile] = []
+    skipped: list[Skipped] = []
+    if root.is_file():
+        _sort_in(root, root.name, TOP_GROUP, files, skipped)
+        if files:
+            _say_mosaic(files)
+            return files, skipped
     if not root.is_dir():
-        raise InputError(
-            "E-IMAGES-FOLDER",
-            f"image folder {root}: {'not a folder' if root.exists() else 'does not exist'}; give a folder",
-        )
-    files, skipped = [], []
+        fault = f"not a folder, and {skipped[0].reason}" if skipped else "does not exist"
+        raise InputError("E-IMAGES-FOLDER", f"image folder {root}: {fault}; give a folder or an image")
     for path in sorted(root.iterdir(), key=lambda p: (p.is_dir(), p.name)):
         if path.name.startswith("."):
             continue

@@ -5,6 +5,7 @@ that was given as None is null. Arrays and poses are lists of numbers in the fil
 """
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,10 +32,13 @@ def mistake(reason: object) -> PydanticCustomError:
     return PydanticCustomError(WITHOUT_VALUE, "{reason}", {"reason": str(reason)})
 
 
-def first_mistake(error: ValidationError, where: str = "", missing: str = "key missing; add it") -> InputError:
+def first_mistake(
+    error: ValidationError, where: str = "", missing: str = "key missing; add it", top: Collection[str] = ()
+) -> InputError:
     """Return the error that names the first mistake, ``where: place: reason``, and the number of further mistakes.
 
-    ``missing`` : reason for a key that is missing.
+    ``missing`` : reason for a key that is missing; ``top`` : keys before the first table, which belong to it if they
+    stand after its head.
     """
     first = error.errors()[0]
     keys = [part for part in first["loc"] if not str(part).startswith("<")]  # not which kind of entry it was taken for
@@ -42,6 +46,8 @@ def first_mistake(error: ValidationError, where: str = "", missing: str = "key m
     place = " ".join(place.split())  # a quoted TOML key may hold a line break
     if first["type"] == "extra_forbidden":
         code, reason = "E-KEY-UNKNOWN", "unknown key; remove it or correct its spelling"
+        if len(keys) > 1 and keys[-1] in top:
+            reason = "unknown key in this table; move it to the top of the file, before the first [table]"
     elif first["type"] == "missing":
         code, reason = "E-KEY-MISSING", missing
     elif first["type"] == WITHOUT_VALUE:

@@ -70,7 +70,7 @@ def validated(content: Any, model: type[M], where: str) -> M:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise first_mistake(error, where) from error
+        raise first_mistake(error, where, top=model.model_fields) from error
 
 
 def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:

@@ -121,8 +121,8 @@ def place_group(
         raise DegenerateError(
             "E-SCENE-VIEWS",
             f"{shape.name}: {len(valid)} of {tried} views show faces and board ({shown} show the faces), "
-            f"{count} needed; a smaller board than {width:.0f} × {height:.0f} mm, a larger distance_mm or a smaller "
-            "focal length needed",
+            f"{count} needed; take a smaller board than {width:.0f} × {height:.0f} mm, a larger distance_mm "
+            "(--distance) or a shorter focal length",
         )
     picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
     return target_from_board, [views.pose(i) for i in valid[picked]]

@@ -178,6 +178,17 @@ def test_what_fits_a_page_is_not_split():
     assert seams_between(0.0, float(room[0]), float(room[0]), np.zeros((0, 2))) == []
 
 
+def test_a_board_that_fits_a_sheet_without_its_dimensions_is_not_cut():
+    """Its own 220 × 172 mm have room on A4 landscape; with dimensions and table they would take two sheets."""
+    board = replace(reference_board(), rows=13, columns=17, pitch_mm=12.0, radius_mm=3.0, corner_radius_mm=4.5)
+    (part,) = board_parts(board, 10.0)
+    (sheet,) = paper_sheets([part], "A4", "board")
+    assert (sheet.bare, sheet.cuts, sheet.width) == (True, False, 297.0)
+    discs = [shape for shape in sheet.shapes() if isinstance(shape, Disc)]
+    assert len(discs) == 13 * 17
+    assert not any(sheet.bare for sheet in paper_sheets([part], "A3", "board"))
+
+
 def test_parts_on_one_sheet_stand_in_rows():
     """Nine equal ones, none over another: all in a row or a column would be 0.1 or 12 times as wide as high."""
     part = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)[0]

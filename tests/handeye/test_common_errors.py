@@ -23,17 +23,19 @@ OWN = np.diag(np.repeat([2e-4, 0.05], 3) ** 2)
 DRAWS = 40
 
 
-def draw(seed: int, count: int = 16, stated: bool = True):
-    """Pairs with these errors, which they state, and the truth."""
+def draw(seed: int, count: int = 16, stated: bool = True, size_sigma: float | None = None):
+    """Pairs with these errors, or with a common one of the board's size alone, which they state, and the truth."""
     rng = np.random.default_rng(seed)
     truth = simulated(rng, count, robot=(1e-4, 0.03))
-    noise = rng.normal(size=(count, 6)) @ np.linalg.cholesky(OWN).T + COMMON @ rng.normal(size=3)
     pairs = truth.pairs
     common = np.tile(COMMON, (count, 1, 1))
+    if size_sigma is not None:
+        common = size_sigma * np.pad(pairs.camera_from_board.translation, ((0, 0), (3, 0)))[:, :, None]
+    noise = rng.normal(size=(count, 6)) @ np.linalg.cholesky(OWN).T + common @ rng.normal(size=common.shape[2])
     pairs = replace(
         pairs,
         camera_from_board=pairs.camera_from_board.moved(noise),
-        camera_from_board_covariance=np.tile(OWN + COMMON @ COMMON.T, (count, 1, 1)),
+        camera_from_board_covariance=OWN + common @ np.swapaxes(common, 1, 2),
         camera_from_board_common=common if stated else None,
     )
     return pairs, truth
@@ -63,6 +65,18 @@ def test_sigma_hold_with_common_errors(method):
         assert np.mean(found) > limits[0] / 1.3  # σ of the robot and factors are estimated
     pairs, truth = draw(0, stated=False)
     assert squared(handeye_by(pairs), truth) / 6 > 10 * limits[1]
+
+
+def test_the_scale_takes_up_a_common_error_of_the_size():
+    """With the scale among the unknowns, σ of X do not contain an error that it takes up; limits as above."""
+    limits = chi2.ppf([0.001, 0.999], 6 * DRAWS) / 6 / DRAWS
+    found = []
+    for seed in range(DRAWS):
+        pairs, truth = draw(seed, size_sigma=0.01)
+        result = handeye_by(pairs, method="pose", options=HandEyeOptions(with_scale=True))
+        found.append(squared(result, truth) / 6)
+        assert np.sqrt(result.covariance[3:, 3:].trace()) < 1  # without a scale: several mm
+    assert limits[0] / 1.3 < np.mean(found) < limits[1] * 1.3  # σ of the robot and factors are estimated
 
 
 def test_a_closed_form_by_the_jackknife_contains_them():

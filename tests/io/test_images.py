@@ -57,6 +57,15 @@ def test_groups_and_order(tmp_path):
     assert [(s.name, s.reason) for s in skipped] == [("b/notes.txt", "not an image file")]
 
 
+def test_a_single_image(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"x")
+    (tmp_path / "a.mp4").write_bytes(b"x")
+    files, skipped = find_images(tmp_path / "a.jpg")
+    assert ([(f.path, f.name, f.group) for f in files], skipped) == ([(tmp_path / "a.jpg", "a.jpg", TOP_GROUP)], [])
+    with fails_with("E-IMAGES-FOLDER … a.mp4: not a folder, and not an image file; give a folder or an image"):
+        find_images(tmp_path / "a.mp4")
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif"])
 def test_whole_files_are_read_and_truncated_ones_refused(suffix):
     data = encoded(suffix)

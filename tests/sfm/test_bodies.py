@@ -1,6 +1,7 @@
 """Bodies whose faces are boards or tags: no dot board and no camera file are needed."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from stcal.boards.faces import shift_by_curves
 from stcal.boards.target import body_toml, load_body
 from stcal.design import KnownDistance, StatedSize, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.net import net_parts
+from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import camera_prior
@@ -35,6 +37,7 @@ from stcal.sfm.planning.bodies import plan_body, planned_photographs
 from stcal.sfm.planning.file import plan_text
 from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
+from stcal.sfm.report.judgement import TESTED_BY
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
@@ -419,6 +422,30 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
         off = pose.camera_from_target @ scene.camera_from_target[i].inverse()
         assert np.degrees(off.angle_rad()) < 0.5
         assert np.linalg.norm(pose.camera_from_target.translation - scene.camera_from_target[i].translation) < 2
+
+
+@pytest.mark.slow
+def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
+    """As many as one takes first: what they do not determine is an error, what they do not test is "not possible"."""
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=8, distance_mm=300, seed=5))
+    write_body(tmp_path / "set", scene)
+    solved, refusals = 0, []
+    for count in (2, 4, 6):
+        taken = tmp_path / f"{count}"
+        taken.mkdir()
+        for path in sorted((tmp_path / "set/images").iterdir())[:count]:
+            shutil.copy(path, taken)
+        for camera in (None, tmp_path / "set/cameras.txt"):
+            try:
+                result = pipeline.run(taken, camera, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
+            except StcalError as error:
+                refusals.append(str(error))
+            else:
+                solved += 1
+                tested = any(c.key in TESTED_BY and c.verdict == "passed" for c in result.checks)
+                assert tested or result.judgement.verdict != "yes"
+    assert 0 < solved < 6
+    assert all("; add " in line or "take " in line for line in refusals), refusals
 
 
 def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):

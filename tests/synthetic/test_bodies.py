@@ -69,3 +69,18 @@ def test_print_is_off_by_what_the_truth_says(target):
     assert np.median(displaced) > 0.5
     assert np.median(errors) < 0.1
     assert max(errors) < 0.5  # bends of 0.3 mm and more turn what is near the horizon by more
+
+
+def test_a_tag_that_is_tilted_too_far_is_named():
+    """A body of two tags, one facing the camera and the other tilted by 75°."""
+    target = tag_cube(60.0)
+    scene = make_body_scene(target, body_camera(900), BodyOptions(images=1, distance_mm=300.0, noise=0.0, seed=1))
+    face = target.faces[0].id
+    from_face = scene.target_from_face[face]
+    facing = Rigid(np.eye(3), np.array([0.0, 0.0, 250.0])) @ Rigid.exp([0, np.radians(75), 0, 0, 0, 0])
+    scene = replace(scene, camera_from_target=(facing @ from_face.inverse(),))
+    grey = render_body(scene, 0, scene.drawings())
+    _, notes = find_on_faces(grey, "image", {each.id: each.printed for each in target.faces}, scene.camera)
+    (note,) = [note for note in notes if "tilted" in note]
+    assert note.startswith(f"face {face}: a tag is tilted by 7")
+    assert "up to 70° is measured" in note

@@ -72,6 +72,7 @@ def plan(
             print_each("warning", [f"{failures}: the σ of its centres have in them what failed"])
     else:
         centre_noise, source = expected_noise(of_corners=printed)
+        source = f"{source} (--noise, --run)"
     options = PlanOptions(
         images,
         spread,

@@ -258,17 +258,12 @@ def budget(
 def _require_pdf(page: Path | None, run: Path) -> None:
     """Refuses, before the work, a PDF without a page or a place.
 
-    Raises InputError if there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not
+    Raises InputError if there is no page, or the extra ``pdf`` is not
     installed.
     """
     from stcal.report.document import require_pdf
 
     if page is None:
         raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")
-    if page.suffix.lower() == ".pdf":
-        raise InputError(
-            "E-OUTPUT-SUFFIX",
-            f"--report {page}: the page is HTML; give {page.with_suffix('.html')}, and --pdf for the PDF",
-        )
     keep_apart([("--pdf", page.with_suffix(".pdf"))], [("RUN", run)])
     require_pdf()

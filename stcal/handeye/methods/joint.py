@@ -50,7 +50,8 @@ SETTLED = 1e-3
 class CameraError:
     """``slope`` : (12, q) derivative of the gradient of X and Z by the intrinsics; ``moment`` : (q, q) second moment of
     the intrinsics' error about zero, from the prior and from the corners; ``noise`` : (12, 12) covariance of the
-    gradient by all other errors, None where it equals the normal matrix. For a rig of c cameras, 6c + 6 replaces 12."""
+    gradient by all other errors, None where it equals the normal matrix. For a rig of c cameras, 6c + 6 replaces 12;
+    with the scale among the unknowns, 13 does."""
 
     slope: np.ndarray
     moment: np.ndarray
@@ -119,10 +120,11 @@ def in_common(loop: Loop, solution: PoseSolution, common: np.ndarray) -> CameraE
 
 
 def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
-    """Returns the derivative (12, q) of the gradient of X and Z, from that of the board's poses (m, 6, q)."""
+    """Returns the derivative (12, q) of the gradient of X and Z, from that of the board's poses (m, 6, q); (13, q) with
+    the scale, which takes up errors that all distances have in common, if it was solved for."""
     used = np.flatnonzero(~solution.outliers)
     state: LoopState = solution.state
-    jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, :12]
+    jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, : len(solution.normal)]
     moves = loop.by_camera(state.mount_from_camera, state.scale) @ by_unknown
     weighted = np.linalg.solve(solution.covariance[used], moves[used])
     return np.einsum("mai,maj->ij", jacobian[used], weighted)

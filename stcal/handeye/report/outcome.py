@@ -217,8 +217,12 @@ def _of_share(outcome: Outcome) -> Finding | None:
 
 def _of_common_errors(outcome: Outcome) -> Finding | None:
     """Judges what the errors of the board's poses have in common: σ contain it, and more poses do not reduce it."""
-    if (common := outcome.result.common_covariance) is None:
-        return None
+    title, result, pairs = "Common errors of the board's poses", outcome.result, outcome.pairs
+    if (common := result.common_covariance) is None:
+        if pairs is None or pairs.camera_from_board_common is None or result.covariance is not None:
+            return None
+        said = f"{result.method} gives no σ, and the board's poses state errors that all have in common"
+        return Finding(title, CARE, said, remedy="leave --method out: no residual shows these errors, only σ do")
     share = share_of_variance(outcome, common)
     if share is None:
         return None
@@ -229,7 +233,7 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
         "away) come from errors that all poses of the board have in common"
     )
     remedy = "calibrate the camera better, or solve from the images: more poses do not help" if word != GOOD else ""
-    return Finding("Common errors of the board's poses", word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
+    return Finding(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
 
 
 def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:

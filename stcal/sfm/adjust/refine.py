@@ -18,7 +18,7 @@ from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import GroupModel, M, Outlier, WorldModel
+from stcal.sfm.data.model import MIN_POINTS, GroupModel, M, Outlier, WorldModel
 
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
@@ -32,9 +32,17 @@ def adjust(model: M, camera: Camera) -> M:
 
     Raises
     ------
+    MappingError
+        The model is empty.
     ConvergenceError
         No minimum after ``MAX_STEPS`` steps.
     """
+    if not model.images:
+        raise MappingError(
+            "E-GROUP-FEW-IMAGES",
+            f"group {model.group}: no two images have {MIN_POINTS} circles or corners in common; add images, until two "
+            "show each face beside a neighbour",
+        )
     minimum = minimise(
         model,
         lambda state: _Normal.of(state, camera),

@@ -53,6 +53,8 @@ SIGNED = ("date", "name", "signature")
 LEAST_SHARE = 1e-3
 """Least share of a variance that is drawn."""
 MANY = 1e4
+NEGLIGIBLE = 1e-4
+"""Share of u below which a contribution has no sensitivity in the tables."""
 ROUNDING = 1e-6
 """Ratio to u below which a contribution is rounding error alone."""
 
@@ -217,9 +219,11 @@ def title_of(file: BudgetFile) -> str:
 def _what_u_is(file: BudgetFile) -> str:
     k = f"{file.coverage_factor:g}"
     return (
-        f"U is the expanded uncertainty with k = {k} (JCGM 100:2008, GUM), which covers about 95 %. In tables it is of "
-        f"one axis: {k} times the σ of the run, with the contributions of what is stated. Where it is of x, y and z "
-        "together, it is the root of their summed variances"
+        f"The expanded uncertainty U is the combined standard uncertainty multiplied by the coverage factor k = {k}, "
+        "which for a normal distribution gives a coverage probability of about 95 % (JCGM 100:2008, GUM). In tables it "
+        f"is of one axis: {k} times the σ of the run, with the contributions of what is stated. Where it is of x, y "
+        "and z together, it is the root of their summed variances, and the sphere of this radius covers more, as the "
+        "coverage in the tables says"
     )
 
 
@@ -288,7 +292,8 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
     rows = []
     first = next(iter(columns.values()))
     for source in file.sources:
-        slope = f"{_slope(first, source):.3g} {unit}/{source.unit}" if source.key in first.sensitivities else "–"
+        value = _slope(first, source) if source.key in first.sensitivities else 0.0
+        slope = f"{value:.3g} {unit}/{source.unit}" if value else "–"
         parts = [number(u.contributions[source.key], 2) for u in columns.values()]
         none = all(u.contributions[source.key] <= ROUNDING * u.standard for u in columns.values())
         if (
@@ -317,9 +322,9 @@ def _freedom(degrees: float | None) -> str:
 
 
 def _slope(of: Uncertainty, source: SourceRow) -> float:
-    """Returns the sensitivity, or 0 if it is rounding error alone."""
+    """Returns the sensitivity, or 0 if it contributes nothing that the table shows."""
     share = of.contributions[source.key] / of.standard if of.standard else 0.0
-    return of.sensitivities[source.key] if share > ROUNDING else 0.0
+    return of.sensitivities[source.key] if share > NEGLIGIBLE else 0.0
 
 
 def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[Block]:

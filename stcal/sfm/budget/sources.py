@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from datetime import date, datetime, time
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from stcal.design import BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
@@ -30,7 +31,16 @@ from stcal.sfm.adjust.uncertainty import (
 FIELDS = ("instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, empty if not given. Other fields follow them."""
 LONGEST = 500
-Text = Annotated[str, Field(max_length=LONGEST)]
+
+
+def _written(value: object) -> object:
+    """Returns a date or time of TOML as its text."""
+    if isinstance(value, datetime):
+        return value.isoformat(" ")
+    return value.isoformat() if isinstance(value, date | time) else value
+
+
+Text = Annotated[str, BeforeValidator(_written), Field(max_length=LONGEST)]
 FieldName = Annotated[str, Field(min_length=1, max_length=60)]
 
 

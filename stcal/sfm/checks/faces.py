@@ -75,6 +75,9 @@ class Again:
 
 
 def _adjusted(models: Sequence[MetricModel], board, flatness_mm, whole: JointResult) -> JointResult | StcalError:
+    models = [model for model in models if model.images]  # a part of a group may hold no two images of a point
+    if not models:
+        return _unfixed(models)
     try:
         return adjust_part(models, board, flatness_mm, whole)
     except StcalError as error:

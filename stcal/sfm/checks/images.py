@@ -62,7 +62,8 @@ def camera_check(
     """
     key, title = "camera", "Intrinsics against the images"
     if not given:
-        return impossible(key, title, "no camera file: the intrinsics were found from these photographs", "")
+        reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
+        return impossible(key, title, reason, "")
     remedy = (
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
         "--refine-camera, or calibrate the camera again"
@@ -150,6 +151,8 @@ def sigma_check(networks: Sequence[Network], factor: float) -> Check:
     low, high = SIGMA_LIMITS
     verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
     redundancy = sum(n.redundancy.sum() for n in networks)
+    if redundancy < 1:
+        return impossible(key, title, "free poses and points explain the images, whatever they show", "add images")
     reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
     remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
     measured = (Measured("all images", factor, low, "×", None),)

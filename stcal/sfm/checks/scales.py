@@ -11,9 +11,11 @@ from stcal.geometry.align import align_similarity
 from stcal.labels import DotLabel
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
-from stcal.sfm.checks.verdict import Check, Trial, impossible, judge
+from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 
 PPM = 1e6
+MOST_PRINT_FACTOR = 10.0
+"""Corners about the design over their stated σ from which on the design, or a stated size, is another one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +36,16 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
     out: each network has one scale. ``print_factor`` : factor on the σ of printed faces.
     """
     key, title = "scales", "Scales against one another"
+    remedy = (
+        "one print, distance or board has another size than stated: measure a side of each print and correct "
+        "target.toml, or state size_sigma_mm"
+    )
+    if print_factor > MOST_PRINT_FACTOR:
+        # σ that have grown so much would hide the contradiction that made them grow.
+        measured = Measured("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
+        why = "the size or drawing of the print is another one, or its σ too small"
+        reason = f"{measured.name} at {measured.words()}: {why}"
+        return Check(key, title, "suspicious", reason, (measured,), 1, (measured.name,), remedy)
     trials: list[Trial] = []
     for network in networks:
         sources = _sources(network, board, print_factor)
@@ -53,10 +65,6 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
                 trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
     if not trials:
         return impossible(key, title, "only one source of the scale", "state a known distance with scale")
-    remedy = (
-        "one print, distance or board has another size than stated: measure a side of each print and correct "
-        "target.toml, or state size_sigma_mm"
-    )
     return judge(key, title, trials, "sources of the scale", remedy)
 
 

@@ -106,7 +106,8 @@ class Trial:
     freedom : int
         Degrees of freedom of ``statistic``.
     redundancy : float
-        Degrees of freedom with which its σ is estimated (F test); a stated σ if not given.
+        Degrees of freedom with which its σ is estimated (F test); a stated σ if not given. If there are none, which is
+        where images are so few that free poses and points explain them, nothing can be tested.
     ratio : bool
         Whether ``value`` is a ratio.
     """
@@ -120,7 +121,7 @@ class Trial:
     ratio: bool = False
 
     def __post_init__(self):
-        require_fields(self, f"trial {self.name}", statistic=0, freedom=1, redundancy=0)
+        require_fields(self, f"trial {self.name}", statistic=0, freedom=1)
 
     def limit(self, count: int) -> float | None:
         """Returns the value beyond which one of ``count`` values is suspicious."""
@@ -155,6 +156,9 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
     """
     if not trials:
         return impossible(key, title, f"no {what} to test", "")
+    trials = [trial for trial in trials if trial.redundancy > 0]
+    if not trials:
+        return impossible(key, title, "free poses and points explain the images, whatever they show", "add images")
     count = len(trials)
     statistic, freedom, redundancy = np.array([(t.statistic, t.freedom, t.redundancy) for t in trials], float).T
     probability = fdtrc(freedom, redundancy, statistic / freedom)

@@ -63,7 +63,7 @@ def draw_overlay(
     notes: int,
     left_out: Collection[Label] = (),
 ) -> bytes:
-    """Returns a JPEG with every measured ellipse and its label.
+    """Returns a JPEG with every measured ellipse and its label, and the name of each face within its pattern.
 
     Parameters
     ----------
@@ -96,7 +96,9 @@ def draw_overlay(
         if label in left_out:
             _cross(picture, at, max(LEAST_CROSS_PX, int(1.4 * np.ptp(rim, axis=0).max() / 16)))
     _name_faces(picture, observations, scale, colours, size)
-    counts = f"{observations.name}: {len(observations)} circles labelled"
+    extended = observations.shape.any(axis=(1, 2))
+    kind = "circles" if extended.all() else "circles and corners" if extended.any() else "corners"
+    counts = f"{observations.name}: {len(observations)} {kind} labelled"
     _text(
         picture,
         counts + (f", {notes} note{'s' * (notes > 1)}" if notes else ""),
@@ -137,9 +139,11 @@ def _rim(centre_px: np.ndarray, shape_px: np.ndarray, scale: float) -> np.ndarra
 def _name_faces(picture, observations: ImageObservations, scale: float, colours: dict, size: float) -> None:
     for face in observations.face_ids():
         members = [i for i, x in enumerate(observations.labels) if isinstance(x, CircleLabel) and x.face == face]
-        low, high = observations.centre_px[members].min(0), observations.centre_px[members].max(0)
-        at = (np.array([(low[0] + high[0]) / 2, low[1]]) * scale).astype(int)
-        _text(picture, f"face {face}", (at[0] - int(45 * size), at[1] - int(45 * size)), 1.5 * size, colours[face])
+        circles = observations.centre_px[members]
+        between = (circles[:, None] + circles).reshape(-1, 2) / 2
+        room = np.linalg.norm(between[:, None] - observations.centre_px, axis=2).min(1)
+        at = (between[np.argmax(room)] * scale).astype(int)
+        _text(picture, f"face {face}", (at[0] - int(45 * size), at[1] + int(12 * size)), 1.5 * size, colours[face])
 
 
 def _cross(picture, at: np.ndarray, reach: int) -> None:

@@ -22,9 +22,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import leaves_a_pattern_out
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advice, in_order
-from stcal.sfm.mapping.database import image_ids
-from stcal.sfm.mapping.models import read_model
-from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
+from stcal.sfm.runs.saved import AnyRun, SavedRun, read_target_model, saved_run
 
 MIN_MAPPED = 3
 """Least number of mapped circles that place the others of their plane."""
@@ -114,8 +112,7 @@ def doctor(
         raise InputError(
             "E-IMAGES-FOLDER", f"image folder {images}: not a folder; give the folder of the run's images with --images"
         )
-    ids = image_ids(run.observations)
-    models = read_model(run.folder / "target_model", run.observations, ids, run.corrected_px).in_mm()
+    models = read_target_model(run).in_mm()
     mapped = {name for model in models for name in model.images}
     try:
         findings = [*_files(run), *_images(run, mapped), *_circles(run), *_faces(run), *_unread(run, models)]

@@ -69,7 +69,7 @@ def design_target(
     """
     target_file, board_file = _free(out)
     board = load_board(board_file) if board_file is not None and os.path.lexists(board_file) else None
-    made = make_target(options, progress and partial(progress, "hide"))
+    made = make_target(options, progress and partial(progress, "patterns"))
     target, noise, source = made.pattern.target, *expected_noise()
     session = PlanOptions(
         images=images,

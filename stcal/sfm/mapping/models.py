@@ -26,6 +26,9 @@ LOG_NOTHING = 4
 KEYPOINT_TOLERANCE_PX = 0.002
 """Largest deviation of a keypoint from the database. Steps of float32: 0.0005 px at x = 5000, 0.002 px at x = 30
 000."""
+CORRECTION_TOLERANCE_PX = 1.0
+"""Largest deviation of a keypoint whose eccentricity was computed again from other poses, or not at all: less than an
+eccentricity of a large circle, far less than the distance of neighbours."""
 MAX_RMS_PX = 4.0
 """Largest RMS reprojection error of a model per axis. COLMAP excludes observations that are further off."""
 MAX_LENGTH_ERROR = 1e-3
@@ -172,9 +175,16 @@ def find_models(folder: str | Path) -> list[Path]:
 
 
 def read_model(
-    path: Path, observations: Sequence[ImageObservations], ids: dict[str, int], corrected_px: Sequence[np.ndarray]
+    path: Path,
+    observations: Sequence[ImageObservations],
+    ids: dict[str, int],
+    corrected_px: Sequence[np.ndarray],
+    corrected_again: bool = False,
 ) -> ReadModel:
     """Reads a model that is based on the keypoints of the run's database. (image, keypoint) determines the label.
+
+    ``corrected_again`` : whether the model is the run's ``target_model``, whose centres were corrected for the
+    eccentricity by the poses of the joint adjustment, and so are slightly elsewhere; its centres are then those read.
 
     Raises InputError: the model is damaged, has more than one camera, an image that is not in the run, or keypoints of
     another database; or its poses and points do not fit the keypoints.
@@ -205,8 +215,10 @@ def read_model(
                 f"{observations[-1].name}); {remedy}",
             )
         i = index_of_name[image.name]
-        require_keypoints(path, image, observations[i].labels, corrected_px[i])
-        members.setdefault(observations[i].group, []).append((observations[i], corrected_px[i], image))
+        tolerance_px = CORRECTION_TOLERANCE_PX if corrected_again else KEYPOINT_TOLERANCE_PX
+        xy = require_keypoints(path, image, observations[i].labels, corrected_px[i], tolerance_px)
+        corrected = xy if corrected_again else corrected_px[i]
+        members.setdefault(observations[i].group, []).append((observations[i], corrected, image))
     point_label, unlabelled = _labels_of_points(reconstruction, index_of_name, observations)
     groups, split = [], 0
     for name, images in sorted(members.items()):
@@ -346,8 +358,14 @@ def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
         raise ValueError(f"{file.name}: {len(walk.data)} bytes, {walk.at} by its own counts")
 
 
-def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], corrected_px: np.ndarray) -> None:
-    """Checks that the model uses the run's keypoints, as only then (image, keypoint) determines a label.
+def require_keypoints(
+    path: Path,
+    image: pycolmap.Image,
+    labels: Sequence[str],
+    corrected_px: np.ndarray,
+    tolerance_px: float = KEYPOINT_TOLERANCE_PX,
+) -> np.ndarray:
+    """Returns the model's keypoints (k, 2), which must be the run's, as only then (image, keypoint) determines a label.
 
     Raises InputError: the number of keypoints differs, or a keypoint is elsewhere.
     """
@@ -359,13 +377,14 @@ def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], 
             "give the run that the model's database came from",
         )
     off = np.abs(xy - corrected_px).max(axis=1, initial=0.0)
-    if not (off <= KEYPOINT_TOLERANCE_PX).all():
+    if not (off <= tolerance_px).all():
         k = int(np.argmax(off))
         raise InputError(
             "E-MODEL-NOT-OF-RUN",
             f"model {path}: image {image.name}: keypoint {k} ({labels[k]}) is {off[k]:.4f} px off the run's, "
-            f"{KEYPOINT_TOLERANCE_PX:g} allowed; give the run that the model's database came from",
+            f"{tolerance_px:g} allowed; give the run that the model's database came from",
         )
+    return xy
 
 
 def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:

@@ -297,8 +297,8 @@ def noise_of_run(run: AnyRun) -> CentreNoise:
 def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
     """Returns the σ to expect in good photographs; ``of_corners`` : of tags and squares, not of circles."""
     if of_corners:
-        return CentreNoise.expected(), "what corners of tags have in rendered photographs (--noise, --run)"
+        return CentreNoise.expected(), "what corners of tags have in rendered photographs"
     return CentreNoise.expected(), (
         f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale, edges "
-        f"blurred by {BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound (--noise, --run)"
+        f"blurred by {BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound"
     )

@@ -43,6 +43,8 @@ IN_ONE_GROUP = ("board", "board-lines", "flatness", "control", "camera", "residu
 EXPLAINED_BY = {"radius-design": ("rim",), "groups": IN_ONE_GROUP, "loops": IN_ONE_GROUP}
 """Checks that fail because of what others found; those are said before them. A fault within a group makes it contradict
 the others, but groups that contradict one another make no fault within one of them."""
+TESTED_BY = {"labels", "agreement"}
+"""Keys of the checks of which one at least must be possible for σ to be tested at all."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "
@@ -183,7 +185,7 @@ def _use(report: dict) -> tuple[Use, str]:
     if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, face) for face in open_)):
         verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
     elif verdict == "yes" and _absent(report):
-        answer = f"Yes, for face {join(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
+        answer = f"Yes, for {_faces(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
     return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
 
 
@@ -217,10 +219,18 @@ def _by_result(report: dict) -> tuple[Use, str]:
             "with care",
             "With care: groups were solved one by one; there are no σ, and there are fewer checks.",
         )
-    passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     n = counts["not possible"]
+    testing = [check["verdict"] for check in checks if check["key"] in TESTED_BY]
+    if testing and set(testing) == {"not possible"}:
+        return "with care", f"With care: the photographs are too few to test one another, {n} checks were not possible."
+    passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     open_ = f", {n} {'was' if n == 1 else 'were'} not possible" if n else ""
     return "yes", f"Yes: {passed}{open_}."
+
+
+def _faces(names: list[str]) -> str:
+    """Returns the names of faces in words."""
+    return f"face{'' if len(names) == 1 else 's'} {join(names)}"
 
 
 def _absent(report: dict) -> list[str]:
@@ -277,10 +287,13 @@ def _gaps(report: dict) -> list[str]:
         else:
             never.append(face)
     if never:
-        words.insert(0, f"face {join(never)} of the design was seen in no image")
+        was = "was seen in no image" if len(never) == 1 else "were seen in no image"
+        if report["left_out"]["images"]:  # which may show them
+            was = "is in no image that was used" if len(never) == 1 else "are in no image that was used"
+        words.insert(0, f"{_faces(never)} of the design {was}")
     single = [name for name, face in report["faces"].items() if face["images"] == 1]
     if single:
-        words.append(f"face {join(single)} rests on one image")
+        words.append(f"{_faces(single)} {'rests' if len(single) == 1 else 'rest'} on one image")
     words += [f"{group} was left out completely" for group in _lost_groups(report)]
     return words
 
@@ -509,9 +522,11 @@ def _more(report: dict, verdict: Use) -> list[str]:
         read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
         unseen = [face for face in missing if face not in read]
         if unseen:
-            advice.append(f"Photograph face {join(unseen)} together with one of the others: not seen in any image.")
+            seen = "in no image that was used" if report["left_out"]["images"] else "not seen in any image"
+            advice.append(f"Photograph {_faces(unseen)} together with one of the others: {seen}.")
         if read:
-            advice.append(f"Read why face {join(read)} was left out, and photograph it again from other places.")
+            was, it = ("was", "it") if len(read) == 1 else ("were", "them")
+            advice.append(f"Read why {_faces(read)} {was} left out, and photograph {it} again from other places.")
     open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and c["remedy"]]
     if verdict == "yes" and open_:
         remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")

@@ -31,7 +31,7 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
-from stcal.sfm.mapping.models import read_model
+from stcal.sfm.mapping.models import ReadModel, read_model
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
@@ -319,6 +319,15 @@ class AdjustedRun:
     prior: CameraPrior | None
 
 
+def read_target_model(run: SavedRun) -> ReadModel:
+    """Reads the adjusted model of a run, mm, target frame.
+
+    Raises InputError: it is missing or damaged.
+    """
+    ids = image_ids(run.observations)
+    return read_model(run.folder / "target_model", run.observations, ids, run.corrected_px, corrected_again=True)
+
+
 def adjusted_run(run: SavedRun) -> AdjustedRun:
     """Repeats the final adjustment of a run, which moves nothing.
 
@@ -329,7 +338,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     ConvergenceError
         The adjustment finds no minimum.
     """
-    read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
+    read = read_target_model(run)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
     start = CalibratedTarget(
         run.faces.reference_face,

@@ -81,26 +81,28 @@ def _camera_taken_as_exact(camera: Camera) -> str:
 def _scale_of_target(result: RunResult) -> Iterator[str]:
     """Yields what the size rests on where that is not the board alone, and how good print and flatness are."""
     sources, joint = result.scale_from(), result.calibration.joint
-    known = faces_of_known_shape(result.board_design)
+    known = [f for f in faces_of_known_shape(result.board_design) if f.id in result.target.target_from_face]
+    count = len(known_distances(result.board_design)) if "distances" in sources else 0
+    distances = f"{count} known distance{'' if count == 1 else 's'}"
     if "faces" in sources:
         beside = " beside the board" if "board" in sources else ", no board"
         stated = any(face.size_sigma for face in known)
         size = "" if stated else ", which is taken as exact: state size_sigma_mm of a measured square or tag"
-        yield f"scale: from the printed size of {len(known)} faces{beside}{size}"
+        faces = f"the printed size of {len(known)} face{'' if len(known) == 1 else 's'}"
+        yield f"scale: from {f'{distances} and ' if count else ''}{faces}{beside}{size}"
         if joint is not None:
             within = 1e3 * joint.print_factor * float(np.median([face.sigma_mm or 0.0 for face in known]))
             flat = result.options.flatness_mm
             off = "" if flat is None else f", {1e3 * joint.bend_factor * flat:.0f} µm off it"
             yield f"print: corners lie {within:.0f} µm about the design in the plane{off} (σ, from the photographs)"
     if "drawing" in sources:
-        (known,) = known_distances(result.board_design)
+        (drawn,) = known_distances(result.board_design)
         yield (
-            f"scale: unknown, nothing of known size is in view; the unit is such that {known.first} and {known.second} "
-            f"are {known.mm:g} mm apart, as drawn"
+            f"scale: unknown, nothing of known size is in view; the unit is such that {drawn.first} and {drawn.second} "
+            f"are {drawn.mm:g} mm apart, as drawn"
         )
-    if "distances" in sources:
-        count = len(known_distances(result.board_design))
-        yield f"scale: from {count} known distance{'' if count == 1 else 's'}"
+    if count and "faces" not in sources:
+        yield f"scale: from {distances}"
 
 
 def _found_camera(result: RunResult) -> Iterator[str]:
@@ -112,7 +114,8 @@ def _found_camera(result: RunResult) -> Iterator[str]:
     focal, centre = refined.focal, refined.centre
     yield (
         f"camera: found from the photographs: f {focal[0]:.2f} ± {sigma[0]:.2f}, {focal[1]:.2f} ± {sigma[1]:.2f} px, "
-        f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px"
+        f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px from the centre of the "
+        "first pixel (the camera file, as COLMAP's, counts from its corner: 0.5 px more)"
     )
     if sigma[0] > WEAK_FOCAL * focal[0]:
         yield (
@@ -247,7 +250,7 @@ def _faces(result: RunResult) -> Iterator[str]:
             )
             yield f"face {face} is not in the result: seen in {what}"
     if unseen := [face for face in absent if face not in seen and not images_left_out(face, notes)]:
-        yield f"not seen in any image: face {', '.join(unseen)}"
+        yield f"not seen in any image: face{'' if len(unseen) == 1 else 's'} {', '.join(unseen)}"
 
 
 def _boards(result: RunResult) -> Iterator[str]:

@@ -124,6 +124,14 @@ def test_one_thermometer_of_both_errs_in_the_difference_of_the_expansions(saved,
     assert (source.sigma, source.unit, source.origin) == (1.0, "K", "stated")
 
 
+def test_a_date_of_toml_is_its_text(tmp_path):
+    path = tmp_path / "lab.toml"
+    path.write_text("[fields]\ndate = 2026-11-27\nread = 2026-11-27 08:30:00\n")
+    assert (
+        statement_of(StatedSize(), path).fields.items() >= {"date": "2026-11-27", "read": "2026-11-27 08:30:00"}.items()
+    )
+
+
 def test_one_thermometer_is_stated_before_the_tables(saved, tmp_path):
     path = tmp_path / "lab.toml"
     path.write_text("one_thermometer = true\n[board]\ntemperature_sigma_k = 0.5\n")
@@ -331,6 +339,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
         ("[target]\npitch_sigma_ppm = 1\n", "target.pitch_sigma_ppm: unknown key"),
         ("[fields]\noperator = 3\n", "fields.operator: 3:"),
         ("operator = 'x'\n", "operator: unknown key"),
+        ("[target]\none_thermometer = true\n", "move it to the top of the file"),
     ],
 )
 def test_statements_that_are_none(stcal_sfm, small_run, tmp_path, content, words):

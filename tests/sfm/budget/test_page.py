@@ -49,7 +49,8 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
 def test_a_pdf_stands_beside_a_page(stcal_sfm, small_run, tmp_path):
     assert_error(stcal_sfm("budget", small_run, "--pdf"), INPUT, "E-OPTION-NEEDS", "--report", "FILE.html")
     words = ("--report", tmp_path / "budget.pdf", "--pdf")
-    assert_error(stcal_sfm("budget", small_run, *words), INPUT, "E-OUTPUT-SUFFIX")
+    assert_error(stcal_sfm("budget", small_run, *words), INPUT, "E-OUTPUT-SUFFIX", "budget.html, and --pdf")
+    assert_error(stcal_sfm("budget", small_run, *words[:2]), INPUT, "E-OUTPUT-SUFFIX", "budget.html, and --pdf")
 
 
 @pytest.mark.parametrize(

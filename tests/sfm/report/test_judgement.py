@@ -223,11 +223,22 @@ def test_what_is_missing_is_said_too():
     own["summary"]["faces_not_seen"] = ["5", "6"]
     told = judgement_of(own)
     assert told.use == (
-        "Yes, for face 1, 2, 3, 4: nothing was checked, 2 were not possible; face 5, 6 of the design was seen in no "
+        "Yes, for faces 1, 2, 3, 4: nothing was checked, 2 were not possible; faces 5, 6 of the design were seen in no "
         "image."
     )
-    assert "Photograph face 5, 6 together with one of the others: not seen in any image." in told.next
+    assert "Photograph faces 5, 6 together with one of the others: not seen in any image." in told.next
     assert told.next.endswith("For 2 more checks: add a group.")
+
+
+def test_photographs_that_do_not_test_one_another_are_no_yes():
+    """Two of five checks passed, but none that residuals decide."""
+    keys = {"centres": "not possible", "labels": "not possible", "agreement": "not possible"}
+    own = report(check("pitch", "passed"), check("radius", "passed"), *(check(k, v) for k, v in keys.items()))
+    told = judgement_of(own)
+    assert told.verdict == "with care"
+    assert told.use == "With care: the photographs are too few to test one another, 3 checks were not possible."
+    keys["labels"] = "passed"
+    assert judgement_of(report(*(check(k, v) for k, v in keys.items()))).verdict == "yes"
 
 
 def test_a_missing_face_that_was_expected_is_a_no():
@@ -235,11 +246,11 @@ def test_a_missing_face_that_was_expected_is_a_no():
     own["summary"] |= {"faces_not_seen": ["5", "6"], "faces_expected": ["1", "6"]}
     told = judgement_of(own)
     assert (told.verdict, told.missing) == ("no", ["6"])
-    assert told.use == "No: face 5, 6 of the design was seen in no image."
+    assert told.use == "No: faces 5, 6 of the design were seen in no image."
     assert told.position_sigma_um is None
     assert "µm" not in told.quality
     own["checks"] = [check("a", "failed", remedy="x")]
-    assert judgement_of(own).use.endswith("the first: Check a; face 5, 6 of the design was seen in no image.")
+    assert judgement_of(own).use.endswith("the first: Check a; faces 5, 6 of the design were seen in no image.")
 
 
 def test_a_face_that_was_read_and_left_out_and_a_lost_group_call_for_care():

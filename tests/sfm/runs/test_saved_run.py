@@ -18,7 +18,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.target import read_target
 from stcal.sfm.runs.options import RunOptions, unknown_faces
-from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
@@ -376,6 +376,19 @@ def test_faces_of_a_run_with_another_digit_are_refused_by_what_reads_them_alone(
     nudge(own_run / "faces.json")
     with fails_with("E-RUN-CHANGED"):
         read_target(own_run / "faces.json", own_run / "target.toml")
+
+
+def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_path):
+    """Its poses are others than those of the groups, and with a wrong camera their eccentricities differ by more than a
+    rounded number: the run's own model is read with its own centres."""
+    run = unsealed_copy(small_run, tmp_path / "run")
+
+    def shifted(body):
+        return [[*row[:7], *(str(float(value) + 0.01) for value in row[7:9]), *row[9:]] for row in body]
+
+    rows(shifted)(run / "labels.csv")
+    found, known = (adjusted_run(load_run(folder)).state.result() for folder in (run, small_run))
+    assert np.array_equal(found.xyz_model, known.xyz_model)
 
 
 def test_reading_writes_nothing(own_run):
