@@ -25,13 +25,13 @@ BAR, SHORT_BAR = 100.0, 50.0
 
 
 def framed(part: Part, bare: bool = False) -> list[Shape]:
-    """Return the part with cut marks and, unless it is to be ``bare``, its name above and dimensions below and to the
-    left."""
+    """Return the part with its outline and, unless it is to be ``bare``, its name above, cut marks, and dimensions below
+    and to the left."""
     box = np.array([part.outline.min(0), part.outline.max(0)])
     lines = part.lines or (Line(part.outline, "CUT", width=0.1, closed=True),)
-    shapes: list[Shape] = [*part.shapes, *lines, *([] if part.lines else _cut_marks(box))]
     if bare:
-        return shapes
+        return [*part.shapes, *lines]
+    shapes: list[Shape] = [*part.shapes, *lines, *([] if part.lines else _cut_marks(box))]
     for axis in (0, 1):
         spans = [span for span in part.spans if span[0] == axis]
         outer = (axis, float(box[0, axis]), float(box[1, axis]), said_mm(box[1, axis] - box[0, axis]))
