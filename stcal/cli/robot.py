@@ -151,11 +151,6 @@ def axes(
     nominal = load_robot(robot_file)
     source = shared.one_table(sweeps, first, second, key, "SWEEPS", columns=columns, columns_a=columns_a)
     data = read_measurements(source, nominal, rotation=rotation)
-    if len(set(data.stations)) > 1:
-        raise InputError(
-            "E-STATION-SINGLE",
-            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time",
-        )
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
     document = axes_report(result, data.where)

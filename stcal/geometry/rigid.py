@@ -19,6 +19,10 @@ UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 
 
+SMALL_RAD = 1e-3
+"""Angle below which the next term of a series is rounding error."""
+
+
 def skew(v: ArrayLike) -> np.ndarray:
     """Return the cross-product matrices, shape (..., 3, 3), of vectors of shape (..., 3)."""
     v = np.asarray(v, float)
@@ -162,6 +166,20 @@ class Rigid(_ByValue):
     def log(self) -> np.ndarray:
         """Return rotation vector (rad) and translation (mm), (6,): the inverse of :meth:`exp`."""
         return np.concatenate([self.as_scipy().as_rotvec(), self.translation])
+
+    def log_sigma(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the σ (6,) of :meth:`log`, rad and mm, from the covariance (6, 6) of a left perturbation.
+
+        A small turn ω moves the rotation vector φ by the inverse left Jacobian of SO(3), (φ/2) cot(φ/2) ω across φ, and
+        by half of ω × φ; σ about the axes are those of its components for small φ only (Barfoot, "State Estimation for
+        Robotics", 2017, sec. 7.1.5).
+        """
+        turn = self.log()[:3]
+        angle = float(np.linalg.norm(turn))
+        across = 1 / 12 if angle < SMALL_RAD else (1 - angle / 2 / math.tan(angle / 2)) / angle**2
+        by_turn = np.eye(3) - skew(turn) / 2 + across * skew(turn) @ skew(turn)
+        squares = np.concatenate([np.diag(by_turn @ covariance[:3, :3] @ by_turn.T), np.diag(covariance)[3:]])
+        return np.sqrt(np.maximum(squares, 0))
 
     def matrix(self) -> np.ndarray:
         """Return the homogeneous 4×4 matrix."""

@@ -123,7 +123,9 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
     InputError
         Fewer than three poses would remain.
     """
-    k = held_out or max(1, count // 4)
+    if held_out is not None and held_out < 1:
+        raise InputError("E-OPTION-RANGE", f"cross-validation: held_out {held_out}: 1 or more needed")
+    k = max(1, count // 4) if held_out is None else held_out
     if count - k < LEAST_LEFT:
         raise InputError(
             "E-HELD-OUT-FEW",

@@ -118,7 +118,8 @@ def join_tables(
     joined: dict[str, list[str] | np.ndarray] = {}
     for table, row_of_key, prefix in zip(tables, places, prefixes, strict=True):
         rows = [row_of_key[name] for name in common]
-        for name, values in table.columns.items():
+        for name in table.columns:
+            values = table.kept(name)
             posed = bool(_OF_POSES.fullmatch(name))
             new = prefix + name if posed else name
             if new in joined and posed:
@@ -174,7 +175,7 @@ def stack_tables(
     common = [name for name in tables[0].columns if name != column and all(name in table for table in tables)]
     columns: dict[str, list[str] | np.ndarray] = {}
     for name in common:
-        values_of_table = [table.columns[name] for table in tables]
+        values_of_table = [table.kept(name) for table in tables]
         numeric = all(isinstance(part, np.ndarray) for part in values_of_table)
         columns[name] = (
             np.concatenate(values_of_table) if numeric else [v for table in tables for v in table.text(name)]

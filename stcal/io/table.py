@@ -73,6 +73,16 @@ class Table:
             return [row.split(",")[at].strip() for row in self.rows]
         return [f"{v:.15g}" for v in values]
 
+    def kept(self, column: str) -> "list[str] | np.ndarray":
+        """Return a column for another table, without rows: as text if its numbers are names, such as 0001, or times in
+        nanoseconds, that no float writes alike."""
+        values = self.columns[column]
+        if isinstance(values, list) or not self.rows:
+            return values
+        text = self.text(column)
+        named = any(word.isdecimal() and word != f"{value:.15g}" for word, value in zip(text, values, strict=True))
+        return text if named else values
+
     def numbers(self, column: str) -> np.ndarray:
         """Return the finite numbers (m,) of a column."""
         self._need(column)

@@ -443,10 +443,14 @@ def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
 
 
 def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -> list[ImageCorners]:
-    """Chooses in each image the numbering of a symmetric board that places the tags where the first image has them."""
-    order = sorted(range(len(images)), key=lambda i: -len(images[i].rows))
-    turned, place_of_tag = list(images), {}
-    for i in order:
+    """Chooses in each image the numbering of a symmetric board that places the tags where the others have them.
+
+    The image with most tags comes first, then each time the one that shares most tags with those before.
+    """
+    turned, place_of_tag, left = list(images), {}, list(range(len(images)))
+    while left:
+        i = max(left, key=lambda i: (sum(row in place_of_tag for row in images[i].rows), len(images[i].rows), -i))
+        left.remove(i)
         image = images[i]
         choices = [image, *(image.turned(symmetry) for symmetry in symmetries)]
         places = [plane_points(choice.pose, choice.seen).reshape(-1, 4, 2) for choice in choices]

@@ -138,7 +138,7 @@ HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
 def transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str]]:
     """Return a row for each of x, y, z: translation in mm and rotation vector in degrees, each with σ."""
     turn = np.degrees(Rotation.from_matrix(np.array(pose.rotation)).as_rotvec())
-    sigma = [None] * 6 if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    sigma = [None] * 6 if covariance is None else pose.log_sigma(covariance)
     sigma = [*(None if s is None else np.degrees(s) for s in sigma[:3]), *sigma[3:]]
     columns = zip("xyz", pose.translation, sigma[3:], turn, sigma[:3], strict=True)
     return [[a, number(t, 4), number(s, 4), number(r, 4), number(d, 4)] for a, t, s, r, d in columns]

@@ -133,6 +133,7 @@ def read_urdf(
         raise InputError("E-URDF-LINKS", f"{where}: a link is the child of two joints; a tree needed")
     links = [link.get("name", "") for link in root.findall("link")]
     links = list(dict.fromkeys([*links, *joints, *(joint.parent for joint in joints.values())]))
+    _require_no_circle(joints, where)
     given = [to_link] if isinstance(to_link, str) else list(to_link)
     for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
@@ -150,7 +151,8 @@ def read_urdf(
     for name, path in paths.items():
         _require_chain(path, start, ends[name], where)
     first, world = next(iter(paths.values())), Rigid()
-    if not from_link and start == WORLD and first[0].kind == "fixed":
+    shared = all(path[0].name == first[0].name for path in paths.values())
+    if not from_link and start == WORLD and first[0].kind == "fixed" and shared:
         world, start = first[0].parent_from_child, first[0].child
         paths = {name: path[1:] for name, path in paths.items()}
     name = root.get("name") or "robot"
@@ -342,6 +344,19 @@ def _root(joints: dict[str, UrdfJoint], links: list[str], where: str) -> str:
             "E-URDF-LINKS", f"{where}: {len(roots)} links are no joint's child; one root needed, or --from-link"
         )
     return roots[0]
+
+
+def _require_no_circle(joints: dict[str, UrdfJoint], where: str) -> None:
+    """Refuses a link that is below itself."""
+    sound: set[str] = set()
+    for link in joints:
+        passed, at = [], link
+        while at in joints and at not in sound:
+            if at in passed:
+                raise InputError("E-URDF-LINKS", f"{where}: link {at} is below itself; a tree needed")
+            passed.append(at)
+            at = joints[at].parent
+        sound.update(passed)
 
 
 def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, str]:

@@ -1,5 +1,7 @@
 """Rigid and similarity transforms: group axioms, the action on points, and what the constructors refuse."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -194,3 +196,20 @@ def test_from_matrix_repairs_the_rounding_of_a_text_file():
 def test_similarity_refuses(scale):
     with fails_with("E-SCALE-VALUE"):
         Similarity(scale, Rigid())
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.3, 2.0, np.pi - 1e-3])
+def test_sigma_of_a_rotation_vector_are_those_of_its_components(angle):
+    rng = np.random.default_rng(3)
+    axis = rng.normal(size=3)
+    pose = Rigid.exp([*(angle * axis / np.linalg.norm(axis)), 1.0, 2.0, 3.0])
+    root = rng.normal(size=(6, 6)) * 1e-3
+    step = 1e-6
+    slope = (
+        np.array([(Rigid.exp(step * e) @ replace(pose, translation=np.zeros(3))).log()[:3] for e in np.eye(6)[:3]])
+        - pose.log()[:3]
+    )
+    jacobian = slope.T / step
+    expected = np.sqrt(np.diag(jacobian @ (root @ root.T)[:3, :3] @ jacobian.T))
+    np.testing.assert_allclose(pose.log_sigma(root @ root.T)[:3], expected, rtol=1e-4)
+    np.testing.assert_allclose(pose.log_sigma(root @ root.T)[3:], np.sqrt(np.diag(root @ root.T)[3:]))

@@ -121,3 +121,15 @@ def test_files_of_one_kind_stand_below_each_other(tmp_path):
     assert np.allclose(found.points("commanded_"), [[1, 2, 3], [4, 5, 6], [1, 2, 3]])
     with fails_with("E-TABLES-NAMES … after … set"):
         stack_tables(joined, ["after", "after"], {})
+
+
+def test_names_that_are_numbers_stay_as_they_are_written(tmp_path):
+    """Both columns are numbers in both files, and no float has these digits."""
+    stamps = "1700000000123456789", "1700000000223456789"
+    a = written(tmp_path / "a.csv", f"image,time_ns,x_mm\n0001,{stamps[0]},1.50\n0002,{stamps[1]},2.50\n")
+    b = written(tmp_path / "b.csv", "image,u_px\n0002,7\n0001,8\n")
+    joined = join_tables(a, b, "image").table
+    assert (joined.text("image"), joined.text("time_ns")) == (["0001", "0002"], list(stamps))
+    assert np.array_equal(joined.numbers("x_mm"), [1.5, 2.5])
+    both = stcal.stack_tables([stcal.load_table(a)] * 2, ["first", "second"])
+    assert both.text("image") == ["0001", "0002"] * 2

@@ -254,3 +254,33 @@ def test_two_arms_come_back_from_a_urdf(tmp_path, convention):
     for name in ("left", "right"):
         wanted = robot.world_from_base @ forward(robot, q, name)
         assert np.abs((found.world_from_base @ forward(found, q, f"tool_{name}")).difference(wanted)).max() < 1e-9
+
+
+TWO_ARMS = """<robot name="cell"><link name="world"/>
+{arms}</robot>"""
+ARM = """<link name="{arm}_base"/><link name="{arm}_1"/><link name="{arm}_2"/><link name="{arm}_tool"/>
+<joint name="{arm}_mount" type="fixed"><origin xyz="{x} 0 0.5" rpy="0 0 {x}"/><parent link="world"/><child
+ link="{arm}_base"/></joint>
+<joint name="{arm}_a" type="continuous"><parent link="{arm}_base"/><child link="{arm}_1"/><axis xyz="0 0 1"/></joint>
+<joint name="{arm}_b" type="continuous"><origin xyz="0.4 0 0.3"/><parent link="{arm}_1"/><child link="{arm}_2"/>
+<axis xyz="0 1 0"/></joint>
+<joint name="{arm}_end" type="fixed"><origin xyz="0.3 0 0"/><parent link="{arm}_2"/><child link="{arm}_tool"/></joint>
+"""
+
+
+def test_two_arms_that_stand_at_two_places(tmp_path):
+    """Each fixed to the world by a joint of its own: the tool of either is where its own mount puts it."""
+    arms = "".join(ARM.format(arm=arm, x=x) for arm, x in (("left", 1.0), ("right", -2.0)))
+    (tmp_path / "cell.urdf").write_text(TWO_ARMS.format(arms=arms))
+    robot = load_urdf(tmp_path / "cell.urdf", to_link=["left_tool", "right_tool"]).robot
+    for tool, x in (("left_tool", 1.0), ("right_tool", -2.0)):
+        (pose,) = world_poses(robot, np.zeros((1, 4)), tool)
+        expected = np.array([1000 * x + 700 * np.cos(x), 700 * np.sin(x), 800.0])
+        assert pose.translation == pytest.approx(expected, abs=1e-6)
+
+
+def test_links_in_a_circle_are_refused(tmp_path):
+    circle = ARM.format(arm="a", x=0.0).replace('<parent link="world"/>', '<parent link="a_tool"/>')
+    (tmp_path / "circle.urdf").write_text(TWO_ARMS.format(arms=circle))
+    with fails_with("E-URDF-LINKS … is below itself"):
+        load_urdf(tmp_path / "circle.urdf", from_link="a_base")

@@ -68,7 +68,9 @@ def simulate(
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[
-        float | None, "Use a thin lens of this f-number; without it, everything is in focus.", Opt(min=0.5, max=100)
+        float | None,
+        "Use a thin lens of this f-number, with --focal-mm if there is a --camera; without it, all is in focus.",
+        Opt(min=0.5, max=100),
     ] = None,
     focus: Annotated[
         float | None,
@@ -398,7 +400,8 @@ def design(
     of_circles = {"--faces": faces, "--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
     of_tags = {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}
     if tags is not None and (unfit := [name for name, given in of_circles.items() if given]):
-        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
+        fewer = "; for fewer faces, delete a [[face]] of target.toml" if unfit[0] == "--faces" else ""
+        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out{fewer}")
     if tags is None and (unfit := [name for name, given in of_tags.items() if given]):
         raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of tags, and there are none without --tags; add it")
     model = read_camera(camera) if camera else None

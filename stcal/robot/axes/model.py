@@ -93,8 +93,8 @@ def robot_from_sweeps(
     ConvergenceError
         The fit of an axis reaches no minimum.
     InputError
-        A joint never swept, a reflector that does not move, mirrored positions, a robot of another build; no
-        orientations where they are asked for.
+        Several stations, a joint never swept, a reflector that does not move, mirrored positions, a robot of another
+        build; no orientations where they are asked for.
     DegenerateError
         Axes that their arcs do not determine.
 
@@ -104,6 +104,11 @@ def robot_from_sweeps(
     Ginés, "Uncertainty estimation in robot kinematic calibration", Robotics and Computer-Integrated Manufacturing 29,
     2013.
     """
+    if len(set(data.stations)) > 1:
+        raise InputError(
+            "E-STATION-SINGLE",
+            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time",
+        )
     measured, virtual = data, None if places is None else virtual_reflectors(data, places)
     data = data if virtual is None else virtual.data
     if nominal.tree is not None:

@@ -70,12 +70,13 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
                     f"not used, {DISTINCT[joint.type]} needed"
                 )
         if not arc_count:
-            missing.append(str(j + 1))
+            missing.append(j)
     if missing:
+        names, least = ", ".join(str(j + 1) for j in missing), DISTINCT[robot.joints[missing[0]].type]
         raise InputError(
             "E-AXES-NO-SWEEP",
-            f"{data.where}: joint {', '.join(missing)} is never swept: no rows of one reflector differ in that joint "
-            "alone, 3 or more positions needed; measure its sweep, and if the controller couples joints, give "
+            f"{data.where}: joint {names} is never swept: no rows of one reflector differ in that joint "
+            f"alone, {least} or more positions needed; measure its sweep, and if the controller couples joints, give "
             "`coupling` in the robot file",
         )
     return arcs, notes

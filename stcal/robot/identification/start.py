@@ -60,7 +60,7 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     robot fit. Raises DegenerateError: a target never moved, or only along a line.
     """
     if data.positions is not None and len(set(data.stations)) > 1:
-        return _with_stations(robot, data)
+        return _with_stations(robot, data, fit)
     _moves(data)
     named = sorted(set(data.targets))
     if robot.tree is not None:
@@ -99,11 +99,11 @@ def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
         )
 
 
-def _with_stations(robot: Robot, data: Measurements) -> State:
+def _with_stations(robot: Robot, data: Measurements, fit: Fit) -> State:
     """Returns the state by the rows of the station with most rows; the other stations stand where its positions put
     them."""
     (first, most), *others = data.by_station().items()
-    state = start(robot, data[most])
+    state = start(robot, data[most], fit)
     default = robot.tools.get("", Rigid())
     tools = {name: state.tools.get(name, robot.tools.get(name, default)) for name in sorted(set(data.targets))}
     state = replace(state, tools=tools)

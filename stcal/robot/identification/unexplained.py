@@ -280,12 +280,13 @@ def _shared(state: State, measured: Observed) -> np.ndarray:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Order:
     """What may have moved between two rows. ``motions`` : (r, w, c) as observed, rad over mm where c is 6; ``advice`` :
-    what to do about a jump."""
+    what to do about a jump; ``slides`` : True for a prismatic joint, whose motion is in mm."""
 
     what: str
     joint: int
     motions: np.ndarray
     advice: str
+    slides: bool = False
 
 
 DRIFTS = "let the instrument warm up, and measure a fixed point now and then"
@@ -315,7 +316,8 @@ def _order(state: State, measured: Observed) -> list[_Order]:
         turn, shift = (0 * z, z) if state.chain.prismatic[i] else (z, np.cross(z, tip.translation - origin))
         motions = np.hstack([turn, shift])[:, :, None] * carries[i, :, None, None]
         what, advice = f"the zero of joint {i + 1} another one", "look whether it slipped, and measure again"
-        order.append(_Order(what, i + 1, as_seen(state, measured, tip, motions), advice))
+        slides = bool(state.chain.prismatic[i])
+        order.append(_Order(what, i + 1, as_seen(state, measured, tip, motions), advice, slides))
     return order
 
 
@@ -373,7 +375,8 @@ def _size(moved: _Order, change: Change) -> tuple[float, float]:
     if moved.motions.shape[2] == 6:
         return float(np.linalg.norm(change.motion[3:])), float(np.linalg.norm(change.motion[:3]))
     as_measured = np.linalg.norm((moved.motions @ change.motion)[:, -3:], axis=1)
-    turned = float(abs(change.motion[0])) if moved.joint and len(change.motion) == 1 else 0.0
+    turns = moved.joint and not moved.slides and len(change.motion) == 1
+    turned = float(abs(change.motion[0])) if turns else 0.0
     return float(np.sqrt((as_measured**2).mean())), turned
 
 

@@ -293,7 +293,10 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
     fitted = _derivatives(state, base, good, fit)
     one, full = Weighting(1.0, 1.0), jacobian(state, good)
     seeks = np.concatenate([fitted, full], axis=2)
-    in_base = found @ base.rotation if found.shape[1] == 3 else found
+    in_base = found
+    if found.shape[1] == 3:
+        stations = [state.stations[measured.data.stations[row]].rotation for row in measured.first]
+        in_base = np.einsum("nji,nj->ni", np.array(stations), found) @ base.rotation
     placed = _placed(state, base, residuals(state, good), fitted, fit, measured.kind != "distance")
     return Evaluated(
         replace(robot, world_from_base=base, tools=state.tools),

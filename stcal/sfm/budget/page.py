@@ -48,6 +48,7 @@ def name_of(circles: Sequence[str]) -> str:
     return "–".join(circles)
 
 
+RELATES = "The results relate only to the item named above, in the state in which it was photographed."
 SIGNED = ("date", "name", "signature")
 """Lines that are left empty for whoever signs a certificate."""
 LEAST_SHARE = 1e-3
@@ -159,14 +160,18 @@ def budget_report(file: BudgetFile) -> Document:
                 ],
             ),
             *(
-                [Section("Signature", [Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")])]
+                [Section("Signature", [RELATES, Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")])]
                 if certifies(file)
                 else []
             ),
         ],
         banner=[
             *([macro("answers", [("May the run be used?", file.use)], _tone(file))] if file.use else []),
-            Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts"),
+            Table(
+                ["<Field", "<"],
+                [[name.replace("_", " "), value or NONE] for name, value in file.fields.items()],
+                css="text facts",
+            ),
         ],
     )
 
@@ -282,7 +287,9 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
             largest = max(abs(e) for e in _known(test))
             headline.append((number(largest, 2), "", f"largest |E_n| of {count} lengths, {test.reference}: {word}"))
     unknown = sum(source.origin == "not stated" for source in file.sources)
-    return [*headline, (str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact")]
+    assumed = sum(source.origin == "assumed" for source in file.sources)
+    also = f"; {assumed} assumed" if assumed else ""
+    return [*headline, (str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact{also}")]
 
 
 def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Table:

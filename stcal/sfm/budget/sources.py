@@ -29,7 +29,7 @@ from stcal.sfm.adjust.uncertainty import (
 )
 
 FIELDS = ("instrument", "operator", "date", "traceability")
-"""Fields in the head of every budget, empty if not given. Other fields follow them."""
+"""Fields in the head of every budget, after those that are given, and empty if they are not."""
 LONGEST = 500
 
 
@@ -91,7 +91,8 @@ def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, 
                 "E-OPTION-VALUE",
                 f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST} for a value",
             )
-    named = dict.fromkeys(FIELDS, "") | file.fields | dict(given or {})
+    named = file.fields | dict(given or {})
+    named |= {name: "" for name in FIELDS if name not in named}
     return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
 
 

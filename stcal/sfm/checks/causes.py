@@ -357,8 +357,9 @@ def _turned(camera: Camera, quarters: int) -> np.ndarray:
     """Returns the parameters of a camera whose photographs are turned counterclockwise by quarter turns."""
     parameters, size = camera.parameters().copy(), (camera.width, camera.height)
     for _ in range(quarters):
-        (fx, fy, cx, cy), (p1, p2) = parameters[:4], parameters[6:8]
+        (fx, fy, cx, cy), (p1, p2), (s1, s2, s3, s4) = parameters[:4], parameters[6:8], parameters[12:16]
         parameters[:4], parameters[6:8] = (fy, fx, cy, size[0] - 1 - cx), (-p2, p1)
+        parameters[12:16] = s3, s4, -s1, -s2
         size = size[::-1]
     return parameters
 

@@ -436,7 +436,7 @@ def _exchanged(
     pairs = []
     for network in networks:
         model = network.model
-        for name in set(model.images) & set(by_image):
+        for name in [name for name in model.images if name in by_image]:
             pose = model.camera_from_model[model.images.index(name)]
             labels = [label for label in by_image[name] if label in model.labels]
             place = {x: camera.project((pose @ model.xyz_model[model.labels.index(x)])[None])[0] for x in labels}

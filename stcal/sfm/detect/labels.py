@@ -183,8 +183,11 @@ def detect_circles(
     found = detect_image(grey, camera, target, board, options or EllipseOptions())
     circles = target.with_faces(printed=False)
     focal_px = float(np.sqrt(camera.focal.prod()))
-    labelled, _ = label_groups([[("image", "", found)]], circles, board, focal_px)[0]
-    sharp = without_defocus([_with_corners(labelled[0], found, target)], camera, patterns_of(target, board))[0]
+    if circles.faces or board is not None:
+        labelled = label_groups([[("image", "", found)]], circles, board, focal_px)[0][0][0]
+    else:
+        labelled = labelled_image("image", "", (), found.centres.select(np.zeros(0, int)), found.notes)
+    sharp = without_defocus([_with_corners(labelled, found, target)], camera, patterns_of(target, board))[0]
     seen = sharp.observations
     return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
 

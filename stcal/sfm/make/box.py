@@ -1,5 +1,6 @@
 """The four sides and the top of a box that stands: where they are, and where circles may lie on each of them."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -61,7 +62,7 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
 
 def faces_of(text: str) -> tuple[str, ...]:
     """Parses ``front,right,top`` into the names of sides; all of them if the text is empty."""
-    names = tuple(name.strip() for name in text.split(",")) if text else NAMES
+    names = tuple(name.strip().lower() for name in text.split(",")) if text else NAMES
     require_sides(names, text)
     return names
 
@@ -85,12 +86,12 @@ def require_sides(names: Sequence[str], text: str) -> None:
 
 
 def size_of(text: str) -> tuple[float, float, float]:
-    """Parses ``W,H,D`` into width, height and depth in mm.
+    """Parses ``W,H,D``, or ``WxHxD``, into width, height and depth in mm.
 
     Raises InputError if the text is not three lengths.
     """
     try:
-        width, height, depth = map(float, text.split(","))
+        width, height, depth = map(float, re.split("[,x×]", text))
     except ValueError as error:
         raise InputError("E-OPTION-VALUE", f"--size {text}: W,H,D in mm needed, such as 120,120,100") from error
     require_size((width, height, depth), text)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.faces import why_unseen
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, StcalError
@@ -146,6 +147,7 @@ def measure(
     camera = read_camera(camera) if isinstance(camera, str | Path) else camera_model(camera)
     files, unreadable = find_images(images)
     step = counted(progress, "detect", len(files))
+    shown = True
     if options.sequence:
         result = follow_files(files, camera, replace(target, design=design), board, options, step)
     else:
@@ -164,6 +166,7 @@ def measure(
                 pictures=False,
             )
         observations, notes = _labelled(detection.images, detection.camera, design)
+        shown = any(len(image) for image in observations)
         prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
         result = measure_labelled(observations, detection.camera, target, options, prior)
         measured = tuple(replace(image, notes=notes[image.name]) for image in result.images)
@@ -171,6 +174,9 @@ def measure(
     result = replace(result, left_out=(*unreadable, *result.left_out))
     if not result.images:
         last = result.left_out[-1]
+        printed = design.with_faces(printed=True).faces
+        if printed and not shown:
+            raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
         raise DetectionError(
             "E-MEASURE-NONE",
             f"no face of the target measured in {len(files)} images, first {last.name}: "

@@ -126,7 +126,7 @@ def follow(
 def rows_of(pose: TargetPose) -> list[list[str]]:
     """Returns the rows of the page for a pose: names and values with their σ, camera_from_target in mm and degrees."""
     turn = np.degrees(pose.camera_from_target.log()[:3])
-    sigma = np.sqrt(np.diag(pose.covariance))
+    sigma = pose.camera_from_target.log_sigma(pose.covariance)
     sigma[:3] = np.degrees(sigma[:3])
     rows = [["faces", ", ".join(pose.faces)], ["circles", str(len(pose.labels))]]
     rows += [

@@ -8,7 +8,14 @@ from stcal.boards.design import BoardView, ChessboardDesign, view_of
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration import CalibratedLayout, _by_board_corners, calibrate, plane_points
+from stcal.locate.calibration import (
+    CalibratedLayout,
+    ImageCorners,
+    _by_board_corners,
+    _turned_alike,
+    calibrate,
+    plane_points,
+)
 from stcal.locate.data.layout import LayoutPlan, obj_from_plane
 from tests.outcome import fails_with
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
@@ -169,3 +176,20 @@ def test_an_image_without_the_tag_of_a_small_view():
     few = BoardView("0", boards[0].ids[:3], boards[0].xyz_board[:3], boards[0].xy_px[:3])
     result = calibrate(PLAN, [few, *boards[1:]], tags, names, CAMERA)
     assert result.images == ("1", "2", "3")
+
+
+def test_images_are_numbered_in_an_order_that_links_them():
+    """The first two share no tag, and the third links them, with fewer tags than either."""
+
+    def image(name: str, rows: list[int]) -> ImageCorners:
+        facing = Rigid(np.eye(3), np.array([0.0, 0.0, 100.0]))
+        seen = np.array([[row, corner] for row in rows for corner in range(4)], float) / 100
+        none = np.zeros((0, 2))
+        return ImageCorners(
+            name, facing, np.zeros((0, 3)), none, np.zeros((0, 2, 2)), np.array(rows), seen, np.zeros((0, 8, 8)), 1e3
+        )
+
+    images = [image("a", [3, 4, 5, 6]), image("b", [0, 1, 2]), image("c", [2, 3])]
+    assert _turned_alike(images, ()) == images
+    with fails_with("E-LAYOUT-UNLINKED … b shares no tag"):
+        _turned_alike(images[:2], ())

@@ -10,12 +10,13 @@ from stcal.robot.identification.adjustment import State, Weighting, jacobian, ob
 from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.identification.unexplained import left
+from stcal.robot.identification.unexplained import _Order, _size, left
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, measured
+from stcal.row_order import Change
 from tests.robot.identification.test_solve import simulated
 
 NOISE = Weighting(0.05, 2e-4)
@@ -248,3 +249,10 @@ def test_a_tracker_that_moved_halfway_is_told(shared_data):
     assert found.left[0].line == 32
     assert found.left[0].share > 0.99
     assert "column station" in found.left[0].sentence()
+
+
+def test_the_zero_of_a_joint_that_slides_has_no_angle():
+    change = Change("jump", 2, 2, 2, np.array([0.5]), np.array([0, 0, 1.0, 1.0]), 0.2, -9.0, np.ones(4, bool))
+    for slides, angle in ((True, 0.0), (False, 0.5)):
+        mm, rad = _size(_Order("the zero of joint 1", 1, np.ones((4, 3, 1)), "", slides), change)
+        assert (mm, rad) == (pytest.approx(0.5 * np.sqrt(3)), angle)

@@ -289,3 +289,20 @@ def test_rokae_on_the_half_that_was_not_identified_from(shared_data, tmp_path):
     nominal, own = (Figures.of(each.errors_mm).mean for each in result.robots)
     assert 1.4 < nominal < 2.2
     assert 0.05 < own < 0.15
+
+
+def test_stations_leave_base_and_tool_as_they_are_and_errors_in_its_axes():
+    """Half of the rows from another station, turned by a quarter: without a fit, all is as from one, but for what the
+    place of the second station takes up."""
+    true, turned = arm(), Rigid.exp([0.0, 0.0, np.pi / 2, 500.0, 0.0, 0.0])
+    data = seen(true, 5, sigma_mm=0.0)
+    off = np.zeros((40, 3))
+    off[:, 0] = np.tile([0.1, -0.1], 20)
+    points = data.points() + off @ BASE.rotation.T
+    second = np.arange(40) % 4 >= 2
+    there = np.where(second[:, None], turned @ points, points)
+    apart = replace(data, positions=there, stations=tuple(np.where(second, "B", "A").tolist()))
+    other_tool = placed(true, BASE, {"": TOOL @ Rigid.exp([0, 0, 0, 5.0, 0, 0])})
+    [found, other] = evaluate({"a": true, "b": other_tool}, apart, "none").robots
+    assert found.residuals == pytest.approx(off, abs=0.09)  # across, as of other axes: 0.1
+    assert np.array_equal(other.robot.tools[""].matrix(), other_tool.tools[""].matrix())

@@ -148,9 +148,8 @@ def test_zoom_in_two_images_of_a_group_accuses_no_image(few, lab):
 
 
 def test_a_camera_turned_by_a_quarter_has_its_parameters_turned():
-    camera = Camera(
-        1000, 1000, np.array([800.0, 790.0]), np.array([520.0, 480.0]), np.array([-0.1, 0.02, 1e-3, -2e-3, *[0.0] * 8])
-    )
+    distortion = np.array([-0.1, 0.02, 1e-3, -2e-3, 0, 0, 0, 0, 3e-3, 1e-3, -2e-3, 4e-3])
+    camera = Camera(1000, 1000, np.array([800.0, 790.0]), np.array([520.0, 480.0]), distortion)
     xy = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 2))
     turned = camera.with_parameters(_turned(camera, 1))
     pixel = camera.pixel_from_normalised(xy)

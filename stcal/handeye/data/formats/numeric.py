@@ -167,12 +167,12 @@ def _without_counts(lines: list[Line], where: str) -> list[Line]:
     Raises InputError: there are not as many poses as the first line says.
     """
     single = [i for i, line in enumerate(lines) if len(line.values) == 1 and not line.label]
-    matrix_lines = 4
     wide = [line for line in lines if len(line.values) > 1]
+    matrix_lines = 4 if len(wide) > 3 and list(wide[3].values) == [0, 0, 0, 1] else 3
     if not single or not wide:
         return lines
     if single[0] == 0 and (len(single) == 1 or single[1] == 1):
-        poses = len(wide) // matrix_lines if len(wide[0].values) == matrix_lines else len(wide)
+        poses = len(wide) // matrix_lines if len(wide[0].values) == 4 else len(wide)
         if lines[0].values[0] != poses:
             raise InputError(
                 "E-POSES-COUNT",

@@ -4,12 +4,15 @@ import io
 import json
 import pickle
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.handeye.data.formats.numeric import Line, _without_counts
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
 from stcal.handeye.data.robot_poses import read_robot_poses
@@ -419,3 +422,15 @@ def test_a_matrix_under_a_header_with_an_element_missing(tmp_path):
     (tmp_path / "robot.csv").write_text(",".join(header) + "\n" + ",".join(["1"] * 15))
     with pytest.raises(InputError, match="the header is 'm00,m01"):
         read_robot_poses(tmp_path / "robot.csv", "wxyz", Said())
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_a_count_before_matrices_of_three_or_four_lines(tmp_path, rows):
+    matrices = [Rigid.exp([0.1 * k, 0.2, -0.1 * k, 100 * k, 50, 20]).matrix()[:rows] for k in range(1, 5)]
+    text = "\n".join(" ".join(f"{v:.9g}" for v in line) for matrix in matrices for line in matrix)
+    numbers = [[float(v) for v in line.split()] for line in ["4", *text.split("\n")]]
+    lines = [Line(i, "", values, f"{values[0]:g}") for i, values in enumerate(numbers, 1)]
+    assert len(_without_counts(lines, "file")) == 4 * rows
+    lines[0] = replace(lines[0], values=[5.0], first="5")
+    with fails_with("E-POSES-COUNT … says 5 poses, 4 follow"):
+        _without_counts(lines, "file")
