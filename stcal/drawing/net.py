@@ -23,6 +23,8 @@ SKETCH, SKETCH_OF_CIRCLES = 1 / 8, 1 / 5
 APART = 15.0
 LETTERS, SMALL_LETTERS = 2.0, 1.2
 """Height of names, and of the numbers of circles in the sketch, mm."""
+IN_CORNER = 3.0
+"""Distance of the name of a printed face from the corner of its plate, mm: in the white about a tag."""
 PLACES = 17
 """Number of places, across and up, where a name in the sketch may have room between the numbers."""
 TOUCH = 1e-3
@@ -160,6 +162,10 @@ def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -
             elif isinstance(shape, Area):
                 grounds.append(replace(shape, lines=tuple(plate.place(line) for line in shape.lines)))
         corners = plate.corners()
+        if plate.face.printed:  # beside circles, a detector may take letters for circles
+            inwards = corners.mean(0) - corners[0]
+            x, y = (corners[0] + IN_CORNER * inwards / np.linalg.norm(inwards)).tolist()
+            shapes.append(Text(x, y - LETTERS / 2, plate.face.id, LETTERS, "middle"))
         for edge in range(len(corners)):
             edge_id, partner = (plate.face.id, edge), shared.get((plate.face.id, edge))
             ends = np.array([corners[edge], corners[(edge + 1) % len(corners)]])

@@ -78,7 +78,7 @@ def plan_poses(
     sight at random. Each candidate adds its information to that of the poses taken, with the σ of robot and camera that
     the result states or estimated; the wide rotations of Tsai & Lenz 1989 follow from this. The σ cover independent
     errors of the poses only. They contain neither errors of the camera file nor the scatter of
-    :func:`~.scatter.scatter`, which further poses do not lower alike.
+    :func:`~stcal.handeye.validate.scatter`, which further poses do not lower alike.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import root_scalar
 
-from stcal.boards.design import BoardView
+from stcal.boards.design import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
@@ -523,7 +523,7 @@ def _by_board_corners(corners: np.ndarray, origin: int, turn: np.ndarray) -> np.
     rows = slice(4 * origin, 4 * origin + 4)
     flat = corners.reshape(-1, 2)
     middle = flat[rows].mean(0)
-    nominal = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ turn  # corners of the square in the axes of the board
+    nominal = 2 * UNIT_SQUARE @ turn  # corners of the square in the axes of the board
     offset = flat[rows] - middle
     quarter_turn = nominal @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # quarter turn from x to y
     by_angle = quarter_turn / np.sum(nominal * offset)

@@ -79,10 +79,10 @@ def check_conventions(
             raise InputError(
                 "E-HANDEYE-CONVENTION", f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {convention}"
             )
-        wording = next(convention for convention in typical_of_variant if convention.startswith(INVERTED))
-        if gain[wording] > DOUBTFUL and as_read[1] > typical_of_variant[wording][1]:
-            turn, shift = typical_of_variant[wording]
-            than = f"by {np.degrees(turn):.2g}° and {shift:.2g} mm {wording}"
+        inverted = next(convention for convention in typical_of_variant if convention.startswith(INVERTED))
+        if gain[inverted] > DOUBTFUL and as_read[1] > typical_of_variant[inverted][1]:
+            turn, shift = typical_of_variant[inverted]
+            than = f"by {np.degrees(turn):.2g}° and {shift:.2g} mm {inverted}"
             notes = (Grave(f"the poses contradict each other by {size}, but {than}"),)
         spread = _differ(loop)
         turn, shift = np.divide(_typical(loop, guess, True), spread)

@@ -120,7 +120,7 @@ def _emptied(folder: Path) -> None:
 
 
 def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO) -> list[Path]:
-    """Write the chosen frames of a video into a folder, as ``<name>_<number>.png``; those of an earlier call go.
+    """Write the chosen frames of a video into a folder, as ``frame_<number>.png``; those of an earlier call go.
 
     A warning lists them. Frames that are blurred more than others are left out.
 

@@ -174,7 +174,7 @@ def likely_mistake(
 
     Parameters
     ----------
-    seen : corners of the layout's tags, px
+    detected : corners of the layout's tags, px
     layout : the layout as it is
     camera : the camera at the size of the image
     prior : covariance of the intrinsics

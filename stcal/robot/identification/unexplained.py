@@ -92,7 +92,7 @@ def left(
     ----------
     state : chain and tools, as fitted or given
     world_from_base : pose of the base, for up, the axes and the place
-    seen : r observations
+    measured : r observations
     weighting : σ of the observations, up to a common factor
     explained : (r, w, k) derivatives by the parameters that were fitted to these observations
     weights : (r,) weights of the observations; those below 0.5 are errors and left out

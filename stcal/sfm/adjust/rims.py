@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import fit_plane
 from stcal.geometry.robust import huber_weights, robust_sigma
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, ImageObservations
@@ -74,11 +73,8 @@ def radius_views(
     point = model.point_index[order]
     is_circle = np.array([label in design_mm for label in model.labels])[point]  # corners have no radius
     radius = np.array([design_mm.get(label, 1.0) for label in model.labels])[point]
-    normal = np.zeros((len(model.labels), 3))
-    for members in model.points_by_face().values():
-        normal[members] = fit_plane(model.xyz_model[members]).normal
     rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index[order]]
-    n = np.einsum("nij,nj->ni", rotation, normal[point])
+    n = np.einsum("nij,nj->ni", rotation, model.normals()[point])
     c = model.xyz_camera()[order]
     dual = radius[:, None, None] ** 2 * (np.eye(3) - n[:, :, None] * n[:, None, :]) - c[:, :, None] * c[:, None, :]
     middle = dual[:, :2, 2] / dual[:, 2:, 2]

@@ -29,7 +29,7 @@ class Scale:
     ``board_from_world`` : similarity over all dots by least squares, unless λ by rows was requested; its scale is λ
     (mm per unit); ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs); ``rows`` : these
     two rows; ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
-    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions;     ``source`` : what determines λ:
+    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions; ``source`` : what determines λ:
     ``board``, ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames),
     ``distances``, or the ``drawing`` if no size is known.
     """

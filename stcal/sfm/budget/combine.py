@@ -125,7 +125,7 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     adjusted = adjusted_run(run)
     contributions = contributions_of(adjusted.state)
     derivatives_of_run = derivatives(contributions.joint, adjusted.start, run.target_design, run.faces.frame)
-    rows = statement or statement_of(run.board_design.stated)
+    stated = statement or statement_of(run.board_design.stated)
     rim = _rims(run, contributions, derivatives_of_run)
     camera, refined = run.camera, run.options.refine_camera
     return budget(
@@ -135,7 +135,7 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
         run.board_design,
         run.options.flatness_mm,
         refined,
-        rows,
+        stated,
         run.faces.reference_face,
         rim,
         run.report["summary"].get("camera_given", True),

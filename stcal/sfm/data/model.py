@@ -3,13 +3,16 @@
 import csv
 import io
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 import numpy as np
 
+from stcal.errors import DegenerateError
 from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import CircleLabel, Label, parse_labels
 
@@ -253,6 +256,15 @@ class GroupModel:
         for i, label in enumerate(self.labels):
             members.setdefault(label.plane, []).append(i)
         return {key: np.array(indices) for key, indices in members.items()}
+
+    def normals(self) -> np.ndarray:
+        """Returns the normal of each point's face or board, (p, 3); zero where too few points of it are in the model,
+        as may be of a face with corners."""
+        normal = np.zeros((len(self.labels), 3))
+        for members in self.points_by_face().values():
+            with suppress(DegenerateError):
+                normal[members] = fit_plane(self.xyz_model[members]).normal
+        return normal
 
     def without(self: "M", drop: np.ndarray) -> "M":
         """Returns the model without the observations of mask ``drop``.

@@ -12,7 +12,6 @@ from scipy.special import ellipe, ellipk
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign
 from stcal.geometry.arrays import frozen, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import fit_plane
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -135,11 +134,8 @@ class _Rims:
     @classmethod
     def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
         """Returns the rims as ellipses, to first order in radius over distance. The error is negligible for a σ."""
-        normal = np.zeros((len(model.labels), 3))
-        for members in model.points_by_face().values():
-            normal[members] = fit_plane(model.xyz_model[members]).normal
         radius = np.array([radius_mm[label] for label in model.labels])
-        in_plane = np.linalg.svd(normal[:, None])[2][:, 1:] * radius[:, None, None]
+        in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
         by_point = projection_jacobians(model, camera)[1]
         shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
         square, axes = np.linalg.eigh(shape @ np.swapaxes(shape, 1, 2))

@@ -10,7 +10,6 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
@@ -203,11 +202,8 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
     """
     focal_px, widest = float(np.sqrt(camera.focal.prod())), []
     for model in models:
-        normal = np.zeros((len(model.labels), 3))
-        for members in model.points_by_face().values():
-            normal[members] = fit_plane(model.xyz_model[members]).normal
         rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
-        n, c = np.einsum("nij,nj->ni", rotation, normal[model.point_index]), model.xyz_camera()
+        n, c = np.einsum("nij,nj->ni", rotation, model.normals()[model.point_index]), model.xyz_camera()
         gradient = np.linalg.norm(n[:, :2], axis=1) / np.abs((n * c).sum(1)) / focal_px
         u = 1 / c[:, 2]
         away = np.abs(u - (np.bincount(model.image_index, u) / np.bincount(model.image_index))[model.image_index])

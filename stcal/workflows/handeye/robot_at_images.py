@@ -52,7 +52,7 @@ class AtImages:
 
 
 def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> AtImages:
-    """Returns poses of the robot at the times of images, where both have times that are not the same.
+    """Returns poses of the robot at the times of images, where both have times, and these are not simply equal.
 
     Poses stay as they are where ``timing`` is None, since joint values belong to images by name.
 
