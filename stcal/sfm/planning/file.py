@@ -261,8 +261,9 @@ def plan_text(plan: Plan, noise: str) -> str:
         if worst_mm < (1 - LEAST_SHARE) * sigma:
             lines.append(f"{change:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
     if useless := [change for worst_mm, change in reachable if worst_mm >= (1 - LEAST_SHARE) * sigma]:
-        lines.append(f"no help: {', '.join(useless)}")
-    lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
+        lines.append(f"does not help: {', '.join(useless)}")
+    impossible = ((r.what, r.reason.partition("; ")[0]) for r in plan.remedies if r.sigma_mm is None)
+    lines += [f"{change:<28}      –   not possible, {why}" for change, why in impossible]
     lens = f"f/{USUAL_FOCAL_MM / plan.aperture_mm:.1f} of a {USUAL_FOCAL_MM:g} mm lens"
     lens = "focal length / f-number" if options.camera else lens
     lines.append(
