@@ -44,7 +44,7 @@ def find_on_faces(
         try:
             if isinstance(board, TagLayout):
                 view, oblique = _not_oblique(view_of_tags(name, tags, board))
-                view = _straightened(view, camera)
+                view = straightened(view, camera)
             elif isinstance(board, CharucoDesign):
                 if any((board.dictionary, tag) in read for tag in board.tag_ids()):
                     view = find_charuco(image, name, board)
@@ -56,7 +56,7 @@ def find_on_faces(
             elif isinstance(board, AprilGridDesign):
                 view, why = find_aprilgrid(image, name, board, camera)
                 view, oblique = _not_oblique(view)
-                view = _straightened(view, camera)
+                view = straightened(view, camera)
         except StcalError as error:  # corners on a line, say
             why = f"left out, {error}"
         where = BOARD if face == BOARD else f"face {face}"
@@ -91,7 +91,7 @@ def _not_oblique(view: BoardView | None) -> tuple[BoardView | None, str]:
     return replace(view, **place, covariance_px2=covariance), why
 
 
-def _straightened(view: BoardView | None, camera: Camera) -> BoardView | None:
+def straightened(view: BoardView | None, camera: Camera) -> BoardView | None:
     """Returns the view of tags with the corners at which their curved edges meet."""
     if view is None:
         return None

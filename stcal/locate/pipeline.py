@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.boards.design import TagLayout
+from stcal.boards.faces import shift_by_curves
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
@@ -183,6 +184,9 @@ def locate_scene(
     if troubles:
         return Located(scene, merged, None, _rejected(troubles), tuple(notes))
     size = used[0].size
+    corners = merged.seen.corners_px
+    straight = corners - shift_by_curves(corners, camera.sized(*size))
+    merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
     try:
         if options.method == "patent":

@@ -22,6 +22,7 @@ from stcal.boards.design import (
     TagLayout,
     turns,
 )
+from stcal.boards.faces import shift_by_curves, straightened
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
@@ -163,9 +164,10 @@ def _find_flat(
         view = find_charuco(image, name, board)
         return view, "" if view else _without_charuco(image, board)
     if isinstance(board, AprilGridDesign):
-        return find_aprilgrid(image, name, board, camera)
+        view, why = find_aprilgrid(image, name, board, camera)
+        return straightened(view, camera), why
     tags = find_tags(image, tuple(dict.fromkeys(dictionary for dictionary, _ in board.tags)))
-    return view_of_tags(name, tags, board), "no tag of the layout"
+    return straightened(view_of_tags(name, tags, board), camera), "no tag of the layout"
 
 
 def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
@@ -427,5 +429,8 @@ def calibration_images(
     names, views, tags = zip(*((image.name, image.view, image.tags) for image in detections.images), strict=True)
     left_out = tuple(
         f"{image.name}: {image.reason}" for image in (*skipped, *detections.skipped) if image.name not in names
+    )
+    tags = tuple(
+        replace(each, corners_px=each.corners_px - shift_by_curves(each.corners_px, detections.camera)) for each in tags
     )
     return CalibrationImages(names, views, tags, detections.camera, detections.symmetries, left_out)

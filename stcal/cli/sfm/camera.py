@@ -76,7 +76,7 @@ def calibrate_camera(
     board_design = board_of(None) if board is None else load_flat_board(board)
     dots = isinstance(board_design, BoardDesign)
     common = (json_file, report, workers)
-    with designs_told(target, board, with_target=dots):
+    with designs_told(target, board, with_target=dots and board is None):
         if rig:
             failed = _rig(images, out or Path("rig"), target_design, board_design, common_model, models, *common)
         elif models:

@@ -152,7 +152,10 @@ class HandEyeFile(ResultFile):
     method: str = Field(description="that found the result")
     flange_from_camera: Pose | None = Field(None, description="`X` of eye-in-hand")
     base_from_camera: Pose | None = Field(None, description="`X` of eye-to-hand")
-    covariance: Matrix6 | None = Field(description="of `X`, null for methods that give none")
+    covariance: Matrix6 | None = Field(
+        description="of `X`: rotation about the camera, rad, and its translation, mm, in the axes of flange or base; "
+        "null for methods that give none"
+    )
     base_from_board: Pose | None = Field(None, description="`Z` of eye-in-hand")
     base_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
     flange_from_board: Pose | None = Field(None, description="`Z` of eye-to-hand")

@@ -123,6 +123,9 @@ AS_ONE, AS_THREE = 1.0, 3.0
 WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 """Residuals (RMS), as an angle and as a share of the board's distance, beyond which poses do not belong together. Arms
 that were never calibrated and poses of single tags stay below half of these."""
+OTHER_SIZE, SIZE_SIGMAS = 0.02, 5.0
+"""Deviation of a board from its stated size, and in σ, beyond which it is another board or camera: prints and pitches
+are off by less than a hundredth."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
 
@@ -135,6 +138,7 @@ def judged(outcome: Outcome) -> Verdict:
         _of_share(outcome),
         _of_common_errors(outcome),
         _of_motions(outcome),
+        _of_size(outcome),
         _of_outliers(outcome),
     ]
     return Verdict(tuple(each for each in (*tests, *of_notes(outcome.all_notes())) if each is not None))
@@ -277,6 +281,16 @@ def _of_motions(outcome: Outcome) -> Finding | None:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
     remedy = observability.missing() if word != GOOD else ""
     return Finding("Motions of the flange", word, said, f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}", remedy)
+
+
+def _of_size(outcome: Outcome) -> Finding | None:
+    """Judges a board's size that was solved for: where it is far from the stated one, something else may be wrong."""
+    scale, sigma = outcome.result.scale, outcome.result.sigma_scale
+    if sigma is None or abs(scale - 1) <= max(SIZE_SIGMAS * sigma, OTHER_SIZE):
+        return None
+    said = f"the board is {scale:.3g} times as large as stated, or the focal length wrong by as much"
+    remedy = "measure the board, and correct its file or the poses' unit; where it is as stated, check the camera file"
+    return Finding("Size of the board", CARE, said, f"{scale:.3g}", f"1 ± {OTHER_SIZE:g}", remedy)
 
 
 def _of_outliers(outcome: Outcome) -> Finding:

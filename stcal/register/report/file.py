@@ -144,8 +144,8 @@ class RegistrationFile(ResultFile):
     method: str = Field(description="as asked for")
     b_from_a: Matrix4 = Field(description="row-major: `xyz_b = b_from_a @ xyz_a`")
     covariance: Matrix = Field(
-        description="of a left perturbation in frame b (rotation vector, translation, then the relative scale of a "
-        "similarity), or of the rows of the 3×4 matrix of an affine transform"
+        description="of a left perturbation in the axes of b (rotation about the origin of a, translation of that "
+        "origin, then the relative scale of a similarity), or of the rows of the 3×4 matrix of an affine transform"
     )
     covariance_of: list[str] = Field(description="names of its rows: `rx … z`, `scale`, `m11 … m34`")
     units: Units = Field(description="of `b_from_a`, of `residuals`, and of each row of `covariance`")

@@ -14,7 +14,7 @@ from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
 from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
-from stcal.robot.kinematics.dh import FITS, require_convention
+from stcal.robot.kinematics.dh import FITS, require_convention, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
@@ -44,6 +44,8 @@ GUESS_ROWS = 60
 """Largest number of rows by which mistakes in the rows are tried: far more than the nine numbers of base and tool."""
 MOST_JOINTS = 8
 """Largest number of joints of which two or three at a time are tried; their number grows with the third power."""
+LEAST_ORIENTATIONS = 5
+"""Number of rows from which on orientations that do not fit are refused: of fewer, chance explains many."""
 AROUND = 0.1
 """Distance from the given tool point at which distances are fitted from other starts too, as a share of the arm's
 reach."""
@@ -83,6 +85,8 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     if data.rotations is not None:
         flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
         require_convention(data.where, data.targets, flange, data.rotations)
+        if len(data) >= LEAST_ORIENTATIONS:
+            require_orientations(data.where, data.targets, flange, data.rotations)
     return replace(state, stations={data.stations[0]: Rigid()})
 
 

@@ -1,6 +1,6 @@
 """Denavit-Hartenberg rows from a chain of axes, and checks of poses against joint values."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.quaternions import explaining
+from stcal.io.quaternions import EXPLAINS, explaining
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.model import (
     Chain,
@@ -231,6 +231,10 @@ TURNED_RAD = 0.2
 and the base as positions have it, are off by less than half of that (:data:`FITS`)."""
 
 
+MOST_TOOLS = 200
+"""Number of rows of a target whose tools are tried for the one that most rows agree with."""
+
+
 def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
     """Refuse orientations that fit the robot only in another quaternion convention.
 
@@ -265,3 +269,60 @@ def turned_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> 
         tool = Rotation.from_matrix(own).mean()
         square += float(((tool.inv() * Rotation.from_matrix(own)).magnitude() ** 2).sum())
     return float(np.sqrt(square / len(seen)))
+
+
+def require_orientations(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
+    """Refuse orientations of which most are not those of the robot, whatever its tools; arguments as above.
+
+    Few rows may be wrong: the typical angle from the best tool is tested, not the RMS. One orientation in all rows, as
+    of instruments that see none, is no misreading: the adjustment finds that it tells nothing.
+
+    Raises InputError: the message names the misreading that explains it, if one does.
+    """
+    own = _typical_rad(targets, flange, seen)
+    if own < TURNED_RAD or np.ptp(seen, axis=0).max() < NOTHING_RAD:
+        return
+    missed = f"{where}: orientations typically miss the robot by {np.degrees(own):.3g}°, {np.degrees(TURNED_RAD):.2g}°"
+    left = {
+        reason: _typical_rad([targets[i] for i in rows.tolist()], flange[rows], read)
+        for reason, rows, read in _misread(seen)
+    }
+    best = min(left, key=left.__getitem__)
+    if left[best] < EXPLAINS * own:
+        raise InputError(
+            "E-ROBOT-ORIENTATIONS", f"{missed} allowed; by {np.degrees(left[best]):.2g}° if {best}: correct them"
+        )
+    raise InputError(
+        "E-ROBOT-ORIENTATIONS",
+        f"{missed} allowed, though positions fit; check the convention of the angles and that each orientation is in "
+        "the line of its joint values, or leave the orientations out",
+    )
+
+
+def _typical_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
+    """Returns the median angle from the tool of each target for which the median of its rows is least, rad."""
+    between, angles = np.swapaxes(flange, 1, 2) @ seen, []
+    for name in dict.fromkeys(targets):
+        own = Rotation.from_matrix(between[[target == name for target in targets]])
+        tools = own[:: 1 + len(own) // MOST_TOOLS]
+        off = [(tool.inv() * own).magnitude() for tool in tools]
+        angles.append(min(off, key=np.median))
+    return float(np.median(np.concatenate(angles)))
+
+
+def _misread(seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yields frequent misreadings of orientations in words, the rows (k,) that remain, and rotations (k, 3, 3)."""
+    rows, fixed = np.arange(len(seen)), Rotation.from_matrix(seen).as_euler("xyz")
+    moving = Rotation.from_matrix(seen).as_euler("XYZ")
+    yield (
+        "the first and the third angle were exchanged (A, B, C about Z, Y, X; W, P, R about X, Y, Z)",
+        rows,
+        Rotation.from_euler("xyz", fixed[:, ::-1]).as_matrix(),
+    )
+    for k, axis in enumerate("XYZ"):
+        signs = np.where(np.arange(3) == k, -1.0, 1.0)
+        yield f"the angle about {axis} had the other sign", rows, Rotation.from_euler("xyz", signs * fixed).as_matrix()
+    yield "the angles were about moving axes, X first", rows, Rotation.from_euler("XYZ", fixed).as_matrix()
+    yield "the angles were about fixed axes, X first", rows, Rotation.from_euler("xyz", moving).as_matrix()
+    yield "each orientation were in the line before", rows[:-1], seen[1:]
+    yield "each orientation were in the line after", rows[1:], seen[:-1]

@@ -327,7 +327,7 @@ def _usable(data: Measurements, table: Table) -> Measurements:
     ]
     keep = ~(undecided | copies)
     if not keep.any():
-        raise InputError("E-MEASURED-AMBIGUOUS", f"{data.where}: {notes[0]}")
+        raise InputError("E-MEASURED-REACH", f"{data.where}: {notes[0]}")
     return replace(data[keep], notes=(*notes, *data.notes)) if notes else data
 
 

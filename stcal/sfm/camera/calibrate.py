@@ -132,15 +132,23 @@ def calibrate_camera(
     files, not_images = find_images(images)
     camera = start_camera(*require_common_size(files)[0], colmap_model)
     before: Intrinsics | None = None
-    settled = False
+    settled = of_perspective = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
             detection = _detect(
                 files, camera, colmap_model, target, board, ellipses, Path(cache), workers, progress, rounds
             )
-            views, skipped, result = _of_one_round(
-                files, not_images, detection, board, camera, colmap_model, before is None
-            )
+            try:
+                views, skipped, result = _of_one_round(
+                    files, not_images, detection, board, camera, colmap_model, before is None
+                )
+            except (DetectionError, DegenerateError):
+                if before is not None or of_perspective or not camera.fisheye:
+                    raise
+                # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds it.
+                rough = calibrate_camera(images, target, board, PERSPECTIVE, ellipses, workers, progress)
+                camera, of_perspective = replace(camera, focal=rough.intrinsics.camera.focal), True
+                continue
             result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
             camera = result.camera
             settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS

@@ -198,7 +198,8 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     Raises
     ------
     InputError
-        Not a finished run, a damaged or changed model, an unknown format, or ``out`` exists.
+        Not a finished run, a damaged or changed model, an unknown format, a name that it cannot hold, or ``out``
+        exists.
     """
     out, kind = Path(out), form
     if kind not in get_args(ModelFormat):
@@ -210,6 +211,13 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     saved = replace(saved, camera=saved.adjusted_camera(report.camera))
     reconstruction, points = _labelled_points(saved)
     require_fit(saved.folder / TARGET_MODEL, _views(saved, reconstruction, points), saved.camera, report)
+    spaced = [image.name for image in saved.observations if " " in image.name]
+    if spaced and kind in ("colmap-txt", "bundler"):
+        raise InputError(
+            "E-MODEL-NAMES",
+            f"format {kind}: image {spaced[0]} has a space in its name, at which readers end it; use colmap-bin, "
+            "or rename the image and run again",
+        )
     ideal = kind in ("nvm", "bundler")
     camera = saved.camera
     focal_px = float(camera.focal.mean())

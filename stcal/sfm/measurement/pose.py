@@ -140,6 +140,9 @@ def _principal(covariance: np.ndarray) -> np.ndarray:
     return (vector * np.sqrt(np.maximum(value, 0))).T * sigma
 
 
+MISFIT = 0.03
+"""Largest RMS residual, as a share of the extent of the circles in the image. Wrong intrinsics or a lens without its
+distortion stay below a hundredth."""
 NEAR_PREVIOUS = 1 / 3
 """Largest ratio of two rotations from the previous image's pose, of the nearer pose over the other, that decides."""
 NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
@@ -270,6 +273,7 @@ def pose_from_circles(
         raise DegenerateError(
             "E-MEASURE-FEW-CIRCLES", f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face"
         )
+    _require_fit(problem, minima, where)
     pose = _answer(problem, minima, names, outliers, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
         if pose.chi2_per_redundancy() > OUTLIER**2:  # the rotation is open because the residuals are large
@@ -319,6 +323,19 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     return used, PoseProblem(
         *circles, noise_of_centres, by_camera, prior_covariance, target.covariance[np.ix_(rows, rows)]
     )
+
+
+def _require_fit(problem: PoseProblem, found: Minima, where: str) -> None:
+    """Refuses a pose that no covariance describes, since most circles are elsewhere."""
+    residual = problem.in_px(problem.seen(found.poses[[0]])[0][0])
+    rms_px = float(np.sqrt((residual**2).mean()))
+    limit_px = MISFIT * float(np.ptp(problem.in_px(problem.centre), axis=0).max())
+    if not rms_px <= limit_px:
+        raise DegenerateError(
+            "E-MEASURE-MISFIT",
+            f"{where}: circles lie {rms_px:.3g} px RMS from where the best pose has them, {limit_px:.2g} allowed, "
+            f"{MISFIT:.0%} of their extent; wrong labels, a mirrored image, another target, or another camera's file",
+        )
 
 
 def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:

@@ -80,12 +80,13 @@ def test_the_text_has_the_transform_with_its_sigma(of_views):
     result = of_views.result
     lines = outcome_report(of_views).text().splitlines()
     row = next(i for i, line in enumerate(lines) if line.startswith("base_from_camera"))
+    of_log = result.base_from_camera.log_sigma(result.covariance)
     for k, axis in enumerate("xyz"):
         name, shift, sigma, _, turn_sigma = lines[row + 1 + k].split()
         assert name == axis
         assert float(shift) == pytest.approx(result.base_from_camera.translation[k], abs=1e-4)
         assert float(sigma) == pytest.approx(math.sqrt(result.covariance[3 + k, 3 + k]), abs=1e-4)
-        assert float(turn_sigma) == pytest.approx(math.degrees(math.sqrt(result.covariance[k, k])), abs=1e-4)
+        assert float(turn_sigma) == pytest.approx(math.degrees(of_log[k]), abs=1e-4)
     text = "\n".join(lines)
     assert f"pitch {25 * result.scale:.4f} ± {25 * result.sigma_scale:.4f} mm, stated 25 mm" in text
     assert "held out (2 × 2 of 10 poses): rotation" in text

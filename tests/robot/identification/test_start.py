@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
@@ -177,3 +178,22 @@ def test_the_order_of_quaternions_is_an_option(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as end:
             main()
         assert (end.value.code or 0) == code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("way", ["exchanged", "sign", "line", "random"])
+def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(way):
+    """Misreadings that no quaternion convention explains are named; what none explains is refused, too."""
+    rng = np.random.default_rng(4)
+    robot = mh80()
+    data = measured(robot, joint_vectors(robot, 30, rng), rng)
+    angles = Rotation.from_matrix(data.rotations).as_euler("xyz")
+    rotations, said = {
+        "exchanged": (Rotation.from_euler("xyz", angles[:, ::-1]), "the first and the third angle were exchanged"),
+        "sign": (Rotation.from_euler("xyz", angles * [1, -1, 1]), "the angle about Y had the other sign"),
+        "line": (Rotation.from_matrix(np.roll(data.rotations, 1, axis=0)), "each orientation were in the line before"),
+        "random": (Rotation.random(30, rng), "check the convention of the angles"),
+    }[way]
+    with fails_with(f"E-ROBOT-ORIENTATIONS … {said}"):
+        start(robot, replace(data, rotations=rotations.as_matrix()))
+    third = np.where((np.arange(30) % 3 == 0)[:, None, None], rotations.as_matrix(), data.rotations)
+    start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
