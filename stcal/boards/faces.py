@@ -9,7 +9,7 @@ from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
-from stcal.boards.tags import find_aprilgrid, find_tags, other_dictionaries, view_of_tags
+from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, other_dictionaries, view_of_tags
 from stcal.boards.target import tags_on
 from stcal.design import FaceDesign
 from stcal.errors import StcalError
@@ -35,7 +35,7 @@ def find_on_faces(
     """
     of_layouts = [d for board in boards.values() if isinstance(board, TagLayout) for d, _ in board.tags]
     of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
-    tags = find_tags(image, tuple(dict.fromkeys([*of_layouts, *of_charuco])))
+    tags = find_tags(image, tuple(dict.fromkeys([*of_layouts, *of_charuco])), windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
     views: dict[str, BoardView] = {}
     notes: list[str] = []

@@ -30,8 +30,8 @@ SATURATION_POINTS = 8
 WHITE_PX = 3
 """Side of the window of the dilation, px. Without dilation, a blurred corner at which two black squares meet joins them
 to one outline."""
-WINDOWS_PX = (5, 21)
-"""Sides of the windows of the threshold, px, each of which is searched with by itself."""
+TOGETHER_PX, APART_PX = (5, 25), ((5,), (21,))
+"""Sides of the windows of the threshold, px, of one search, and of two."""
 GROWN_LOOKS = ((2, 4e7), (3, 1e7), (1, 5e8))
 """Scales of the dilated images, each with the largest number of pixels up to which it is used. Dilation by a pixel at
 the original scale grows the white too far into tags of 50 px and less."""
@@ -72,10 +72,17 @@ class Tags:
         return np.hypot(EDGE_PX, SATURATED_EDGE_PX * np.asarray(self.saturated))
 
 
-def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int = 1, joined: bool = False) -> Tags:
+def find_tags(
+    image: np.ndarray,
+    dictionaries: Sequence[str],
+    border_bits: int = 1,
+    joined: bool = False,
+    windows_px: Sequence[tuple[int, ...]] = (TOGETHER_PX,),
+) -> Tags:
     """Return the tags of the dictionaries in a grey image (height, width), with corners from their edges.
 
-    ``border_bits`` : width of the black border in cells; ``joined`` : True if black squares touch the tags' corners.
+    ``border_bits`` : width of the black border in cells; ``joined`` : True if black squares touch the tags' corners;
+    ``windows_px`` : sides of the threshold windows of each search.
     """
     grey = grey_8bit(image)
     places_of: dict[tuple[str, int], list[np.ndarray]] = {}
@@ -85,8 +92,8 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
                 places_of.setdefault((name, tag), []).append(place.astype(np.float32))
             continue
         detectors = [
-            cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits, (window,)))
-            for window in WINDOWS_PX
+            cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits, windows))
+            for windows in windows_px
         ]
         for look, detector in product(_looks(grey, joined), detectors):
             corners, ids, _ = detector.detectMarkers(look.grey)
@@ -178,7 +185,7 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
     return replace(view, unused=tuple(f"tag {tag[1]} is in view more than once" for tag in tags.repeated if tag in row))
 
 
-def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ...] = (5, 25)):
+def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ...] = TOGETHER_PX):
     """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows.
 
     The default settings lose small tags: only the middle of a cell keeps its colour, blur mixes the rest with the

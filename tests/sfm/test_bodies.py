@@ -430,21 +430,20 @@ def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
     scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=8, distance_mm=300, seed=5))
     write_body(tmp_path / "set", scene)
     solved, refusals = 0, []
-    for count in (2, 4, 6):
+    for count, camera in ((2, None), (4, None), (6, None), (6, tmp_path / "set/cameras.txt")):
         taken = tmp_path / f"{count}"
-        taken.mkdir()
+        taken.mkdir(exist_ok=True)
         for path in sorted((tmp_path / "set/images").iterdir())[:count]:
             shutil.copy(path, taken)
-        for camera in (None, tmp_path / "set/cameras.txt"):
-            try:
-                result = pipeline.run(taken, camera, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
-            except StcalError as error:
-                refusals.append(str(error))
-            else:
-                solved += 1
-                tested = any(c.key in TESTED_BY and c.verdict == "passed" for c in result.checks)
-                assert tested or result.judgement.verdict != "yes"
-    assert 0 < solved < 6
+        try:
+            result = pipeline.run(taken, camera, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
+        except StcalError as error:
+            refusals.append(str(error))
+        else:
+            solved += 1
+            tested = any(c.key in TESTED_BY and c.verdict == "passed" for c in result.checks)
+            assert tested or result.judgement.verdict != "yes"
+    assert 0 < solved < 4
     assert all("; add " in line or "take " in line for line in refusals), refusals
 
 

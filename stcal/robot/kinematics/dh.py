@@ -284,7 +284,7 @@ def require_orientations(where: str, targets: Sequence[str], flange: np.ndarray,
         return
     missed = f"{where}: orientations typically miss the robot by {np.degrees(own):.3g}°, {np.degrees(TURNED_RAD):.2g}°"
     left = {
-        reason: _typical_rad([targets[i] for i in rows.tolist()], flange[rows], read)
+        reason: _typical_rad(np.array(targets, object)[rows].tolist(), flange[rows], read)
         for reason, rows, read in _misread(seen)
     }
     best = min(left, key=left.__getitem__)

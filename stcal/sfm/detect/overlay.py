@@ -26,6 +26,10 @@ MIN_LABEL_GAP = 70.0
 """Smallest distance between numbered dots, px at text size 1."""
 
 
+NAME_ROOM = 60.0
+"""Distance of a face's name from the nearest centre, in units of its letters, from which on it has room there."""
+
+
 def kept_overlay(
     cache: Path,
     digest: str,
@@ -63,7 +67,8 @@ def draw_overlay(
     notes: int,
     left_out: Collection[Label] = (),
 ) -> bytes:
-    """Returns a JPEG with every measured ellipse and its label, and the name of each face within its pattern.
+    """Returns a JPEG with every measured ellipse and its label, and the name of each face within its pattern, or above
+    it where there is no room.
 
     Parameters
     ----------
@@ -142,7 +147,10 @@ def _name_faces(picture, observations: ImageObservations, scale: float, colours:
         circles = observations.centre_px[members]
         between = (circles[:, None] + circles).reshape(-1, 2) / 2
         room = np.linalg.norm(between[:, None] - observations.centre_px, axis=2).min(1)
-        at = (between[np.argmax(room)] * scale).astype(int)
+        place = between[np.argmax(room)]
+        if room.max() * scale < NAME_ROOM * size:
+            place = np.array([circles[:, 0].mean(), circles[:, 1].min() - 57 * size / scale])
+        at = (place * scale).astype(int)
         _text(picture, f"face {face}", (at[0] - int(45 * size), at[1] + int(12 * size)), 1.5 * size, colours[face])
 
 
