@@ -26,7 +26,7 @@ MIN_LABEL_GAP = 70.0
 """Smallest distance between numbered dots, px at text size 1."""
 
 
-NAME_ROOM = 60.0
+NAME_ROOM = 100.0
 """Distance of a face's name from the nearest centre, in units of its letters, from which on it has room there."""
 
 
