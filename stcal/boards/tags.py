@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import cv2
 import numpy as np
@@ -95,13 +94,14 @@ def find_tags(
             cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits, windows))
             for windows in windows_px
         ]
-        for look, detector in product(_looks(grey, joined), detectors):
-            corners, ids, _ = detector.detectMarkers(look.grey)
-            places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
-            earlier = {tag: list(known_places) for tag, known_places in places_of.items()}
-            for place, tag in zip(places, [] if ids is None else ids.ravel(), strict=True):
-                if not any(_inside(place, earlier_place) for earlier_place in earlier.get((name, int(tag)), [])):
-                    places_of.setdefault((name, int(tag)), []).append(place)
+        for look in _looks(grey, joined):
+            for detector in detectors:
+                corners, ids, _ = detector.detectMarkers(look.grey)
+                places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
+                earlier = {tag: list(known_places) for tag, known_places in places_of.items()}
+                for place, tag in zip(places, [] if ids is None else ids.ravel(), strict=True):
+                    if not any(_inside(place, earlier_place) for earlier_place in earlier.get((name, int(tag)), [])):
+                        places_of.setdefault((name, int(tag)), []).append(place)
     places_of = _outermost(places_of)
     once = {tag: places[0] for tag, places in sorted(places_of.items()) if len(places) == 1}
     cells = np.array([cells_of(name, border_bits) for name, _ in once])

@@ -184,11 +184,11 @@ def locate_scene(
     if troubles:
         return Located(scene, merged, None, _rejected(troubles), tuple(notes))
     size = used[0].size
-    corners = merged.seen.corners_px
-    straight = corners - shift_by_curves(corners, camera.sized(*size))
-    merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
     try:
+        corners = merged.seen.corners_px
+        straight = corners - shift_by_curves(corners, camera.sized(*size))
+        merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
         if options.method == "patent":
             patent_pose = locate_as_patent(
                 [e.tags for e in used], layout, camera.sized(*size), options.patent, scene.name
