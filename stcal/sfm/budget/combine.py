@@ -93,13 +93,15 @@ class View:
 class Budget:
     """The uncertainty budget of a run.
 
-    ``conditions`` : for which lengths hold. Their correction is not applied to the run's result.
+    ``circles_covariance_mm2`` : (c, 3, 3) by circle of ``joint``, target frame; ``conditions`` : for which lengths hold.
+    Their correction is not applied to the run's result.
     """
 
     joint: JointResult
     reference_face: str
     sources: tuple[Source, ...]
     rows: tuple[Row, ...]
+    circles_covariance_mm2: np.ndarray
     views: tuple[View, ...]
     statement: Statement
     conditions: Conditions
@@ -177,7 +179,9 @@ def budget(
         for measurand in measurands(found.joint, own, reference_face)
     ]
     views = tuple(_view(model) for model in found.joint.models)
-    return Budget(found.joint, reference_face, sources, tuple(rows), views, statement, conditions_of(statement, board))
+    circles = own.circle_covariance(np.sum([source.covariance_mm2 for source in sources], axis=0))
+    conditions = conditions_of(statement, board)
+    return Budget(found.joint, reference_face, sources, tuple(rows), circles, views, statement, conditions)
 
 
 def _placed(own: Derivatives) -> Source:

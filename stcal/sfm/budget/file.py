@@ -79,6 +79,11 @@ class DistanceUncertainty(Part):
     distance_um: Uncertainty
 
 
+class CircleUncertainty(Part):
+    position_mm: list[float]
+    position_xyz_um: list[float]
+
+
 class StatedRow(Part):
     body: Literal["board", "target"]
     key: str
@@ -140,7 +145,8 @@ class BudgetFile(ResultFile):
         "`faces.json`; `changed`: files that are not as the run left them"
     )
     fields: dict[ByName, str] = Field(
-        description="`instrument`, `operator`, `date`, `traceability` and others, as given; empty where not"
+        description="`laboratory`, `instrument`, `operator`, `date` (of the calibration), `traceability` and others, as "
+        "given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
@@ -193,6 +199,12 @@ class BudgetFile(ResultFile):
         description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm` with "
         "`correction_ppm`, and `distance_um` with `contributions`, `sensitivities`, `standard`, `expanded`, "
         "`coverage`, `degrees_of_freedom` as of faces"
+    )
+    circles: dict[ByName, CircleUncertainty] = Field(
+        default={},
+        description="by label, circles or corners of the target in its frame: `position_mm` with `correction_ppm`, and "
+        "combined standard uncertainties of x, y, z, `position_xyz_um`; empty where the size is not known or the run "
+        "must not be used",
     )
     length_tests: list[LengthTestPart] = Field(
         description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
@@ -251,6 +263,7 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
         "correction_ppm": PPM * conditions.correction if conditions.size_known else None,
         "faces": {} if refused else _faces(budget, run.faces.poses()),
         "distances": [] if without_lengths else [_distance(row, budget) for row in budget.of_kind("distance")],
+        "circles": {} if without_lengths else _circles(budget, run.faces.circles),
         "notes": notes_of(budget, verified, run),
     }
 
@@ -318,6 +331,19 @@ def _faces(budget: Budget, target_from_face: Mapping[str, Rigid]) -> dict[str, d
             "rotation_xyz_mdeg": (MILLIDEGREES * np.sqrt(np.diag(rotation.covariance))).tolist(),
         }
     return faces
+
+
+def _circles(budget: Budget, xyz_mm: Mapping[str, np.ndarray]) -> dict[str, dict]:
+    """Returns places of circles with their uncertainties. ``xyz_mm`` : by label, target frame, of the run."""
+    enlarged = 1 + budget.conditions.correction
+    sigma = MICRO * np.sqrt(np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2))
+    return {
+        str(label): {
+            "position_mm": (np.asarray(xyz_mm[str(label)]) * enlarged).tolist(),
+            "position_xyz_um": each.tolist(),
+        }
+        for label, each in zip(budget.joint.labels, sigma, strict=True)
+    }
 
 
 def _distance(row: Row, budget: Budget) -> dict:

@@ -49,7 +49,9 @@ def name_of(circles: Sequence[str]) -> str:
 
 
 RELATES = "The results relate only to the item named above, in the state in which it was photographed."
-SIGNED = ("date", "name", "signature")
+HEADS = {"date": "date of calibration"}
+"""Names of fields where the key does not say what they are."""
+SIGNED = ("date of issue", "name", "signature")
 """Lines that are left empty for whoever signs a certificate."""
 LEAST_SHARE = 1e-3
 """Least share of a variance that is drawn."""
@@ -84,6 +86,7 @@ def budget_report(file: BudgetFile) -> Document:
         if e.position_mm is not None and e.position_xyz_um is not None
     ]
     rotations = [[face, *_with_u(e.rotation_vector_deg, e.rotation_xyz_mdeg, k)] for face, e in faces.items()]
+    points = [[label, *_with_u(e.position_mm, e.position_xyz_um, k)] for label, e in file.circles.items()]
     inputs = [
         [each.title, NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}", *_origin(each)]
         for each in file.sources
@@ -145,6 +148,16 @@ def budget_report(file: BudgetFile) -> Document:
             Section(
                 "Length test", [block for test in file.length_tests for block in _length_test(test)], terminal=True
             ),
+            *(
+                [
+                    Section(
+                        "Circles and corners",
+                        [f"In the frame of face {file.reference_face}", Table(_heads("point", "mm", "µm"), points)],
+                    )
+                ]
+                if points
+                else []
+            ),
             Section("What is measured", [bullets(file.definitions)]),
             Section(
                 "What it rests on",
@@ -169,7 +182,7 @@ def budget_report(file: BudgetFile) -> Document:
             *([macro("answers", [("May the run be used?", file.use)], _tone(file))] if file.use else []),
             Table(
                 ["<Field", "<"],
-                [[name.replace("_", " "), value or NONE] for name, value in file.fields.items()],
+                [[HEADS.get(name, name.replace("_", " ")), value or NONE] for name, value in file.fields.items()],
                 css="text facts",
             ),
         ],

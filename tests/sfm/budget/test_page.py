@@ -1,5 +1,6 @@
 """The page of a budget and its PDF."""
 
+import json
 import re
 
 import pytest
@@ -41,6 +42,8 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert all(len(value.replace(".", "").strip("0")) <= 2 for value in expanded), expanded
     assert text.index("position of face") < text.index("distance of")
     assert "agrees: all 10 lengths within U" in html
+    circle = next(iter(json.loads((small_run / "faces.json").read_text())["circles"]))
+    assert re.search(rf'<th scope="row" class="l">{circle}</th>(<td>-?[\d.]+</td>){{3}}(<td>\d[\d.]*</td>){{3}}', html)
     assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
     assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
