@@ -83,8 +83,8 @@ def left(
 
     Candidates of a revolute joint are its zero; its angle, once and twice a turn, as a motion of that joint (an error
     of its gear or encoder) and as one of the tool along the base's axes; the direction from which it came; and the
-    torque about it of a load at the tool, where z of the base is up. A prismatic joint has its value. Candidates of
-    place are scale, linear terms, and the distance from the base's axis. Along the order of the rows, which is that of
+    torque about it of a load at the tool, where z of the base is up. Every joint has its own value (a ratio that is
+    off) and those of the others (a coupling), as a motion of that joint. Candidates of place are scale, linear terms, and the distance from the base's axis. Along the order of the rows, which is that of
     the measurements, the instrument or the base may have moved, a target slipped, or a joint lost its zero: a jump at
     any row, or a drift. These are tried with all rows, since half of them may seem to be errors.
 
@@ -397,12 +397,14 @@ def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> lis
 
     for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
         joint, arm = i + 1, tip.translation - origin
+        twist = np.hstack([np.zeros_like(z), z] if chain.prismatic[i] else [z, np.cross(z, arm)])
+        for k in range(len(chain.prismatic)):
+            with_joint = f"along the motion of joint {joint}, as of a coupling that the robot file does not state"
+            what = f"the value of joint {k + 1}, " + ("along its motion" if k == i else with_joint)
+            add(what, twist[:, :, None] * values[:, k, None, None], joint)
         if chain.prismatic[i]:
-            twist, by = np.hstack([np.zeros_like(z), z]), values[:, i, None, None]
-            add(f"the value of joint {joint}, along its motion", twist[:, :, None] * by, joint)
-            add(f"the value of joint {joint}", along * by, joint)
+            add(f"the value of joint {joint}", along * values[:, i, None, None], joint)
             continue
-        twist = np.hstack([z, np.cross(z, arm)])
         add(f"the zero of joint {joint}", twist[:, :, None], joint)
         for turns, period in TURNS.items():
             waves = np.stack([np.cos(turns * values[:, i]), np.sin(turns * values[:, i])], axis=1)

@@ -22,6 +22,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import leaves_a_pattern_out
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advice, in_order
+from stcal.sfm.report.trust import Words
 from stcal.sfm.runs.saved import AnyRun, SavedRun, read_target_model, saved_run
 
 MIN_MAPPED = 3
@@ -127,7 +128,8 @@ def doctor(
     shown = _shown_with(run, mapped, options)
     findings = [_with_options(finding, options, shown) for finding in findings]
     observed = sum(len(model.image_index) for model in models)
-    return Diagnosis(files, len(run.observations), len(mapped), observed, in_order(findings))
+    point = Words.of(run.report).point
+    return Diagnosis(files, len(run.observations), len(mapped), observed, in_order(findings), point)
 
 
 def _files(run: SavedRun) -> list[Finding]:
@@ -148,7 +150,7 @@ def _images(run: SavedRun, mapped: set[str]) -> list[Finding]:
             entry["gate"],
             entry["value"],
             entry["limit"],
-            "circles",
+            Words.of(run.report).points,
             (NOTHING_KNOWN if entry["value"] == 0 else "") + _remedy_in(entry),
         )
         for entry in left_out["images"]

@@ -96,7 +96,8 @@ class Diagnosis:
     """The findings and counts of a run.
 
     ``files`` : number given; ``images`` : usable ones among them; ``mapped`` : mapped images; ``circles`` :
-    observations in the model; ``findings`` : what was left out, the most useful to know first.
+    observations in the model; ``findings`` : what was left out, the most useful to know first; ``point`` : what the
+    faces show, circle, corner or point.
     """
 
     files: int
@@ -104,6 +105,7 @@ class Diagnosis:
     mapped: int
     circles: int
     findings: tuple[Finding, ...]
+    point: str = "circle"
 
 
 def advice(gate: str, value: float | None = None, limit: float | None = None, cause: str = "") -> str:
@@ -162,17 +164,17 @@ def by_gate(findings: Iterable[Finding]) -> dict[str, GateCount]:
 
 def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
     """Returns counts, what options let in, and one line for each reason, up to ``lines`` of them."""
-    findings = diagnosis.findings
-    heading = f"{diagnosis.mapped} of {diagnosis.images} images mapped, {diagnosis.circles} circles in the model"
+    findings, point = diagnosis.findings, diagnosis.point
+    heading = f"{diagnosis.mapped} of {diagnosis.images} images mapped, {diagnosis.circles} {point}s in the model"
     if not findings:
-        return f"nothing was left out: {heading}, every circle in view has a label"
+        return f"nothing was left out: {heading}, every {point} in view has a label"
     files = _number(diagnosis.files - diagnosis.images, "file")
     images = _number(diagnosis.images - diagnosis.mapped, "image")
     patterns = [whole_pattern for whole_pattern in findings if whole_pattern.gate == WHOLE_PATTERN]
     whole = f"{_number(len(patterns), 'whole face or board', 'whole faces and boards')}, " if patterns else ""
-    text = [f"{heading}; left out: {files}, {images}, {whole}{_circles(findings)}"]
+    text = [f"{heading}; left out: {files}, {images}, {whole}{_circles(findings, point)}"]
     for gate, count in sorted(by_gate(findings).items(), key=lambda item: (-item[1].circles, -item[1].images)):
-        circles = f"{_number(count.circles, 'circle')} of " if count.circles else ""
+        circles = f"{_number(count.circles, point)} of " if count.circles else ""
         text.append(f"  {gate:<18}{circles}{_number(count.images, 'image')}")
     helping: dict[str, list[Finding]] = {}
     for finding in findings:
@@ -180,22 +182,22 @@ def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
             helping.setdefault(option, []).append(finding)
     for option, findings_of_option in sorted(helping.items(), key=lambda item: -len(item[1])):
         whole = sum(not finding.labels for finding in findings_of_option)
-        parts = [_number(whole, "whole image")] * bool(whole) + [_circles(findings_of_option)] * (
+        parts = [_number(whole, "whole image")] * bool(whole) + [_circles(findings_of_option, point)] * (
             whole < len(findings_of_option)
         )
         text.append(f"{option} lets in {', '.join(parts)}")
     text.append("")
-    rows = [_line(list(findings_of_option)) for _, findings_of_option in groupby(findings, key=_key)]
+    rows = [_line(list(findings_of_option), point) for _, findings_of_option in groupby(findings, key=_key)]
     text += rows[:lines]
     if lines is not None and len(rows) > lines:
         text.append(f"… {len(rows) - lines} more lines with --all")
     return "\n".join(text)
 
 
-def _circles(findings: Iterable[Finding]) -> str:
+def _circles(findings: Iterable[Finding], point: str) -> str:
     in_images = [finding for finding in findings if finding.labels and finding.image]
     images = len({finding.image for finding in in_images})
-    circles = _number(sum(len(finding.labels) for finding in in_images), "circle")
+    circles = _number(sum(len(finding.labels) for finding in in_images), point)
     return f"{circles} of {_number(images, 'image')}" if in_images else circles
 
 
@@ -203,10 +205,10 @@ def _number(count: int, what: str, several: str = "") -> str:
     return f"{count} {what}" if count == 1 else f"{count} {several or what + 's'}"
 
 
-def _line(own: list[Finding]) -> str:
+def _line(own: list[Finding], point: str) -> str:
     first = min(own, key=lambda f: f.value if isinstance(f.value, float) else 0.0)  # asks most of whoever comes closer
     labels = [label for finding in own for label in finding.labels]
-    where = "  ".join(word for word in (first.image, _listed(labels)) if word) or "the run"
+    where = "  ".join(word for word in (first.image, _listed(labels, point)) if word) or "the run"
     values, limits = [f.value for f in own], [f.limit for f in own]
     # Enough digits to tell the value from the limit.
     digits = next((n for n in range(3, 7) if _range(values, n) != _range(limits, n)), 3)
@@ -233,7 +235,7 @@ def _range(values: list, digits: int) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _listed(labels: list[str]) -> str:
+def _listed(labels: list[str], point: str) -> str:
     """Returns the labels as a text; consecutive dots of one row of the board as ``board:2:0–5``."""
     parts: list[str] = []
     dots: dict[str, list[int]] = {}
@@ -247,7 +249,7 @@ def _listed(labels: list[str]) -> str:
             first, *_, last = [column for _, column in run] * 2
             parts.append(f"{row}:{first}" if first == last else f"{row}:{first}–{last}")
     shown = ", ".join(parts[:MAX_LABELS])
-    return shown if len(parts) <= MAX_LABELS else f"{shown} … ({len(labels)} circles)"
+    return shown if len(parts) <= MAX_LABELS else f"{shown} … ({len(labels)} {point}s)"
 
 
 ByGate = Annotated[str, "gate"]
