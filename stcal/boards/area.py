@@ -13,6 +13,8 @@ PIXEL_VARIANCE = 1 / 12
 PRIOR_PX, PRIOR_LINES = 0.005, 1
 """σ of the displacement of edges by the pixels' sampling before an image is seen, px, and the number of lines that it
 counts as."""
+BY_CHANCE = 3.0
+"""Number of σ up to which a displacement of points is taken for chance."""
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -85,10 +87,9 @@ def passed_by_blur(rise: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return np.exp(-2 * np.pi**2 * variance * (rise**-2 - 1))
 
 
-def of_sampling(distance: np.ndarray, rise: np.ndarray, variance: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Return the gradients (m, p, s, 2) by a displacement that follows the cosine, or the sine, of the phase.
+def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Return the gradients (m, p, s, 2) by a displacement of 1 px that follows the cosine, or the sine, of the phase.
 
-    The displacement is 1 px in an edge along the rows.
     Sampling displaces an edge by an amount that depends on its place between two pixels and comes again from pixel to
     pixel: in an edge along the rows it is one for all profiles, in a turned one it averages out. Its first harmonic is
     what is modelled.
@@ -97,14 +98,13 @@ def of_sampling(distance: np.ndarray, rise: np.ndarray, variance: np.ndarray, gr
     ----------
     distance : (m, p, s) array
         Distances of the pixels from the edges.
-    rise, variance : (m,) arrays
-        As of :func:`passed_by_blur`.
+    rise : (m,) array
+        Change of the distance from one pixel to the next.
     gradient : (m, p, s) array
         Derivative of the grey values by the place of the edge.
     """
-    rise, passed = (value[:, None, None] for value in (rise, passed_by_blur(rise, variance)))
-    angle = -2 * np.pi * distance / rise
-    return (passed * gradient)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    angle = -2 * np.pi * distance / rise[:, None, None]
+    return gradient[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,23 +112,49 @@ class Displacement:
     """What lines say about the variance of the displacement of edges by sampling, px².
 
     ``square`` : (k,) estimates of the variance, which may be negative; ``noise`` : (k,) the mean of their part by other
-    errors; ``lines`` : (k,) the equivalent number of lines of each.
+    errors; ``lines`` : (k,) the equivalent number of lines of each; ``passed`` : (k,) as of :func:`passed_by_blur`.
     """
 
     square: np.ndarray
     noise: np.ndarray
     lines: np.ndarray
+    passed: np.ndarray
 
 
-def displacement_variance(*parts: Displacement) -> float:
-    """Return the mean of the estimates, weighted by their certainty, with a prior; at least 0."""
-    square, noise, lines = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("square", "noise", "lines")
+@dataclass(frozen=True, slots=True)
+class SamplingVariance:
+    """Variances of the displacement of edges by sampling, px².
+
+    ``of_area`` : that of an edge along the rows, of which the blur passes less in turned ones; ``of_points`` : that of
+    all edges in images that were resampled in points before they were blurred, as by a warp that takes no means.
+    """
+
+    of_area: float
+    of_points: float
+
+    def of(self, passed: np.ndarray) -> np.ndarray:
+        """Return the variances of edges of which the blur passes ``passed`` (m,)."""
+        return self.of_area * passed**2 + self.of_points
+
+
+def displacement_variance(*parts: Displacement) -> SamplingVariance:
+    """Return the means of the estimates, weighted by their certainty; at least 0.
+
+    That of areas has a prior. That of points is 0 unless it is beyond chance.
+    """
+    square, noise, lines, passed = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("square", "noise", "lines", "passed")
     )
-    certainty = np.where(np.isfinite(square), lines * (noise + PRIOR_PX**2) ** -2, 0.0)
+    known = np.isfinite(square) & (lines > 0)
+    square, noise, lines, share = square[known], noise[known], lines[known], passed[known] ** 2
+    certainty = lines * share**2 * (noise + share * PRIOR_PX**2) ** -2
     prior = PRIOR_LINES * PRIOR_PX**-4
-    mean = (np.nansum(certainty * np.nan_to_num(square)) + prior * PRIOR_PX**2) / (np.nansum(certainty) + prior)
-    return max(float(mean), 0.0)
+    of_area = (float((certainty * square / share).sum()) + prior * PRIOR_PX**2) / (float(certainty.sum()) + prior)
+    of_area = max(of_area, 0.0)
+    certainty = lines * (1 - share) ** 2 * (noise + PRIOR_PX**2) ** -2
+    of_points = float((certainty * (square - of_area * share)).sum())
+    chance = float(np.sqrt((certainty**2 * 2 * noise**2 / lines).sum()))
+    return SamplingVariance(of_area, of_points / float(certainty.sum()) if of_points > BY_CHANCE * chance else 0.0)
 
 
 CLEAR_BLURS = 2.5
@@ -232,11 +258,12 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
 @dataclass(frozen=True, slots=True, eq=False)
 class _Offsets:
     """Offsets of lines from the grid, px: ``offset``, ``variance`` (n, 2, lines, 2), of both signs apart, and
-    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen."""
+    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen. ``passed`` : (n, 2), by direction."""
 
     offset: np.ndarray
     variance: np.ndarray
     by_sampling: np.ndarray
+    passed: np.ndarray
 
 
 def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> _Offsets:
@@ -255,7 +282,7 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
         step, slope = integrated_step(sign * away, pieces.normal, blur)[:2]
         design = np.stack([-own[:, 2] * sign * slope, np.ones_like(step), step], axis=-1)
         residual = level - own[:, 1] - own[:, 2] * step
-        sampling = of_sampling(away, rise, blur, design[..., 0])
+        sampling = of_sampling(away, rise, design[..., 0])
         rows = products(design, used, np.concatenate([design, sampling, residual[..., None]], -1))
         total = np.zeros((len(value), 3, 6))
         np.add.at(total, group, rows)
@@ -271,7 +298,9 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
         offset[:, axis, line, sign] = 0.0
         variance[:, axis, line, sign] = outer.variance[:, edge]
         by_sampling[:, axis, line, sign] = outer.by_sampling[:, edge]
-    return _Offsets(offset, variance, by_sampling)
+    direction = 2 * pieces.tag + pieces.axis
+    passed = np.bincount(direction, passed_by_blur(rise, blur), 2 * n) / np.bincount(direction, minlength=2 * n).clip(1)
+    return _Offsets(offset, variance, by_sampling, passed.reshape(n, 2))
 
 
 def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -333,4 +362,4 @@ def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> Displacement:
     square = ((left**2).sum(1) - freedom) / by_displacement
     good &= square < MOST_PX**2 + 3 * np.sqrt(2 * freedom.clip(1)) / by_displacement
     square[~good] = np.nan
-    return Displacement(square, freedom / by_displacement, np.maximum(freedom, 0.0))
+    return Displacement(square, freedom / by_displacement, np.maximum(freedom, 0.0), lines.passed.ravel())

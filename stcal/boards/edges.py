@@ -11,6 +11,7 @@ from stcal.boards.area import (
     PRIOR_PX,
     Displacement,
     OuterLines,
+    SamplingVariance,
     displacement_variance,
     integrated_step,
     of_sampling,
@@ -100,7 +101,7 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
         rough = _fit(frame.place, offset, good)
         area = _by_area(grey, frame, rough)
-        meeting = _meet(frame, area.lines(rough, 0.0))[0]
+        meeting = _meet(frame, area.lines(rough, SamplingVariance(0.0, 0.0)))[0]
         variance = displacement_variance(area.told, *_told_by_lines(grey, meeting, np.reshape(cells, -1), area))
         covariance = _meet(frame, area.lines(rough, variance))[1]
     seen = good.mean(2) >= MIN_SHARE
@@ -119,7 +120,8 @@ def _told_by_lines(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, are
         blur, noise = (np.median(value.reshape(n, 4)[rows], axis=1) for value in (area.blur, area.noise))
         levels = np.median(dark[rows], axis=1), np.median(rise[rows], axis=1)
         sampling = area.by_sampling[:, 0].reshape(n, 4, 2)[rows]
-        told.append(told_by_lines(grey, OuterLines(corners[rows], blur, *levels, noise, spread[rows], sampling), count))
+        outer = OuterLines(corners[rows], blur, *levels, noise, spread[rows], sampling)
+        told.append(told_by_lines(grey, outer, count))
     return told
 
 
@@ -275,8 +277,8 @@ class _Area:
 
     ``offset``, ``slope`` : (n, 4), as in :class:`_Lines`; ``settled`` : (n, 4) False where the profiles' line is kept;
     ``blur`` : (m,) variances, px²; ``levels`` : (m, 2) dark and rise; ``by_noise`` : (m, 2, 2) covariance of offset and
-    slope without sampling; ``by_sampling`` : (m, 2, 2) their derivatives by its two harmonics, in columns; ``told`` :
-    estimate of the offset from the profiles along rotated edges.
+    slope without sampling; ``by_sampling`` : (m, 2, 2) their derivatives by its two harmonics, in columns; ``passed`` :
+    (m,) share of it that the blur passes; ``told`` : estimate of the offset from the profiles along rotated edges.
     """
 
     offset: np.ndarray
@@ -287,11 +289,13 @@ class _Area:
     noise: np.ndarray
     by_noise: np.ndarray
     by_sampling: np.ndarray
+    passed: np.ndarray
     told: Displacement
 
-    def lines(self, rough: _Lines, variance: float) -> _Lines:
-        """Return the lines with their covariances, where sampling displaces them by ``variance``, px²."""
-        covariance = self.by_noise + variance * self.by_sampling @ np.swapaxes(self.by_sampling, 1, 2)
+    def lines(self, rough: _Lines, variance: SamplingVariance) -> _Lines:
+        """Return the lines with their covariances, where sampling displaces them by ``variance``."""
+        displaced = self.by_sampling @ np.swapaxes(self.by_sampling, 1, 2)
+        covariance = self.by_noise + variance.of(self.passed)[:, None, None] * displaced
         covariance = covariance.reshape(*self.offset.shape, 2, 2)
         covariance = np.where(self.settled[..., None, None], covariance, rough.covariance)
         return _Lines(self.offset, self.slope, covariance, rough.keep)
@@ -331,17 +335,18 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
     shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
     noise = _noise_of(residual, distance, weight)
     factor = noise * _growth_of_tags(residual, design[..., 0], weight, noise, good, shape)
-    sampling = of_sampling(distance, pixels.rise, value[:, 2], design[..., 0])
+    sampling = of_sampling(distance, pixels.rise, design[..., 0])
+    passed = passed_by_blur(pixels.rise, value[:, 2])
     pull = products(design, weight, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
     by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
     value[:, :2] -= shift
-    told = _told_along(residual, design, sampling, weight, factor, good)
+    told = _told_along(residual, design, sampling, passed, weight, factor, good)
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
     levels = value[:, [3, 5]]
-    return _Area(offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], told)
+    return _Area(offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], passed, told)
 
 
 def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:
@@ -373,7 +378,7 @@ BIN_PX = 0.25
 """Width of a class of distances from an edge of a crossing: pixels in one class see the same part of its profile."""
 
 
-def _told_along(residual, design, by_sampling, weight, noise, good) -> Displacement:
+def _told_along(residual, design, by_sampling, passed, weight, noise, good) -> Displacement:
     """Return what turned edges say: whether their profiles move with the phase."""
     harmonic = np.stack(
         [
@@ -386,7 +391,7 @@ def _told_along(residual, design, by_sampling, weight, noise, good) -> Displacem
     gram = products(harmonic, weight, harmonic)
     by_noise, by_displacement = noise * np.trace(gram, axis1=1, axis2=2), np.maximum((gram**2).sum((1, 2)), 1e-12)
     square = ((pulled**2).sum(1) - by_noise) / by_displacement
-    return Displacement(np.where(good, square, np.nan), by_noise / by_displacement, np.full(len(square), 2.0))
+    return Displacement(np.where(good, square, np.nan), by_noise / by_displacement, np.full(len(square), 2.0), passed)
 
 
 def _noise_of(residual, distance, weight) -> np.ndarray:

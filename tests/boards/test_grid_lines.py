@@ -43,7 +43,7 @@ def told(displaced_px: float, seed: int) -> float:
         np.full((1, 4), 1e-6),
         np.broadcast_to([1.0, 0.0], (1, 4, 2)),
     )
-    return displacement_variance(told_by_lines(grey, outer, CELLS))
+    return displacement_variance(told_by_lines(grey, outer, CELLS)).of_area
 
 
 @pytest.mark.parametrize("seed", range(3))
