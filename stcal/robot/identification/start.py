@@ -46,6 +46,10 @@ MOST_JOINTS = 8
 """Largest number of joints of which two or three at a time are tried; their number grows with the third power."""
 LEAST_ORIENTATIONS = 5
 """Number of rows from which on orientations that do not fit are refused: of fewer, chance explains many."""
+UNITS = {"metres": ("m", 1e3), "centimetres": ("cm", 10.0), "inches": ("in", 25.4), "micrometres": ("um", 1e-3)}
+"""Units that are mistaken for mm: endings of columns, and mm of one."""
+PROBED, MOST_MOVES = 8, 4
+"""Number of rows by which the place of an instrument is found again, and largest number of times that it moves."""
 AROUND = 0.1
 """Distance from the given tool point at which distances are fitted from other starts too, as a share of the arm's
 reach."""
@@ -279,7 +283,7 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
     thinned = _thinned(data)
     singles = chain([("", robot, data)], _guesses(robot, thinned), _arms(robot, thinned), _late(robot, data))
-    for guesses in (singles, _pairs_of_mistakes(robot, thinned)):
+    for guesses in (singles, _elsewhere(robot, data, tools), _pairs_of_mistakes(robot, thinned)):
         fitting = []
         for reason, variant, guess in guesses:
             try:
@@ -313,6 +317,38 @@ def _late(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
     reason = "joint values stood one row further {}; pair each position with the joint values of its moment"
     for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
         yield reason.format(way), robot, _thinned(replace(data[places], q=data.q[joints]))
+
+
+def _elsewhere(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Yields the rows up to the first at which the instrument, the base or the target seems to stand elsewhere, if the
+    rows between such changes all fit by themselves."""
+    if data.positions is None or robot.tree is not None:
+        return
+    starts = [0]
+    while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
+        state, misfit = _placed(robot, data[first : first + PROBED], tools)
+        rest = data[first:]
+        far = np.linalg.norm(residuals(state, observed(rest, "position")), axis=1) > FITS * _extent(data)
+        if misfit > FITS * _extent(data) or not far.any():
+            break
+        starts.append(first + int(far.argmax()))
+    ends = [*starts[1:], len(data)]
+    if not 1 < len(starts) <= MOST_MOVES + 1 or min(np.subtract(ends, starts)) < PROBED:
+        return
+    pieces = [data[first:end] for first, end in zip(starts, ends, strict=True)]
+    if any(_placed(robot, each, tools)[1] > FITS * _extent(each) for each in pieces):
+        return
+    stations = tuple(str(k) for k, piece in enumerate(pieces) for _ in range(len(piece)))
+    lines = ", ".join(str(data.lines[first]) for first in starts[1:])
+    try:
+        _with_stations(robot, replace(data, stations=stations), BOTH)
+        what, column = "the instrument, or the robot's base, had", "station"
+    except InputError:
+        what, column = "the target, and perhaps the instrument, had", "target"
+    reason = (
+        f"{what} not moved before line{'s' * (len(starts) > 2)} {lines}; name the rows from there on in column {column}"
+    )
+    yield reason, robot, pieces[0]
 
 
 def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
@@ -430,17 +466,27 @@ def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Mea
     """Yields frequent mistakes: in words, with the robot and the data as they would be without the mistake."""
     turning = ~robot.prismatic
     q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
-    scaled = {"distances": data.distances, "positions": data.positions}
-    scaled = {name: 1e3 * values for name, values in scaled.items() if values is not None}
     yield "joint values are radians in columns of degrees; call the columns q1_rad …", robot, replace(data, q=q * angle)
     yield "joint values are degrees in columns of radians; call the columns q1_deg …", robot, replace(data, q=q / angle)
-    yield "lengths are metres in columns of mm; call the columns x_m … or distance_m", robot, replace(data, **scaled)
+    lengths = {"distances": data.distances, "positions": data.positions}
+    for unit, (suffix, factor) in UNITS.items():
+        reason = f"lengths are {unit} in columns of mm; call the columns x_{suffix} … or distance_{suffix}"
+        scaled = {name: factor * values for name, values in lengths.items() if values is not None}
+        yield reason, robot, replace(data, **scaled)
     reason = "all joint values had the opposite sign; check the rows and the joints' directions"
     yield reason, robot, replace(data, q=np.where(turning, -q, q))
     yield from _signs(robot, data)
     yield from _couplings(robot, data)
     if data.positions is None:
         return
+    moved = np.r_[True, (np.diff(data.positions, axis=0) != 0).any(1)]
+    if not moved.all():
+        first, last = np.flatnonzero(~moved)[[0, -1]]
+        reason = (
+            f"{(~moved).sum()} rows, from line {data.lines[first]} to {data.lines[last]}, did not repeat the position "
+            "of the row before them, while the joints moved; leave them out, or measure again"
+        )
+        yield reason, robot, data[moved]
     mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
     yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
     if data.rotations is not None:

@@ -84,9 +84,10 @@ def left(
     Candidates of a revolute joint are its zero; its angle, once and twice a turn, as a motion of that joint (an error
     of its gear or encoder) and as one of the tool along the base's axes; the direction from which it came; and the
     torque about it of a load at the tool, where z of the base is up. Every joint has its own value (a ratio that is
-    off) and those of the others (a coupling), as a motion of that joint. Candidates of place are scale, linear terms, and the distance from the base's axis. Along the order of the rows, which is that of
-    the measurements, the instrument or the base may have moved, a target slipped, or a joint lost its zero: a jump at
-    any row, or a drift. These are tried with all rows, since half of them may seem to be errors.
+    off) and those of the others (a coupling), as a motion of that joint. Candidates of place are scale, linear terms,
+    and the distance from the base's axis. Along the order of the rows, which is that of the measurements, the
+    instrument or the base may have moved, a target slipped, or a joint lost its zero: a jump at any row, or a drift.
+    These are tried with all rows, since half of them may seem to be errors.
 
     Parameters
     ----------

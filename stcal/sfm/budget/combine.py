@@ -93,8 +93,8 @@ class View:
 class Budget:
     """The uncertainty budget of a run.
 
-    ``circles_covariance_mm2`` : (c, 3, 3) by circle of ``joint``, target frame; ``conditions`` : for which lengths hold.
-    Their correction is not applied to the run's result.
+    ``circles_covariance_mm2`` : (c, 3, 3) by circle of ``joint``, target frame; ``conditions`` : for which lengths
+    hold. Their correction is not applied to the run's result.
     """
 
     joint: JointResult

@@ -145,8 +145,8 @@ class BudgetFile(ResultFile):
         "`faces.json`; `changed`: files that are not as the run left them"
     )
     fields: dict[ByName, str] = Field(
-        description="`laboratory`, `instrument`, `operator`, `date` (of the calibration), `traceability` and others, as "
-        "given; empty where not"
+        description="`laboratory`, `instrument`, `operator`, `date` (of the calibration), `traceability` and others, "
+        "as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
