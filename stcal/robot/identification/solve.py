@@ -50,7 +50,7 @@ from stcal.robot.identification.result import (
     position_errors,
 )
 from stcal.robot.identification.start import start
-from stcal.robot.identification.unexplained import left
+from stcal.robot.identification.unexplained import left, moved_meanwhile
 from stcal.robot.identification.variances import GROSS, Relaxation, components, estimated
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import with_values
@@ -76,6 +76,9 @@ OUTLIER_ROUNDS = 5
 """Largest number of rounds of leaving out gross errors; after 1 to 3 rounds the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Smallest share of good observations; where fewer would be good, nothing is called an error."""
+MOST_OF_IT = 0.5
+"""Share of the squared residuals that a jump along the rows must explain to be named before parameters that stay
+open."""
 TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 REPEATS, FEW_ROWS = 5, 300
 """Number of divisions of the cross-validation for few rows, and largest number of few rows; one division does for
@@ -354,6 +357,12 @@ def _undetermined(solution: Solution, names: list[str], measured: Observed, part
     open_directions = directions_named(directions[:, ~determined][:, expected:], names)
     if not partial:
         first = ", ".join(open_directions[:4]) + (" …" if len(open_directions) > 4 else "")
+        moved = moved_meanwhile(solution.state, measured, MOST_OF_IT)
+        if moved is not None and moved.advice:
+            raise DegenerateError(
+                "E-IDENTIFY-UNDETERMINED",
+                f"{measured.data.where}: {first} stay open with residuals that no robot leaves; {moved.sentence()}",
+            )
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
             f"{measured.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "

@@ -83,11 +83,11 @@ def left(
 
     Candidates of a revolute joint are its zero; its angle, once and twice a turn, as a motion of that joint (an error
     of its gear or encoder) and as one of the tool along the base's axes; the direction from which it came; and the
-    torque about it of a load at the tool, where z of the base is up. Every joint has its own value (a ratio that is
-    off) and those of the others (a coupling), as a motion of that joint. Candidates of place are scale, linear terms,
-    and the distance from the base's axis. Along the order of the rows, which is that of the measurements, the
-    instrument or the base may have moved, a target slipped, or a joint lost its zero: a jump at any row, or a drift.
-    These are tried with all rows, since half of them may seem to be errors.
+    torque about it of a load at the tool, where z of the base is up. A prismatic joint has its value. Every joint has
+    the values of the others, as a motion of that joint (a coupling). Candidates of place are scale, linear terms, and
+    the distance from the base's axis. Along the order of the rows, which is that of the measurements, the instrument or
+    the base may have moved, a target slipped, or a joint lost its zero: a jump at any row, or a drift. These are tried
+    with all rows, since half of them may seem to be errors.
 
     Parameters
     ----------
@@ -400,10 +400,12 @@ def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> lis
         joint, arm = i + 1, tip.translation - origin
         twist = np.hstack([np.zeros_like(z), z] if chain.prismatic[i] else [z, np.cross(z, arm)])
         for k in range(len(chain.prismatic)):
-            with_joint = f"along the motion of joint {joint}, as of a coupling that the robot file does not state"
-            what = f"the value of joint {k + 1}, " + ("along its motion" if k == i else with_joint)
-            add(what, twist[:, :, None] * values[:, k, None, None], joint)
+            if k != i:
+                what = f"the value of joint {k + 1}, along the motion of joint {joint}"
+                what += ", as of a coupling that the robot file does not state"
+                add(what, twist[:, :, None] * values[:, k, None, None], joint)
         if chain.prismatic[i]:
+            add(f"the value of joint {joint}, along its motion", twist[:, :, None] * values[:, i, None, None], joint)
             add(f"the value of joint {joint}", along * values[:, i, None, None], joint)
             continue
         add(f"the zero of joint {joint}", twist[:, :, None], joint)

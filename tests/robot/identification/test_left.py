@@ -82,6 +82,14 @@ def test_a_cause_is_named_once(joint, of, what, kind):
     assert f"residuals go with {what}: " in finding.sentence()
 
 
+def test_a_coupling_of_the_wrist_is_no_gravity():
+    """A hundredth of joint 5 in joint 6."""
+    true, data = bent(4, 60, 6, lambda q, _: 0.01 * q[:, 4])
+    found = identify(replace(mh80(), tools=true.tools), data, QUICK).left[0]
+    assert found.what.startswith("the value of joint 5, along the motion of joint 6, as of a coupling")
+    assert found.share > 0.9
+
+
 def test_the_effect_is_what_was_put_in():
     """Twice a turn of joint 1: 0.2 mrad at the tool's distance from the axis, of which parameters take up a fifth."""
     true, data = bent(6, 200, 1, lambda q, _: 2e-4 * np.sin(2 * q[:, 0]))

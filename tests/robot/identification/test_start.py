@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
+from stcal.robot.identification.solve import identify
 from stcal.robot.identification.start import start
 from stcal.robot.kinematics.file import robot_toml
+from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
@@ -197,3 +199,47 @@ def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(w
         start(robot, replace(data, rotations=rotations.as_matrix()))
     third = np.where((np.arange(30) % 3 == 0)[:, None, None], rotations.as_matrix(), data.rotations)
     start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (0.1, "centimetres"), (1 / 25.4, "inches")])
+def test_another_unit_of_lengths_is_named(factor, unit):
+    data = seen(2, 30)
+    with fails_with(f"E-IDENTIFY-MISFIT … lengths are {unit} in columns of mm"):
+        start(mh80(), replace(data, positions=data.positions * factor))
+
+
+def test_rows_that_repeat_a_position_are_named():
+    data = seen(2, 40)
+    still = data.positions.copy()
+    still[20:] = still[19]
+    with fails_with(
+        f"E-IDENTIFY-MISFIT … 20 rows, from line {data.lines[20]} to {data.lines[39]}, did not repeat the position"
+    ):
+        start(mh80(), replace(data, positions=still, rotations=None))
+
+
+@pytest.mark.parametrize("starts", [(15,), (12, 27)])
+def test_an_instrument_that_moved_far_is_named_with_its_lines(starts):
+    """The target stays: column station mends it."""
+    data = seen(2, 40)
+    for k, row in enumerate(starts):
+        elsewhere = Rigid.exp([0.3, -0.2, 1.0 + k, 1500, -900, 400])
+        data = replace(data, positions=np.vstack([data.positions[:row], elsewhere @ data.positions[row:]]))
+    lines = ", ".join(str(data.lines[row]) for row in starts)
+    named = f"the instrument, or the robot's base, had not moved before line{'s' * (len(starts) > 1)} {lines}"
+    with fails_with(f"E-IDENTIFY-MISFIT … {named} … column station"):
+        start(mh80(), replace(data, rotations=None))
+
+
+def test_a_target_that_slipped_far_is_named_before_parameters_that_stay_open():
+    rng = np.random.default_rng(1)
+    true = placed(
+        made(mh80(), rng), Rigid.exp([0.1, -0.05, 2.1, 2500, -900, 400]), {"": Rigid.exp([0, 0.1, 0, 220, 60, 150])}
+    )
+    slipped = replace(true, tools={"": Rigid.exp([0.2, 0.1, 0.4, 120, 160, 180])})
+    q = joint_vectors(true, 60, rng)
+    parts = [measured(robot, q[rows], rng) for robot, rows in ((true, slice(30)), (slipped, slice(30, 60)))]
+    positions = np.vstack([part.positions for part in parts])
+    data = Measurements.from_arrays(q, positions)
+    with fails_with("E-IDENTIFY-UNDETERMINED … the target elsewhere on its flange from line 31 on … column target"):
+        identify(mh80(), data)
