@@ -336,7 +336,7 @@ def axes_report(result: AxesResult, where: str) -> Document:
                 ],
                 terminal=True,
             ),
-            Section("Left out", [bullets(result.notes)]),
+            Section("Notes", [bullets(result.notes)]),
         ],
     )
 

@@ -25,6 +25,9 @@ SAME_MM = 1e-6
 MISSES, MISSES_MM = 0.05, 20.0
 """Largest RMS deviation of measured from commanded distances of all pairs, as a share and in mm. Arms err by under 1 %
 of their 2 m. Another robot's model, or rows in another order, cause more."""
+MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
+"""Largest share of the poses that may be named as not where they were commanded, and number of poses up to which all
+are compared with all."""
 SCALE_WITHIN = 0.01
 """Largest relative difference of scale.
 
@@ -98,7 +101,8 @@ class SetResult:
     ``error_mm`` : (m − 1,) measured minus commanded distance from the first position; ``mean_mm``, ``std_mm``,
     ``max_mm`` : of their absolute values, the standard deviation with m − 2 in the denominator; ``pairs_rms_mm`` :
     of the errors of all pairs; ``pairs_mm`` : of their commanded distances; ``scale`` : measured over commanded
-    distances of all pairs, by least squares.
+    distances of all pairs, by least squares; ``elsewhere`` : the poses that alone are not where they were commanded, in
+    words.
     """
 
     name: str
@@ -109,9 +113,12 @@ class SetResult:
     pairs_rms_mm: float
     pairs_mm: float
     scale: float
+    elsewhere: str = ""
 
     def doubt(self) -> str:
         """Returns why the measured positions may not belong to the commands; empty if they may."""
+        if self.elsewhere:
+            return f"set {self.name}: {self.elsewhere}"
         if abs(self.scale - 1) > SCALE_WITHIN:
             return (
                 f"set {self.name}: measured distances are {self.scale:.4f} times the commanded ones; "
@@ -255,13 +262,35 @@ def verify(data: MeasuredPoses) -> Verification:
                 f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {next(iter(index))} and "
                 f"{group} (line {data.lines[rows_of_set[k]]}); the same commands needed",
             )
-    sets = tuple(_set_result(data, group, rows_of_set) for group, rows_of_set in index.items())
+    sets = tuple(_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items())
     at = data.commanded[first]
     distances = np.linalg.norm(at[1:] - at[0], axis=1)
     return Verification(data.where, tuple(common), distances, sets, missing, data.notes)
 
 
-def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
+def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]) -> str:
+    """Returns which few of the poses (n, 3) miss most of the others by more than is allowed, while these fit one
+    another; empty if there are none."""
+
+    def off(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distances, own = (np.linalg.norm(xyz[:, None] - xyz, axis=2) for xyz in (commanded, places))
+        missed = np.abs(own - distances)
+        return missed, np.flatnonzero(np.median(missed, axis=1) > max(MISSES * np.median(distances), MISSES_MM))
+
+    missed, wrong = off(measured)
+    good = np.setdiff1d(np.arange(len(names)), wrong)
+    if not len(wrong) or len(wrong) > MOST_ELSEWHERE * len(names) or missed[np.ix_(good, good)].max() > MISSES_MM:
+        return ""
+    listed = _few([names[i] for i in wrong])
+    if len(wrong) == 2:
+        exchanged = measured.copy()
+        exchanged[wrong] = measured[wrong[::-1]]
+        if not len(off(exchanged)[1]):
+            return f"poses {listed} are exchanged; correct the order of the rows"
+    return f"pose{'s' * (len(wrong) > 1)} {listed}: not where commanded, the others are; correct or remove"
+
+
+def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str]) -> SetResult:
     commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
     size = np.abs(error)
@@ -286,6 +315,7 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
         pairs_rms_mm=float(np.sqrt(squares / pairs)),
         pairs_mm=float(np.sqrt(commanded_squares / pairs)),
         scale=product / commanded_squares,
+        elsewhere=_elsewhere(commanded, measured, names) if len(names) <= MOST_COMPARED else "",
     )
 
 

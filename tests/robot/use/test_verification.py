@@ -171,3 +171,29 @@ def test_commands_of_another_robot_are_said(off_mm, warned):
     warnings = result_of(wrong / result_of(wrong).sets[0].scale).warnings()
     assert len(warnings) == warned
     assert all("set a: measured distances miss the commanded ones by" in warning for warning in warnings)
+
+
+def ten_poses(change) -> str:
+    """What is doubted of ten poses in a metre, measured in another frame to 0.2 mm, with ``change`` made to them."""
+    rng = np.random.default_rng(4)
+    commanded = rng.uniform(-500, 500, (10, 3))
+    at = Rigid.exp([0.4, -1.0, 2.0, 500.0, -300.0, 90.0]) @ (commanded + rng.normal(0, 0.2, commanded.shape))
+    change(at)
+    names = tuple(f"P{i}" for i in range(1, 11))
+    data = MeasuredPoses("x.csv", range(2, 12), ("after",) * 10, names, commanded, at)
+    return verify(data).sets[0].doubt()
+
+
+def exchange(at: np.ndarray) -> None:
+    at[[2, 6]] = at[[6, 2]]
+
+
+def displace(at: np.ndarray) -> None:
+    at[4] += [0, 300, 0]
+
+
+def test_exchanged_and_wrong_poses_are_named():
+    assert ten_poses(lambda at: None) == ""
+    assert ten_poses(exchange) == "set after: poses P3, P7 are exchanged; correct the order of the rows"
+    assert ten_poses(displace) == "set after: pose P5: not where commanded, the others are; correct or remove"
+    assert "check units and the order" in ten_poses(lambda at: at.__imul__(1.1))
