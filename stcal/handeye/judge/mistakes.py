@@ -109,7 +109,8 @@ def check_conventions(
             *notes,
             Grave(
                 "the board lies behind the camera in all poses, as it does where both sides are inverted: turn both "
-                f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns"
+                f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns; or the camera's "
+                "axes are those of OpenGL, y up and z backwards: change the signs of y and z of the board in its frame"
             ),
         )
     if behind.any():
