@@ -112,8 +112,24 @@ def _outside(ellipses: Ellipses, polygon: np.ndarray | None) -> Ellipses:
     return ellipses.select(~np.array(inside, bool))
 
 
-def detect_image(
+def detect_target(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageDetection:
+    """Finds and measures all points of the target in one grey image; dots of the board are only set aside.
+
+    Otherwise it is :func:`detect_image`. Half of the time goes into the dots, and the pose of a target has no use for
+    them.
+    """
+    return detect_image(image, camera, target, board, options, dots=False)
+
+
+def detect_image(
+    image: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    dots: bool = True,
 ) -> ImageDetection:
     """Finds and measures all points of the target and the board in one grey image of the camera's size.
 
@@ -130,13 +146,13 @@ def detect_image(
     circles, printed = target.with_faces(printed=False), target.with_faces(printed=True)
     corners = board if isinstance(board, CornerBoard) else None
     if not printed.faces and corners is None:
-        return _detect_circles(image, camera, target, board, options)
+        return _detect_circles(image, camera, target, board, options, dots=dots)
     boards = {face.id: face.printed for face in printed.faces} | ({} if corners is None else {BOARD: corners.printed})
     views, notes = find_on_faces(image, "", boards, camera)  # type: ignore[arg-type]
     detection = ImageDetection(_corners(np.zeros((0, 2)), np.zeros((0, 2, 2)), camera), ())
     if circles.faces or (board is not None and corners is None):
         aside = None if corners is None or BOARD not in views else _outline_px(views[BOARD], corners)
-        detection = _detect_circles(image, camera, circles, None if corners else board, options, aside)
+        detection = _detect_circles(image, camera, circles, None if corners else board, options, aside, dots)
     parts, sightings, board_sightings, first = [detection.centres], [], [*detection.boards], len(detection.centres)
     for face, view in views.items():
         assert view.covariance_px2 is not None, "detectors of boards on faces state σ"
@@ -180,20 +196,21 @@ def _detect_circles(
     board: BoardDesign | None,
     options: EllipseOptions,
     aside: np.ndarray | None = None,
+    dots: bool = True,
 ) -> ImageDetection:
-    """Finds and measures all circles of the target and the board in one grey image of the camera's size; those in the
-    polygon ``aside`` are left out."""
+    """Finds and measures all circles of the target and, with ``dots``, the board in one grey image of the camera's
+    size; those in the polygon ``aside`` are left out."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
     grey = grey_fine(image)
-    named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards
+    named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards if dots else ()
     of_board = board.polarity if board else target.polarity
-    free, dots = reading.free, reading.found[of_board]
+    free, found = reading.free, reading.found[of_board]
     patterns = [_Pattern(target.polarity, free.select(face.used()), face.labels()) for face in named]
     for nameless in refused:
         used = nameless.used()
         patterns.append(_Pattern(target.polarity, free.select(used), [NAMELESS] * len(used)))
     for grid in boards:
-        patterns.append(_Pattern(of_board, dots.select(grid.candidates), [DOT] * len(grid.candidates)))
+        patterns.append(_Pattern(of_board, found.select(grid.candidates), [DOT] * len(grid.candidates)))
     measured = _measured(grey, camera, patterns, reading.found)
     notes = [_untried_note(reading)] if reading.untried else []
     for pattern, centres in zip(patterns, measured, strict=True):

@@ -23,6 +23,7 @@ from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
+from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labels import label_single, without_defocus
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
 from stcal.sfm.measurement.target import TargetCircles, read_target
@@ -162,6 +163,7 @@ def measure(
                 cache,
                 options.workers,
                 step,
+                detect_target,
                 forms=False,
                 pictures=False,
             )

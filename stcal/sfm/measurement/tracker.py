@@ -20,7 +20,7 @@ from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.group_geometry import Arrangement
-from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labels import LabelledImage, label_single, labelled_image
 from stcal.sfm.detect.predict import (
     PredictedCircles,
@@ -174,7 +174,7 @@ class Tracker:
         return self.camera
 
     def _search(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose | StcalError]:
-        detection = detect_image(image, camera, self.design, self.board, self.ellipses)
+        detection = detect_target(image, camera, self.design, self.board, self.ellipses)
         labelled = label_single(name, "", detection, self.design)
         return labelled, self._pose(labelled.observations, camera)
 
