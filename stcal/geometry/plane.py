@@ -53,6 +53,14 @@ def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
     return Plane(normal[0], float(offset[0]), float(rms[0]))
 
 
+def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest and smallest singular values, (...,), of 2×2 matrices (..., 2, 2), in closed form."""
+    half_trace = (m**2).sum((-1, -2)) / 2
+    det = np.abs(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
+    root = np.sqrt(np.maximum(half_trace**2 - det**2, 0))
+    return np.sqrt(half_trace + root), np.sqrt(np.maximum(half_trace - root, 0))
+
+
 def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit a plane to each of k sets of points, (k, n, 3); see :func:`fit_plane`.
 

@@ -1,6 +1,7 @@
 """Observations of one simulated image: the circles in view, and measured centres without rendering pixels."""
 
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -94,7 +95,7 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     whole = _whole(scene.camera, xyz, normal, radius, centre)
     findable = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
     return ImageCircles(
-        tuple(label for label, keep in zip(labels, shown, strict=True) if keep),
+        tuple(compress(labels, shown.tolist())),
         xyz[shown],
         normal[shown],
         radius[shown],

@@ -513,7 +513,7 @@ def circle_equations(blocks: Sequence[Block], shared: Shared, setting: Setting) 
     for block, start in zip(blocks, ends[:-1].tolist(), strict=True):
         _add_group(block, shared, setting, start, normal, shape, by_shape)
     if dots:
-        root = np.linalg.solve(np.linalg.cholesky(shape), by_shape).reshape(3 * dots, -1)
+        root = (np.linalg.inv(np.linalg.cholesky(shape)) @ by_shape).reshape(3 * dots, -1)
         normal -= root.T @ root
     add_knowledge(normal, None, shared, setting, slice(size - shared.basis.shape[1], size))
     inner, cross = normal[size:, size:], normal[size:, :size]
@@ -525,6 +525,7 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
     model, q, d = block.model, shared.basis.shape[1], len(block.dots)
     m, first = len(model.images), 3 * len(setting.labels)
     width = 6 * m + 6 + q  # cameras, pose, intrinsics
+    parts = (slice(start, start + 6 * m + 6), slice(0, 6 * m + 6)), (slice(first, first + q), slice(6 * m + 6, width))
     place = np.concatenate([np.arange(start, start + 6 * m + 6), np.arange(first, first + q)])
     local = np.zeros((width, width))
     cross = np.zeros((len(model.labels), 3, width))
@@ -561,16 +562,15 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
     by_board = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
     pose = slice(6 * m, 6 * m + 6)
     local[pose, pose] += weight * by_board.reshape(3 * d, 6).T @ by_board.reshape(3 * d, 6) if d else np.eye(6)
-    inner, outer = points[block.dots] + weight * np.eye(3), cross[block.dots]
+    inverse, outer = np.linalg.inv(points[block.dots] + weight * np.eye(3)), cross[block.dots]
     outer[:, :, pose] += weight * by_board
-    from_outer = np.linalg.solve(inner, outer)
+    from_outer = inverse @ outer
     local -= outer.reshape(3 * d, width).T @ from_outer.reshape(3 * d, width)
     normal[np.ix_(place, place)] += local
     if len(block.dot_place):
         to_shape = -weight * rotation
-        shape[block.dot_place] += weight * np.eye(3) - to_shape.T @ np.linalg.solve(
-            inner, np.broadcast_to(to_shape, (d, 3, 3))
-        )
+        shape[block.dot_place] += weight * np.eye(3) - to_shape.T @ inverse @ to_shape
         by_shape_reduced = -to_shape.T @ from_outer
         by_shape_reduced[:, :, pose] -= weight * rotation.T @ by_board
-        by_shape[block.dot_place[:, None, None], np.arange(3)[:, None], place] += by_shape_reduced
+        for of_all, own in parts:
+            by_shape[block.dot_place, :, of_all] += by_shape_reduced[:, :, own]

@@ -13,8 +13,8 @@ import numpy as np
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern, singular_values
+from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian, singular_values
+from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern
 
 NEIGHBOURS = 20
 STEP_TOLERANCE = 0.3

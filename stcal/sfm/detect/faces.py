@@ -12,9 +12,9 @@ from functools import lru_cache
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.geometry.plane import homography_jacobian
+from stcal.geometry.plane import homography_jacobian, singular_values
 from stcal.labels import CircleLabel
-from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches, singular_values
+from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches
 from stcal.sfm.detect.sightings import MIN_NAMING, is_named, mirror_images
 
 NEIGHBOURS_IN_DESIGN = 3

@@ -12,6 +12,7 @@ from scipy.special import ellipe, ellipk
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign
 from stcal.geometry.arrays import frozen, require_fields
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import singular_values
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -138,10 +139,13 @@ class _Rims:
         in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
         by_point = projection_jacobians(model, camera)[1]
         shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
-        square, axes = np.linalg.eigh(shape @ np.swapaxes(shape, 1, 2))
-        minor, major = np.sqrt(square).T
-        along = np.stack(_rim_integrals(minor, major), 1)
-        return cls((axes * along[:, None]) @ np.swapaxes(axes, 1, 2), minor)
+        square = shape @ np.swapaxes(shape, 1, 2)
+        major, minor = singular_values(shape)
+        along_minor, along_major = (each[:, None, None] for each in _rim_integrals(minor, major))
+        apart = np.maximum(major**2 - minor**2, 1e-12 * major**2)[:, None, None]
+        # The part of the minor axis is what the square lacks of the major one's; a circle has no axes, and needs none.
+        lacks = (major[:, None, None] ** 2 * np.eye(2) - square) / apart
+        return cls(along_major * np.eye(2) + (along_minor - along_major) * lacks, minor)
 
 
 def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

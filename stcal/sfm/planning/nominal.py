@@ -1,6 +1,7 @@
 """Nominal poses of the faces before a photograph exists, and simulated scenes as labelled centres without pixels."""
 
 from collections.abc import Sequence
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -72,18 +73,18 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
     for name, group in scene.groups.items():
         for i in range(len(group.camera_from_target)):
             circles = image_circles(scene, name, i)
-            keep = np.flatnonzero(circles.must_find & (rng.random(len(circles.labels)) >= missing))
+            keep = circles.must_find & (rng.random(len(circles.labels)) >= missing)
             ideal = circle_image_offset(circles.xyz_camera[keep], circles.normal_camera[keep], circles.radius_mm[keep])
-            centre_px = scene.camera.project(ideal) + noise_px * rng.standard_normal((len(keep), 2))
+            centre_px = scene.camera.project(ideal) + noise_px * rng.standard_normal((len(ideal), 2))
             images.append(
                 ImageObservations(
                     name=f"{name}/{i:04d}",
                     group=name,
-                    labels=tuple(circles.labels[k] for k in keep),
+                    labels=tuple(compress(circles.labels, keep.tolist())),
                     centre_px=centre_px,
                     centre=scene.camera.normalised_from_pixel(centre_px),
-                    shape=np.zeros((len(keep), 2, 2)),
-                    covariance_px2=np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(keep), 1, 1)),
+                    shape=np.zeros((len(ideal), 2, 2)),
+                    covariance_px2=np.tile((noise_px or EXACT_SIGMA_PX) ** 2 * np.eye(2), (len(ideal), 1, 1)),
                 )
             )
     return images

@@ -1,8 +1,9 @@
 """Forecast of a plan before any image exists: the σ to expect, and what would help most."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
-from stcal.parallel import one_thread
+from stcal.parallel import one_thread, run_in_order
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
@@ -29,11 +30,15 @@ from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene, seen_by
 
+R = TypeVar("R")
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
 """Spreads that are tried, from the largest down. The largest tilts that a view may have often forbid wide ones."""
 NEARER = 0.8
 """Distance of the remedy of nearer cameras, relative to the plan's."""
 MIN_IMAGES = 2
+MANY_DOTS = 2000
+"""Number of dots from which on remedies are forecast in processes of their own; fewer take less time than their
+start."""
 MAX_DOTS = 10_000
 """Largest number of dots of a board."""
 FINE_DOTS, MAX_CENTRES = 500, 450_000
@@ -169,17 +174,31 @@ def plan_with_board(
             f"plan: {dots} dots in {options.images * len(scene.groups)} images are {centres} centres, up to "
             f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
         )
+    inputs = (target, board, nominal)
+    twice = replace(options, images=2 * options.images)
+    nearer = replace(options, distance_mm=NEARER * options.distance_mm)
+    jobs = [
+        (_now, scene, options, board),
+        (_remedy, "twice the images", twice, *inputs),
+        (_wider, options, *inputs),
+        (_remedy, "nearer by 20 %", nearer, *inputs),
+    ]
+    workers = None if dots > MANY_DOTS else 1
+    now, more, wider, near = run_in_order(_called, jobs, workers)
+    return replace(now, remedies=(more, wider, *now.remedies, near))
+
+
+def _called(function: Callable[..., R], *arguments) -> R:
+    """Returns what a function returns; a job of another process."""
+    with one_thread():
+        return function(*arguments)
+
+
+def _now(scene: Scene, options: PlanOptions, board: BoardDesign) -> Plan:
+    """Returns the plan as it is asked for, with a better board as the only remedy."""
     setup, models = _setup(scene, options, board), _models(scene, options)
     expected = forecast(models, setup)
     half_board = forecast(models, setup.better_board(0.5), expected.derivatives)
-    twice = replace(options, images=2 * options.images)
-    nearer = replace(options, distance_mm=NEARER * options.distance_mm)
-    remedies = [
-        _remedy("twice the images", twice, target, board, nominal),
-        _wider(options, target, board, nominal),
-        Remedy("a board of half the σ", half_board.worst()[1]),
-        _remedy("nearer by 20 %", nearer, target, board, nominal),
-    ]
     return Plan(
         options,
         setup,
@@ -189,7 +208,7 @@ def plan_with_board(
         widest_aperture_mm(models, scene.camera),
         expected,
         variance_shares(expected, models, setup),
-        tuple(remedies),
+        (Remedy("a board of half the σ", half_board.worst()[1]),),
     )
 
 

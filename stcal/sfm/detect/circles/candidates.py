@@ -11,7 +11,7 @@ from stcal.design import Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian
+from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
 from stcal.io.images import percentiles, shrunk
 
 WINDOWS_PX = (41, 193)
@@ -354,14 +354,6 @@ class Candidates:
 
     def __len__(self) -> int:
         return len(self.xy)
-
-
-def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the largest and smallest singular values, (...,), of 2×2 matrices (..., 2, 2), in closed form."""
-    half_trace = (m**2).sum((-1, -2)) / 2
-    det = np.abs(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
-    root = np.sqrt(np.maximum(half_trace**2 - det**2, 0))
-    return np.sqrt(half_trace + root), np.sqrt(np.maximum(half_trace - root, 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
