@@ -154,7 +154,7 @@ def _in_ppm(value: float) -> float:
 
 Expansion = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True), AfterValidator(_in_ppm)]
 ExpansionSigma = Annotated[Ppm, AfterValidator(_in_ppm)]
-Celsius = Annotated[float, Field(ge=-273.15, le=2000, allow_inf_nan=False, strict=True)]
+Celsius = Annotated[float, Field(ge=-100, le=200, allow_inf_nan=False, strict=True)]
 Kelvin = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)]
 
 

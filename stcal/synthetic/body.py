@@ -68,6 +68,8 @@ class BodyOptions:
         σ of the faces about their rough poses, mm and degrees.
     print_errors : float
         Factor on the σ that the design states of printed faces, and on the bends of :data:`BEND_MM`; 0 for exact ones.
+    body_seed : int, optional
+        Draws the errors of the body, so that another ``seed`` photographs the same one again; ``seed`` by default.
 
     Raises
     ------
@@ -84,9 +86,12 @@ class BodyOptions:
     pose_sigma_mm: float = 0.3
     pose_sigma_deg: float = 0.5
     print_errors: float = 0.0
+    body_seed: int | None = None
 
     def __post_init__(self):
-        require_fields(self, "body", images=1, noise=0, blur_px=0, seed=0, pose_sigma_mm=0, pose_sigma_deg=0)
+        require_fields(
+            self, "body", images=1, noise=0, blur_px=0, seed=0, body_seed=0, pose_sigma_mm=0, pose_sigma_deg=0
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,10 +200,11 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
                 f"face {face.id}: no rough_pose; photographs of a body need one of each face in target.toml",
             )
     rng = np.random.default_rng(options.seed)
+    made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
     moved = {}
     for face_id, pose in rough.items():
-        turn = Rotation.from_rotvec(np.radians(options.pose_sigma_deg) * rng.normal(size=3)).as_matrix()
-        shift = options.pose_sigma_mm * rng.normal(size=3)
+        turn = Rotation.from_rotvec(np.radians(options.pose_sigma_deg) * made.normal(size=3)).as_matrix()
+        shift = options.pose_sigma_mm * made.normal(size=3)
         moved[face_id] = Rigid(pose.rotation @ turn, pose.translation + shift)
     design = _in_first_face(rough)
     scene = BodyScene(target, design, camera, (), options)
@@ -226,7 +232,7 @@ def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) ->
     """
     if not options.print_errors:
         return {}
-    rng = np.random.default_rng([options.seed, 3])
+    rng = np.random.default_rng([options.seed if options.body_seed is None else options.body_seed, 3])
     size, shift_px = options.print_errors * rng.normal(size=2) * [1.0, EDGE_SIGMA_PX]
     shift_mm = float(shift_px * options.distance_mm / (np.mean(camera.focal) * np.sqrt(0.5)))
     off = {}
@@ -515,13 +521,13 @@ def write_body(
         (folder / "target.toml").write_text(body_toml(scene.target), encoding="utf-8")
         truth = json.dumps(body_truth(scene, image_format).content())
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-    drawings = scene.drawings()
-    count = len(scene.camera_from_target)
-    paths = [folder / "images" / _image_name(i, image_format) for i in range(count)]
-    jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]
-    for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
-        if progress:
-            progress(done, count)
+        drawings = scene.drawings()
+        count = len(scene.camera_from_target)
+        paths = [folder / "images" / _image_name(i, image_format) for i in range(count)]
+        jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]
+        for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
+            if progress:
+                progress(done, count)
     return paths
 
 

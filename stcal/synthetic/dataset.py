@@ -1,6 +1,7 @@
 """Data sets of rendered images in a folder, with their truth."""
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -166,17 +167,25 @@ IMAGE_FORMATS = ("jpg", "png")
 
 @contextmanager
 def new_dataset(folder: Path) -> Iterator[None]:
-    """Refuses a folder that is not empty, or that cannot be written within the block."""
+    """Refuses a folder that is not empty, or that cannot be written within the block. If the block fails, the folder is
+    left as it was."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
         )
+    existed = folder.exists()
     try:
         yield
-    except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
-        ) from error
+    except BaseException as error:
+        for child in list(folder.iterdir()) if folder.is_dir() else ():
+            shutil.rmtree(child) if child.is_dir() else child.unlink()
+        if not existed and folder.is_dir():
+            folder.rmdir()
+        if isinstance(error, OSError):
+            raise InputError(
+                "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
+            ) from error
+        raise
 
 
 @require_arguments
@@ -234,16 +243,16 @@ def write_dataset(
         save_body(folder / "target.toml", scene.target)
         save_run_board(folder / "board.toml", scene.board)
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-    jobs = {
-        image_name(group, i, image_format): (scene, group, i, options, jpeg_quality)
-        for group, g in scene.groups.items()
-        for i in range(len(g.camera_from_target))
-    }
-    paths = {name: folder / "images" / name for name in jobs}
-    written = run_parallel(_write_image, [(path, *jobs[name]) for name, path in paths.items()], workers)
-    for done, _ in enumerate(written, 1):
-        if progress:
-            progress(done, len(jobs))
+        jobs = {
+            image_name(group, i, image_format): (scene, group, i, options, jpeg_quality)
+            for group, g in scene.groups.items()
+            for i in range(len(g.camera_from_target))
+        }
+        paths = {name: folder / "images" / name for name in jobs}
+        written = run_parallel(_write_image, [(path, *jobs[name]) for name, path in paths.items()], workers)
+        for done, _ in enumerate(written, 1):
+            if progress:
+                progress(done, len(jobs))
     return list(paths.values())
 
 

@@ -61,6 +61,9 @@ class SceneOptions:
     fisheye_deg : float, optional
         Field of an equidistant lens over the image's diagonal, 60° to 170°, that is not centred on the target. It has
         a focal length and distortion of its own. By default the lens is perspective.
+    body_seed : int, optional
+        Draws the errors of target, camera and ``one_board``, so that another ``seed`` photographs the same ones again;
+        ``seed`` by default.
     """
 
     seed: int = 0
@@ -79,12 +82,14 @@ class SceneOptions:
     margin_mm: float = FACE_MARGIN_MM
     one_board: bool = False
     fisheye_deg: float | None = None
+    body_seed: int | None = None
 
     def __post_init__(self):
         require_fields(
             self,
             "scene",
             seed=0,
+            body_seed=0,
             focal_px=1,
             centre_sigma=0,
             circle_sigma_mm=0,
@@ -226,10 +231,11 @@ def make_scene(
     if missing:
         raise InputError("E-TARGET-ROUGH-POSE", f"scene: no nominal pose of face {missing[0]}; give one pose per face")
     rng = np.random.default_rng(options.seed)
-    target_from_face, circles = _made_target(target, nominal, options, rng)
+    made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
+    target_from_face, circles = _made_target(target, nominal, options, made)
     _check_convex(target, target_from_face, options.margin_mm)
-    camera = _made_camera(options, rng)
-    common = board.sigma_mm * rng.standard_normal((len(board.labels()), 3)) if options.one_board else None
+    camera = _made_camera(options, made)
+    common = board.sigma_mm * made.standard_normal((len(board.labels()), 3)) if options.one_board else None
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
         group = _made_group(pair, target, board, camera, target_from_face, circles, options, common, rng)

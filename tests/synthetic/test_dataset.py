@@ -111,3 +111,28 @@ def test_refusals(tmp_path, scene):
         write_dataset(tmp_path / "new", scene, image_format="tif")
     with fails_with("E-OPTION-FORM"):
         write_dataset(tmp_path / "new", scene, RenderOptions(bit_depth=16))
+
+
+def test_a_data_set_that_fails_leaves_no_folder(tmp_path):
+    def fails(done, total):
+        raise RuntimeError("no")
+
+    folder = tmp_path / "new" / "set"
+    with pytest.raises(RuntimeError, match="no"):
+        write_dataset(folder, make_scene(SceneOptions(width=640, height=426, images_per_group=2)), progress=fails)
+    assert not folder.exists()
+
+
+def test_another_seed_photographs_the_same_body_again():
+    first, again, other = (
+        make_scene(SceneOptions(seed=seed, body_seed=own, one_board=True))
+        for seed, own in ((3, None), (4, 3), (4, None))
+    )
+    assert str(first.target_from_face) == str(again.target_from_face) != str(other.target_from_face)
+    assert np.array_equal(first.camera.parameters(), again.camera.parameters())
+    group, taken_again = (each.groups["12"] for each in (first, again))
+    for one, two, same in (
+        (group.board_circles_target, taken_again.board_circles_target, False),
+        (group.camera_from_target[0].translation, taken_again.camera_from_target[0].translation, False),
+    ):
+        assert np.array_equal(one, two) == same

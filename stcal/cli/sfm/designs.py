@@ -108,6 +108,12 @@ def simulate(
     png: Annotated[bool, "Write PNG instead of JPEG."] = False,
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    body_seed: Annotated[
+        int | None,
+        "Draw the errors of target and camera with this seed: another --seed then photographs the same ones again. "
+        "That of --seed if not given.",
+        Opt(min=0, max=MOST_SEED),
+    ] = None,
     margin: PlateMargin = 15.0,
     workers: Workers = None,
 ) -> None:
@@ -128,6 +134,7 @@ def simulate(
         images_per_group=images,
         margin_mm=margin,
         one_board=one_board,
+        body_seed=body_seed,
     )
     kind = "png" if png or sixteen_bit else "jpg"
     if target is not None and (body := body_of(target)).with_faces(printed=True).faces:
@@ -143,7 +150,9 @@ def simulate(
                 "E-OPTION-CONFLICT",
                 f"{unfit[0]}: not for photographs of a body with boards or tags on its faces; leave it out",
             )
-        shape = BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1.0)
+        shape = BodyOptions(
+            images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1.0, body_seed=body_seed
+        )
         _body(folder, body, camera, shape, width, kind, workers)
         return
     if second_design and (target or board):

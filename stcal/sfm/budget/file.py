@@ -145,8 +145,8 @@ class BudgetFile(ResultFile):
         "`faces.json`; `changed`: files that are not as the run left them"
     )
     fields: dict[ByName, str] = Field(
-        description="`laboratory`, `instrument`, `operator`, `date` (of the calibration), `traceability` and others, "
-        "as given; empty where not"
+        description="`number` (of the certificate), `laboratory`, `instrument`, `operator`, `date` (of the "
+        "calibration), `traceability` and others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
@@ -298,10 +298,12 @@ def _definitions(run: SavedRun) -> list[str]:
         if face.printed is not None:
             faces.append(f"face {face.id}: the frame of its drawing, Z into the body")
         else:
-            normal = "normal to the plane of all its circles, " if run.faces.frame == "plane" else ""
+            plane = run.faces.frame == "plane"
+            normal = "normal to the plane of all its circles, " if plane else ""
+            foot = ", at its foot on the plane of all circles" if plane else ""
             faces.append(
-                f"face {face.id}: origin at circle {face.origin}, X towards circle {face.x}, Y on the side of circle "
-                f"{face.y}, Z {normal}out of the body"
+                f"face {face.id}: origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of "
+                f"circle {face.y}, Z {normal}out of the body"
             )
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "

@@ -19,6 +19,7 @@ from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
 from stcal.sfm.budget.sources import reference_temperature_c
+from stcal.sfm.data.model import ImageObservations
 
 WHAT = "lengths"
 BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
@@ -157,6 +158,32 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
             "board and target for both",
         )
     return LengthTest(str(folder), tuple(tested), notes)
+
+
+SAME_VIEW_PX = 0.2
+"""Median distance of equal circles below which two photographs are of one view: no hand comes back to it."""
+
+
+def common_views(first: Sequence[ImageObservations], second: Sequence[ImageObservations]) -> tuple[str, ...]:
+    """Returns a note on photographs of which both runs have the same view; none if there are none."""
+    common = sum(any(_same_view(image, other) for other in second) for image in first)
+    if not common:
+        return ()
+    return (
+        f"{common} of {len(first)} photographs have the same view in the other run, to {SAME_VIEW_PX} px: the two "
+        "calibrations are not independent, and what both have wrong cannot be seen here; compare with a run of other "
+        "photographs",
+    )
+
+
+def _same_view(image: ImageObservations, other: ImageObservations) -> bool:
+    place = {label: i for i, label in enumerate(other.labels)}
+    rows = [(i, place[label]) for i, label in enumerate(image.labels) if label in place]
+    if 2 * len(rows) <= max(len(image), len(other)):
+        return False
+    own, others = np.array(rows).T
+    apart = np.linalg.norm(image.centre_px[own] - other.centre_px[others], axis=1)
+    return bool(np.median(apart) < SAME_VIEW_PX)
 
 
 def _require_size(budget: Budget) -> None:

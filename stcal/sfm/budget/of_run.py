@@ -1,7 +1,7 @@
 """The uncertainty budget of a run with its length tests, as ``budget`` makes it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stcal.errors import InputError
@@ -9,7 +9,7 @@ from stcal.geometry.arrays import Brief, require_arguments
 from stcal.report.document import Document
 from stcal.sfm.budget.combine import Budget, budget_of_run
 from stcal.sfm.budget.file import BudgetFile, refusals
-from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated
+from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated, common_views
 from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run
@@ -92,7 +92,8 @@ def uncertainty_budget(
         second = saved_run(lengths)
         others.append(second)
         other = budget_of_run(second, statement_of(second.board_design.stated, _path(lengths_statement or statement)))
-        tests.append(against_run(budget, other, second.folder, (saved.board_design, second.board_design)))
+        test = against_run(budget, other, second.folder, (saved.board_design, second.board_design))
+        tests.append(replace(test, notes=common_views(saved.observations, second.observations) + test.notes))
     file = BudgetFile.of(budget, saved, verify(saved), tests, *others)
     return UncertaintyBudget(budget, tuple(tests), file, tuple(refusals([saved, *others], file.length_tests)))
 

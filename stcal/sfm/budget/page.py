@@ -1,6 +1,7 @@
 """The report of an uncertainty budget."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -48,7 +49,12 @@ def name_of(circles: Sequence[str]) -> str:
     return "–".join(circles)
 
 
-RELATES = "The results relate only to the item named above, in the state in which it was photographed."
+RELATES = (
+    "The results relate only to the item named above, in the state in which it was photographed. The certificate may "
+    "be reproduced only as a whole."
+)
+REQUIRED = ("number", "laboratory", "date", "traceability")
+"""Fields without which a page is no certificate (ISO/IEC 17025:2017, 7.8.2.1 and 7.8.4.1)."""
 HEADS = {"date": "date of calibration"}
 """Names of fields where the key does not say what they are."""
 SIGNED = ("date of issue", "name", "signature")
@@ -56,18 +62,19 @@ SIGNED = ("date of issue", "name", "signature")
 LEAST_SHARE = 1e-3
 """Least share of a variance that is drawn."""
 MANY = 1e4
+EXACT_UM = 1e-6
+"""σ below which a value is exact by definition, as that of the frame's own origin is up to rounding, µm or mdeg."""
 NEGLIGIBLE = 1e-4
 """Share of u below which a contribution has no sensitivity in the tables."""
-ROUNDING = 1e-6
-"""Ratio to u below which a contribution is rounding error alone."""
 
 
 def budget_report(file: BudgetFile) -> Document:
     """Returns the report of ``budget``: expanded uncertainties, inputs, contributions, and tests of lengths."""
     faces, images = file.faces, sum(each.images for each in file.views)
+    placed = {f"face {f}": u for f, each in faces.items() if (u := each.position_um)}
     kinds = [
-        ("positions of faces, µm", {f"face {f}": u for f, each in faces.items() if (u := each.position_um)}),
-        ("rotations of faces, mdeg", {f"face {f}": each.rotation_mdeg for f, each in faces.items()}),
+        ("positions of faces, x, y, z together, µm", placed),
+        ("rotations of faces, x, y, z together, mdeg", {f"face {f}": each.rotation_mdeg for f, each in faces.items()}),
         ("longest distances, µm", {name_of(each.circles): each.distance_um for each in file.distances}),
     ]
     kinds = [(title, columns) for title, columns in kinds if columns]
@@ -94,17 +101,18 @@ def budget_report(file: BudgetFile) -> Document:
     stated = [[each.body, each.key, f"{each.value:g}", each.origin] for each in file.stated]
     views = [[each.group, each.images, number(each.spread_deg, 0)] for each in file.views]
     hashes = [
-        ["folder of the run", file.run.folder],
-        ["photographs", file.run.images],
+        ["folder of the run", Path(file.run.folder).name],
+        ["folder of the photographs", Path(file.run.images).name],
         ["SHA-256 of stcal-run.json, which has those of all files", file.run.sha256],
         ["SHA-256 of faces.json", file.run.faces_sha256],
         ["run made by", f"stcal {file.run.version}"],
         ["budget made by", f"stcal {file.version}"],
     ]
+    groups = f"{len(file.views)} group{'s' * (len(file.views) != 1)}"
     return Document(
         title_of(file),
-        f"{file.run.folder}: {images} photographs in {len(file.views)} group{'s' * (len(file.views) != 1)}; faces "
-        f"against face {file.reference_face}, the target frame",
+        f"{Path(file.run.folder).name}: {images} photographs in {groups}; faces against face {file.reference_face}, "
+        "the target frame",
         [
             Section(
                 "Result",
@@ -190,7 +198,7 @@ def budget_report(file: BudgetFile) -> Document:
 
 
 def certifies(file: BudgetFile) -> bool:
-    """Returns whether the page is a certificate: the run may be used, inputs and traceability are stated."""
+    """Returns whether the page is a certificate: the run may be used, inputs and required fields are stated."""
     return _is_valid(file) and not _unstated(file)
 
 
@@ -202,7 +210,7 @@ def _is_valid(file: BudgetFile) -> bool:
 def _unstated(file: BudgetFile) -> list[str]:
     """Returns what a certificate needs and nothing is stated of; faces that need not be flat need no statement."""
     inputs = [row.title for row in file.sources if row.origin == "not stated" and row.key != "flatness"]
-    return inputs + ["traceability"] * (not file.fields.get("traceability"))
+    return inputs + [name for name in REQUIRED if not file.fields.get(name, "").strip()]
 
 
 def _no_certificate(file: BudgetFile) -> str:
@@ -224,7 +232,7 @@ def as_exact(value: float, expanded: float) -> str:
 
 def _with_u(values: Sequence[float], sigma: Sequence[float], k: float) -> list[str]:
     """Returns x, y, z and U of each; ``sigma`` : in a thousandth of the unit."""
-    expanded = [k * v for v in sigma]
+    expanded = [k * v if v > EXACT_UM else 0.0 for v in sigma]
     return [*(as_exact(v, 1e-3 * u) for v, u in zip(values, expanded, strict=True)), *map(significant, expanded)]
 
 
@@ -315,7 +323,7 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         value = _slope(first, source) if source.key in first.sensitivities else 0.0
         slope = f"{value:.3g} {unit}/{source.unit}" if value else "–"
         parts = [number(u.contributions[source.key], 2) for u in columns.values()]
-        none = all(u.contributions[source.key] <= ROUNDING * u.standard for u in columns.values())
+        none = all(u.contributions[source.key] <= NEGLIGIBLE * u.standard for u in columns.values())
         if (
             source.key == "intrinsics" and source.origin == "estimated" and none
         ):  # what they do is in the rows of the centres, with which they were adjusted

@@ -28,7 +28,7 @@ from stcal.sfm.adjust.uncertainty import (
     Contributions,
 )
 
-FIELDS = ("laboratory", "instrument", "operator", "date", "traceability")
+FIELDS = ("number", "laboratory", "instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, after those that are given, and empty if they are not."""
 LONGEST = 500
 

@@ -1,6 +1,7 @@
 """Distances against stated lengths and against a second calibration."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -119,6 +120,7 @@ def test_command(stcal_sfm, small_run, budget, tmp_path):
     one, two = json.loads(out.read_text())["length_tests"]
     assert (one["agrees"], two["agrees"]) == (False, True)
     assert one["lengths"][0]["e_n"] == pytest.approx(1.5, abs=1e-5)
+    assert re.match(r"(\d+) of \1 photographs have the same view in the other run", two["notes"][0])
     assert len(two["lengths"]) == 10  # of four faces: six pairs and four within
 
 

@@ -9,7 +9,7 @@ from stcal.report import document as pdf
 from stcal.report.text import significant
 from stcal.sfm.budget.combine import budget_of_run
 from stcal.sfm.budget.file import BudgetFile
-from stcal.sfm.budget.page import as_exact, budget_report
+from stcal.sfm.budget.page import REQUIRED, as_exact, budget_report
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error
@@ -77,9 +77,9 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
     run = load_run(small_run)
     file = BudgetFile.of(budget_of_run(run), run, verify(run.folder))
     stated = [row.model_copy(update={"origin": "stated"}) for row in file.sources]
-    full = file.model_copy(update={"sources": stated, "fields": {"traceability": "rule 7"}})
+    full = file.model_copy(update={"sources": stated, "fields": dict.fromkeys(REQUIRED, "rule 7")})
     for one, lacks in (
-        (full.model_copy(update={"fields": {"traceability": ""}}), "traceability"),
+        *((full.model_copy(update={"fields": full.fields | {name: " "}}), name) for name in REQUIRED),
         (file.model_copy(update={"fields": full.fields}), "board's pitch"),
     ):
         page = budget_report(one).page()
@@ -92,4 +92,5 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
     assert "not a certificate" not in page
     assert page.index("May the run be used?") < page.index("<h2>")
     assert "origin at circle" in page
+    assert run.folder.parent.name not in page
     assert [row.value for row in file.stated if row.key == "pitch_mm"] == [run.board_design.pitch_mm]
