@@ -1,5 +1,6 @@
 """Detection of the boards and tags on the faces of a body, all of one image together."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -17,6 +18,8 @@ from stcal.geometry.camera import Camera
 from stcal.io.images import ImageFile, decode, grey_of
 from stcal.labels import BOARD
 
+MOST_READ = 12
+"""Largest number of images in which tags of no face are looked for."""
 LOOKED_AT = 5
 """Number of images in which other tags are looked for."""
 MOST_TILT_DEG = 70.0
@@ -112,6 +115,29 @@ def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
     normal = np.linalg.eigh(np.swapaxes(away, 2, 3) @ away)[1][..., 0]
     lines, offsets = (np.stack([np.roll(each, 1, axis=1), each], axis=2) for each in (normal, (normal * middle).sum(2)))
     return np.linalg.solve(lines, offsets[..., None])[..., 0] - corners_px
+
+
+def tags_of_no_face(files: Sequence[ImageFile], faces: Sequence[FaceDesign], unseen: Sequence[FaceDesign]) -> list[str]:
+    """Return notes on tags that images show and no face has, where tags of faces are in none of the images.
+
+    ``files`` : images, of which :data:`MOST_READ` at most are read; ``faces`` : all faces; ``unseen`` : those
+    in no image.
+    """
+    missing = sorted({tag for face in unseen for tag in tags_on(face.printed)})
+    own = {tag for face in faces for tag in tags_on(face.printed)}
+    known = sorted({dictionary for dictionary, _ in own})
+    if not missing:
+        return []
+    chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, min(len(files), MOST_READ)).astype(int))]
+    seen = Counter(
+        tag for file in chosen for tag in set(find_tags(grey_of(decode(file.read(), file.name), file.name), known).tags)
+    )
+    strange = [(tag, count) for tag, count in seen.most_common() if tag not in own and count > 1]
+    if not strange:
+        return []
+    shown = ", ".join(f"tag {number} of {name} in {count} of {len(chosen)}" for (name, number), count in strange[:3])
+    names = ", ".join(f"{number} of {name}" for name, number in missing[:3])
+    return [f"images show tags that no face has ({shown}), and not {names}: correct the ids in target.toml"]
 
 
 def why_unseen(files: Sequence[ImageFile], faces: Sequence[FaceDesign]) -> str:

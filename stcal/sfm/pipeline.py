@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.faces import why_unseen
+from stcal.boards.faces import tags_of_no_face, why_unseen
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
@@ -39,6 +39,7 @@ from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
+from stcal.sfm.data.as_drawn import misnamed_groups, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, seen_by
@@ -258,6 +259,9 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
             task = replace(task, target=target, board=scale_reference(None, target))
         result = _solved(task, detection, labelled, model)
+        printed = target.with_faces(printed=True).faces
+        absent = [face for face in printed if face.id not in result.target.target_from_face]
+        result = replace(result, notes=(*result.notes, *tags_of_no_face(task.files[0], printed, absent)))
         left_out.update(unadjusted(result))
     return result
 
@@ -480,6 +484,8 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
             *unusable,
             *unsolved,
             *calibration.notes,
+            *not_as_drawn(calibration.target.target_from_face, target),
+            *(misnamed_groups(observations, target) if board.rows else ()),
             *unseen_board(solutions, board),
         ),
     )

@@ -14,6 +14,9 @@ from stcal.sfm.adjust.scale import MIN_DOTS, known_points
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 
 PPM = 1e6
+ALONE, FAR, LEAST_AGREEING = 0.005, 3.0, 2
+"""Relative error of size from which one source is named, how many times as far off as the others it must be, and how
+many others must agree."""
 MOST_PRINT_FACTOR = 10.0
 """Corners about the design over their stated σ from which on the design, or a stated size, is another one."""
 
@@ -43,6 +46,11 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
     if print_factor > MOST_PRINT_FACTOR:
         # σ that have grown so much would hide the contradiction that made them grow.
         measured = Measured("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
+        if alone := _alone(networks, board):
+            name, times = alone
+            reason = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
+            size = Measured(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
+            return Check(key, title, "failed", reason, (size, measured), 1, (name,), f"correct the size of {name}")
         why = "the size or drawing of the print is another one, or its σ too small"
         reason = f"{measured.name} at {measured.words()}: {why}"
         return Check(key, title, "suspicious", reason, (measured,), 1, (measured.name,), remedy)
@@ -66,6 +74,23 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
     if not trials:
         return impossible(key, title, "only one source of the scale", "state a known distance with scale")
     return judge(key, title, trials, "sources of the scale", remedy)
+
+
+def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float] | None:
+    """Returns the one source whose size contradicts all others, which agree, and its size over the stated one; None
+    without one."""
+    off: dict[str, list[float]] = {}
+    for network in networks:
+        sources = _sources(network, board, 1.0)
+        middle = float(np.median([source.log_scale for source in sources])) if sources else 0.0
+        for source in sources:
+            off.setdefault(source.name, []).append(source.log_scale - middle)
+    ratio = {name: float(np.median(values)) for name, values in off.items()}
+    if len(ratio) < LEAST_AGREEING + 1:
+        return None
+    name = max(ratio, key=lambda each: abs(ratio[each]))
+    others = max(abs(value) for each, value in ratio.items() if each != name)
+    return (name, float(np.exp(ratio[name]))) if abs(ratio[name]) > max(ALONE, FAR * others) else None
 
 
 def _sources(network: Network, board: BoardDesign, print_factor: float) -> list[_Source]:

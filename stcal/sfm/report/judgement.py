@@ -15,6 +15,7 @@ from pydantic import Field
 from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.text import join, number, significant
+from stcal.sfm.data.as_drawn import NOT_AS_DRAWN
 
 CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in 100,000."
 """Text on the false alarms of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
@@ -69,6 +70,7 @@ INVALIDATES: dict[str, tuple[str, ...]] = {
     "board": (DISTANCES, EVERY_SIGMA),
     "board-lines": (DISTANCES, EVERY_SIGMA),
     "pitch": (DISTANCES,),
+    "scales": (PLACES, DISTANCES, EVERY_SIGMA),
     "radius": ("the centres of the circles whose radius stands out", EVERY_SIGMA),
     "radius-design": (CENTRES, PLACES),
     "flatness": ("the frames of the faces with circles off their plane", EVERY_SIGMA),
@@ -122,7 +124,7 @@ def judgement_of(report: dict) -> Judgement:
     """
     verdict, use = _use(report)
     by_result = _control(report) or _by_checks(report) or _by_gaps(report)
-    cause = by_result or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
+    cause = by_result or _by_drawing(report) or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
@@ -175,6 +177,10 @@ def _use(report: dict) -> tuple[Use, str]:
     verdict, answer = _by_result(report)
     if verdict != "no" and "drawing" in report["summary"].get("scale_from", []):
         verdict, answer = "with care", f"With care, for its shape alone: {UNKNOWN_SIZE}; {answer.partition(': ')[2]}"
+    if drawn := _drawn(report):
+        answer = f"With care: {answer.removeprefix('Yes: ')}" if verdict == "yes" else answer
+        verdict = "with care" if verdict == "yes" else verdict
+        answer = f"{answer.removesuffix('.')}; {drawn[0][0]}."
     gaps = _gaps(report)
     if not gaps or not report["faces"]:
         return verdict, answer
@@ -187,6 +193,18 @@ def _use(report: dict) -> tuple[Use, str]:
     elif verdict == "yes" and _absent(report):
         answer = f"Yes, for {_faces(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
     return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
+
+
+def _drawn(report: dict) -> list[tuple[str, str]]:
+    """Returns in which ways the faces are not where they were drawn, and what to do about each."""
+    notes = [note.removeprefix(NOT_AS_DRAWN) for note in report["notes"] if note.startswith(NOT_AS_DRAWN)]
+    return [(what, remedy) for what, _, remedy in (note.rpartition(": ") for note in notes)] if report["faces"] else []
+
+
+def _by_drawing(report: dict) -> _Cause | None:
+    for what, remedy in _drawn(report):
+        return _Cause(f"The drawing: {what}.", f"{remedy[:1].upper()}{remedy[1:]}.")
+    return None
 
 
 def _by_result(report: dict) -> tuple[Use, str]:

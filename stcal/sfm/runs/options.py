@@ -1,7 +1,7 @@
 """Options of a run."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
@@ -11,6 +11,7 @@ from stcal.geometry.arrays import require_fields
 from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import FLATNESS_MM, AdjustOptions, Solve
+from stcal.sfm.data.as_drawn import faces_in_name
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import GraphKind, PairOptions
 
@@ -135,7 +136,7 @@ class RunOptions:
         if self.expect_faces:
             return [face for face in ids if face in self.expect_faces]
         groups = list(groups)
-        named = [_faces_in_name(name, [*ids, *unknown_faces(groups, target)]) for name in groups]
+        named = [faces_in_name(name, [*ids, *unknown_faces(groups, target)]) for name in groups]
         return [face for face in ids if all(named) and any(face in faces for faces in named)]
 
 
@@ -147,18 +148,10 @@ def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]
     """
     ids, groups = [face.id for face in target.faces], list(groups)
     found: dict[str, str] = {}
-    for group in groups if any(_faces_in_name(name, ids) for name in groups) else ():
+    for group in groups if any(faces_in_name(name, ids) for name in groups) else ():
         words = re.split("[-_+ ]", group)
         parts = words if len(words) > 1 else list(group)
         others = [part for part in parts if part not in ids]
-        if len(parts) == 2 and len(others) == 1 and not _faces_in_name(others[0], ids):
+        if len(parts) == 2 and len(others) == 1 and not faces_in_name(others[0], ids):
             found.setdefault(others[0], group)
     return found
-
-
-def _faces_in_name(group: str, ids: Sequence[str]) -> set[str]:
-    """Returns the faces, at least two, of which a group's name consists; empty if it consists of anything else."""
-    for parts in (re.split("[-_+ ]", group), list(group)):
-        if len(parts) > 1 and len(set(parts)) == len(parts) and set(parts) <= set(ids):
-            return set(parts)
-    return set()

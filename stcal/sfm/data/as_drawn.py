@@ -1,0 +1,105 @@
+"""Whether a result has the faces where the design draws them, and groups show the faces that their names state."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from stcal.design import TargetDesign
+from stcal.geometry.rigid import Rigid
+from stcal.sfm.data.model import ImageObservations, by_group
+
+NOT_AS_DRAWN = "not as drawn: "
+"""How a note begins on faces that are not where the design or the names of groups have them; what to do follows behind
+the last colon."""
+MOST_TURNED_DEG = 25.0
+"""Largest angle of a face to its rough pose. A rough pose is good to a few degrees; a face on the wrong side of the
+body, or drawn turned, is off by far more."""
+LIKE_DRAWN = 1.3
+"""Largest factor between distances of faces and those of their rough poses."""
+SHOWN = 2
+"""Number of images that must show a face before its group counts as one of it."""
+
+
+def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign) -> list[str]:
+    """Returns notes on faces that are not where the rough poses of the design have them.
+
+    Parameters
+    ----------
+    target_from_face : poses of the faces by id, mm
+    design : design of the target; faces without a rough pose are not compared
+    """
+    rough = {face: pose for face, pose in design.rough_poses().items() if face in target_from_face}
+    if len(rough) < 2:
+        return []
+    notes = []
+    found = {face: target_from_face[face] for face in rough}
+    ratio = _size_ratio(found, rough)
+    if not 1 / LIKE_DRAWN < ratio < LIKE_DRAWN:
+        notes.append(
+            f"{NOT_AS_DRAWN}faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has "
+            "them: check the sizes that it states (size_mm, radius_mm, pitch_mm), and that of the board"
+        )
+    turned = _turned(found, rough)
+    if not turned:
+        return notes
+    what = ", ".join(f"face {face} is turned by {angle:.0f}°" for face, angle in turned.items())
+    what += " against rough_pose in target.toml"
+    for a, b in combinations(turned, 2):
+        exchanged = rough | {a: rough[b], b: rough[a]}
+        if not {a, b} & _turned(found, exchanged).keys():
+            what += f", as if the names of faces {a} and {b} were exchanged"
+            break
+    return [*notes, f"{NOT_AS_DRAWN}{what}: correct names, ids or rough_pose"]
+
+
+def _size_ratio(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> float:
+    """Returns the median ratio of distances between origins of faces, found over rough; 1 where all are one."""
+    ratios = []
+    for a, b in combinations(rough, 2):
+        drawn, seen = (float(np.linalg.norm(of[a].translation - of[b].translation)) for of in (rough, found))
+        if drawn > 0:
+            ratios.append(seen / drawn)
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def _turned(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
+    """Returns the faces that are turned against most others, with their angles, degrees."""
+    off = {face: found[face].rotation @ rough[face].rotation.T for face in rough}
+    angles = {anchor: {face: _angle_deg(own.T @ off[face]) for face in off} for anchor, own in off.items()}
+    anchor = max(angles, key=lambda face: sum(angle <= MOST_TURNED_DEG for angle in angles[face].values()))
+    return {face: angle for face, angle in angles[anchor].items() if angle > MOST_TURNED_DEG}
+
+
+def _angle_deg(rotation: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+
+
+def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[str]:
+    """Returns notes on groups that are named after faces, and show others in place of them."""
+    ids, notes = [face.id for face in design.faces], []
+    for group, images in by_group(observations).items():
+        named = faces_in_name(group, ids)
+        seen = Counter(face for image in images for face in image.face_ids())
+        shown = [face for face, count in seen.items() if count >= SHOWN]
+        lacking, others = named - seen.keys(), [face for face in shown if face not in named]
+        if named and lacking and others:
+            notes.append(
+                f"{NOT_AS_DRAWN}group {group} is named after {_faces(sorted(named))} and shows {_faces(shown)}: "
+                "correct the names of faces in target.toml, or of folders"
+            )
+    return notes
+
+
+def faces_in_name(group: str, ids: Sequence[str]) -> set[str]:
+    """Returns the faces, at least two, of which a group's name consists; empty if it consists of anything else."""
+    for parts in (re.split("[-_+ ]", group), list(group)):
+        if len(parts) > 1 and len(set(parts)) == len(parts) and set(parts) <= set(ids):
+            return set(parts)
+    return set()
+
+
+def _faces(names: Iterable[str]) -> str:
+    return f"faces {' and '.join(names)}"

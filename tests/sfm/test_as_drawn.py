@@ -1,0 +1,100 @@
+"""Faces that are not where the design draws them, and groups that show others than they are named after."""
+
+import re
+
+import numpy as np
+import pytest
+
+from stcal.boards.target import body_toml
+from stcal.design import reference_target
+from stcal.geometry.rigid import Rigid
+from stcal.sfm import pipeline
+from stcal.sfm.data.as_drawn import misnamed_groups, not_as_drawn
+from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.report.judgement import judgement_of
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.saved import load_run
+from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.designs import tag_cube
+
+CUBE = tag_cube(60.0)
+
+
+def found(size: float = 1.0, seed: int = 1) -> dict[str, Rigid]:
+    """The cube made to 5° and 3 mm, in the frame of its third face."""
+    rng, rough = np.random.default_rng(seed), CUBE.rough_poses()
+    off = [Rigid.exp([*rng.normal(0, np.radians(3), 3), *rng.normal(0, 1.5, 3)]) for _ in rough]
+    third = rough["3"].inverse()
+    return {
+        face: Rigid((at := third @ pose @ error).rotation, size * at.translation)
+        for (face, pose), error in zip(rough.items(), off, strict=True)
+    }
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_body_as_drawn_says_nothing(seed):
+    assert not_as_drawn(found(seed=seed), CUBE) == []
+    assert not_as_drawn({"1": Rigid()}, CUBE) == []
+
+
+def test_another_size_and_exchanged_faces_are_named():
+    [size] = not_as_drawn(found(0.1), CUBE)
+    assert re.match(r"not as drawn: faces are 0\.(1|09\d|10) times as far from one another as their rough_pose", size)
+    poses = found()
+    poses["2"], poses["5"] = poses["5"], poses["2"]
+    [turned] = not_as_drawn(poses, CUBE)
+    assert "as if the names of faces 2 and 5 were exchanged" in turned
+    turn = Rigid.exp([0, 0, np.pi / 2, 0, 0, 0])
+    poses = found()
+    [turned] = not_as_drawn(poses | {"4": poses["4"] @ turn}, CUBE)
+    assert "face 4 is turned by 9" in turned or "face 4 is turned by 8" in turned
+    assert "exchanged" not in turned
+
+
+def seen(group: str, *faces: str) -> list[ImageObservations]:
+    labels = tuple(f"{face}:{circle}" for face in faces for circle in "abcd")
+    n = len(labels)
+    empty = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
+    return [ImageObservations(f"{group}/{i}", group, labels, *empty) for i in range(3)]
+
+
+def test_groups_that_show_other_faces_than_their_names_say():
+    target = reference_target()
+    assert misnamed_groups([*seen("12", "1", "2"), *seen("left", "3", "4"), *seen("14", "1")], target) == []
+    [note] = misnamed_groups([*seen("12", "1", "3"), *seen("14", "1", "4")], target)
+    assert note.startswith("not as drawn: group 12 is named after faces 1 and 2 and shows faces 1 and 3: correct")
+
+
+@pytest.mark.slow
+def test_one_tag_of_another_size_and_one_of_another_id_are_named(tmp_path):
+    write_body(
+        tmp_path / "set", make_body_scene(CUBE, body_camera(640), BodyOptions(images=10, distance_mm=300, seed=5))
+    )
+    text = body_toml(CUBE)
+    sizes = [line for line in text.splitlines() if "size_mm = " in line and "dictionary" in line]
+    reports = []
+    for name, changed in (
+        ("size", text.replace(sizes[1], sizes[1].replace("size_mm = 45.0", "size_mm = 40.0"))),
+        ("id", text.replace("id = 2,", "id = 77,")),
+    ):
+        assert changed != text
+        (path := tmp_path / f"{name}.toml").write_text(changed, encoding="utf-8")
+        result = pipeline.run(tmp_path / "set/images", None, tmp_path / name, path, None, RunOptions())
+        reports.append((result, next(check for check in result.checks if check.key == "scales")))
+    (size, scales), (ids, sound) = reports
+    assert (scales.verdict, scales.names) == ("failed", ("face 2",))
+    assert scales.reason.startswith("face 2 would fit with 1.1")
+    assert size.judgement.verdict == "no"
+    assert sound.verdict != "failed"
+    assert any("tag 2 of DICT_APRILTAG_36H11" in note and "not 77 of" in note for note in ids.notes)
+
+
+def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):
+    report = load_run(small_run).report
+    notes = [*report["notes"], "not as drawn: faces are 0.1 times as far: check the sizes"]
+    assert judgement_of(report).verdict == "yes"
+    judged = judgement_of(report | {"notes": notes})
+    assert judged.verdict == "with care"
+    assert "; faces are 0.1 times as far" in judged.use
+    assert judged.limit == "The drawing: faces are 0.1 times as far."
+    assert judged.next.startswith("Check the sizes.")
