@@ -317,7 +317,7 @@ def test_metres_on_both_sides_are_said():
     assert (
         handeye(HandEyePoses(*both))
         .notes[0]
-        .endswith("if lengths are in metres, name the columns _m, or give --length-unit m")
+        .endswith("name the columns x_m … or x_in …, or give --length-unit m where none states a unit")
     )
 
 

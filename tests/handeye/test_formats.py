@@ -110,7 +110,7 @@ def test_the_unit_of_a_model_is_solved_for(command, tmp_path, truth):  # noqa: F
 def test_options_that_a_table_does_not_need(command, tmp_path, truth):  # noqa: F811
     code, _, err = command(poses_file(tmp_path / "poses.csv", truth), "--length-unit", "m")
     assert code == INPUT
-    assert "the columns of the tables state these; leave --length-unit out" in err
+    assert "the names of columns state unit and rotation; leave --length-unit out" in err
 
 
 @pytest.mark.slow

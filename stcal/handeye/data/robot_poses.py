@@ -128,7 +128,8 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
             require_own(path, quaternions)
         raise InputError(
             "E-OPTION-NEEDS",
-            f"robot poses {path}: its columns or keys state these; leave {', '.join(statements.options())} out",
+            f"robot poses {path}: the names of its columns or keys state unit and rotation; leave "
+            f"{', '.join(statements.options())} out, and rename those that are wrong (x_m in place of x_mm)",
         )
     if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
         raise InputError(

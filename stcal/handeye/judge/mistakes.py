@@ -35,7 +35,7 @@ LOST = 0.25
 """Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
 nothing in common."""
 NAMED = "rename them in the file, or give --poses-are where the file does not name them"
-NAMED_ORDER = "name the columns so, or reorder the numbers in other files"
+NAMED_ORDER = "name the columns so; for a file without names of columns give --rotation {side}={order}"
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 HALL_MM = 5e4
@@ -145,12 +145,16 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
     for reading in (*ORDERS, CONJUGATED):
         robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)
         kind = "conjugated" if reading.conjugated else "in another order"
-        one_side = f"quaternions {kind}: if {reading.held}, "
-        one_side += reading.remedy if reading.conjugated else NAMED_ORDER
+        # A file without names is of the order x, y, z, w by its form, such as TUM's: the other one is w, x, y, z.
+        robot_side, camera_side = (
+            f"quaternions {kind}: if {reading.held}, "
+            + (reading.remedy if reading.conjugated else NAMED_ORDER.format(side=side, order="wxyz"))
+            for side in ("robot", "camera")
+        )
         both_sides = f"quaternions {kind}: if {reading.held}, {reading.remedy}"
-        variants[f"with the robot's {both_sides if by_images else one_side}"] = replace(loop, stand_from_mount=robot)
+        variants[f"with the robot's {both_sides if by_images else robot_side}"] = replace(loop, stand_from_mount=robot)
         if not by_images:
-            variants[f"with the board's {one_side}"] = replace(loop, camera_from_board=board)
+            variants[f"with the board's {camera_side}"] = replace(loop, camera_from_board=board)
             variants[f"with all {both_sides}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
     return variants
 
@@ -176,13 +180,15 @@ def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
     variants = {}
     for side, other in (("robot", "board"), ("board", "robot")):
         factor, which = 1000.0, side
-        remedy = "if they are metres, name the columns _m, or give --length-unit m"
+        remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
             remedy = "if the size in its file is in metres, correct that"
         if _typical_length(_of_side(loop, other)) > HALL_MM:
             factor, which = 1e-3, other
             role = "robot" if other == "robot" else "camera"
-            remedy = f"if they are mm, name the columns _mm, or give --length-unit {role}=mm"
+            remedy = (
+                f"if they are mm, name the columns x_mm …, or give --length-unit {role}=mm where none states a unit"
+            )
         poses = _of_side(loop, which)
         scaled = Poses(poses.rotation, factor * poses.translation)
         times = "times" if factor > 1 else "divided by"

@@ -256,8 +256,8 @@ def of_distance(loop: Loop) -> tuple[str, ...]:
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
     if away >= NEAR_MM:
         return ()
-    message = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m, "
-    message += "or give --length-unit m"
+    remedy = "name the columns x_m … or x_in …, or give --length-unit m where none states a unit"
+    message = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres or inches, {remedy}"
     return (Grave(message),)
 
 

@@ -306,7 +306,8 @@ def _require_unsaid(statements: Said, where: str) -> None:
     if statements.options():
         raise InputError(
             "E-OPTION-NEEDS",
-            f"{where}: the columns of the tables state these; leave {', '.join(statements.options())} out",
+            f"{where}: the names of columns state unit and rotation; leave {', '.join(statements.options())} out, and "
+            "rename columns that are wrong (x_m in place of x_mm)",
         )
 
 
