@@ -1,6 +1,7 @@
 """The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
 import tempfile
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
@@ -12,7 +13,7 @@ from stcal.boards.faces import tags_of_no_face, why_unseen
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
-from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
+from stcal.errors import DegenerateError, DetectionError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
@@ -189,6 +190,10 @@ def run_on_files(
     """Calibrates a target from some of the photographs in the folder ``images``; see :func:`run`."""
     progress = progress or (lambda *_: None)
     model = None if camera is None else camera_model(camera)
+    if model is not None and is_vague(model) and not (options.refine_camera or options.compare):
+        options = replace(options, refine_camera=True)
+        known = f"camera file {model.source}: states its focal length to ±{_focal_sigma(model):.3g} px only"
+        warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
@@ -288,9 +293,18 @@ def _with_found_camera(task: Task) -> tuple[DetectionResult, list[LabelledImage]
 def is_rough(model: CameraModel, options: RunOptions) -> bool:
     """Returns whether a camera is too rough to map the groups with: one to be refined whose focal length is known less
     well than the boards tell it, as that of EXIF."""
-    if not options.refine_camera or model.covariance is None or model.colmap_model != LENS:
+    return options.refine_camera and is_vague(model)
+
+
+def is_vague(model: CameraModel) -> bool:
+    """Returns whether a camera file states its focal length less well than the boards tell it."""
+    if model.covariance is None or model.colmap_model != LENS:
         return False
-    return bool(np.sqrt(model.covariance[0, 0]) > MAX_FOCAL_SIGMA * model.focal[0])
+    return _focal_sigma(model) > MAX_FOCAL_SIGMA * model.focal[0]
+
+
+def _focal_sigma(model: CameraModel) -> float:
+    return float(np.sqrt(model.covariance[0, 0])) if model.covariance is not None else 0.0
 
 
 def _camera_of_dots(task: Task, rough: CameraModel | None) -> CameraModel:

@@ -25,6 +25,9 @@ SAY_EVERY_S = 1.0
 """Shortest time between two lines of --live, s."""
 
 
+TABLE = Path("poses.csv")
+
+
 @app.command()
 def measure(
     camera: shared.CameraFile,
@@ -36,7 +39,7 @@ def measure(
         Arg(),
     ] = None,
     target: shared.TargetFile = None,
-    out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = Path("poses.csv"),
+    out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = TABLE,
     json_file: Annotated[
         Path | None,
         "Also write all results to this file, with both solutions of ambiguous images (JSON), or to standard output "
@@ -98,6 +101,7 @@ def measure(
         mode = "--live" if live else "--serve"
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--columns": columns}
         alone |= {
+            "--out": out != TABLE,
             "IMAGES": images if serve else None,
             "--json": json_file if serve or json_file != STANDARD_OUTPUT else None,
             "--previous": previous,
@@ -111,7 +115,7 @@ def measure(
             raise InputError(
                 "E-OPTION-CONFLICT",
                 f"{mode} and {conflicting[0]}: images come {source}; leave {conflicting[0]} out"
-                + (", or give --json -, a line each" if live and conflicting[0] == "--json" else ""),
+                + (", or give --json -, a line each" if live and conflicting[0] in ("--json", "--out") else ""),
             )
         setting = _setting(camera, faces, target, board, sigma_factor, ellipses)
         listen = host, port, max_megabytes, token
@@ -122,6 +126,14 @@ def measure(
         return
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
+    from stcal.io.images import SUFFIXES
+
+    if images.is_file() and images.suffix.lower() not in SUFFIXES:
+        raise InputError(
+            "E-IMAGES-FOLDER",
+            f"{images}: a file, and no image; for the pose in each picture of a video give --live --json -, or give "
+            "the folder of its frames",
+        )
     if columns is not None and joints is None:
         raise InputError(
             "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of joint values; give it with --joints"

@@ -174,6 +174,7 @@ def test_pictures_of_a_folder_or_a_video_of_odd_size(small_run, small_dataset, t
         (["http://127.0.0.1:9/clip"], "E-LIVE-SOURCE … http://127.0.0.1:9/clip"),
         (["--strict"], "E-OPTION-CONFLICT … --strict"),
         (["--json", "poses.json"], "E-OPTION-CONFLICT … --json -"),
+        (["--out", "clip.csv"], "E-OPTION-CONFLICT … --out … --json -"),
     ],
 )
 def test_what_cannot_be_shown_ends_in_one_line(small_run, words, code):
@@ -182,6 +183,13 @@ def test_what_cannot_be_shown_ends_in_one_line(small_run, words, code):
         CliRunner().invoke(
             app, ["sfm", "measure", "--live", *map(str, faces), "--port", "0", *words], catch_exceptions=False
         )
+
+
+def test_a_video_without_live_is_told_how_it_is_measured(small_run, tmp_path):
+    (clip := tmp_path / "clip.avi").write_bytes(b"RIFF")
+    faces = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json"]
+    with fails_with("E-IMAGES-FOLDER … clip.avi: a file, and no image … --live --json -"):
+        CliRunner().invoke(app, ["sfm", "measure", str(clip), *map(str, faces)], catch_exceptions=False)
 
 
 @pytest.mark.slow
