@@ -33,7 +33,7 @@ FAMILIES = MappingProxyType({"tagStandard41h12": Family(2115, 5, 2), "tagCircle2
 TOO_LARGE = ("tagStandard52h13", "tagCircle49h12", "tagCustom48h12")
 """Families of 42 000 to 66 000 tags: a detector needs a table of 1 to 2 GB in each process."""
 EXTRA = "pip install 'stereo-target-calibration[apriltag]'"
-_APRILTAG = re.compile(r"(?:april)?[_ -]?t(?:ag)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
+_APRILTAG = re.compile(r"(?:april)?[_ -]?(?:t(?:ag)?)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
 
 
 @cache
@@ -58,7 +58,7 @@ def known_dictionary(name: str) -> str:
     if plain not in dictionaries:
         size = re.search(r"\d+ ?[X×] ?\d+|\d\dH\d+", plain)
         word = size[0].replace(" ", "").replace("×", "X") if size else plain[5:9]
-        alike = sorted(key for key in dictionaries if word in key) or sorted(dictionaries)
+        alike = sorted(own for key, own in dictionaries.items() if word in key) or sorted(dictionaries.values())
         raise ValueError(f"unknown dictionary; one of {', '.join(alike)} needed")
     return dictionaries[plain]
 

@@ -242,6 +242,17 @@ def frames_of(video: str | Path) -> Iterator[Iterator[np.ndarray]]:
         device.release()
 
 
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Keep back what OpenCV prints by itself; its errors are raised as ever."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
 def _device(source: int | str) -> cv2.VideoCapture:
     """Return the source, opened if it can be. The libraries' own words about it are kept back.
 
@@ -253,13 +264,12 @@ def _device(source: int | str) -> cv2.VideoCapture:
             f"--bayer {pattern}: pictures of a camera or a video have their colours already, and no mosaic; leave "
             "--bayer out",
         )
-    level, before = cv2.utils.logging.getLogLevel(), os.environ.get(FFMPEG_LEVEL)
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    before = os.environ.get(FFMPEG_LEVEL)
     os.environ[FFMPEG_LEVEL] = "-8"
     try:
-        return cv2.VideoCapture(source)
+        with quiet_opencv():
+            return cv2.VideoCapture(source)
     finally:
-        cv2.utils.logging.setLogLevel(level)
         os.environ.pop(FFMPEG_LEVEL)
         if before is not None:
             os.environ[FFMPEG_LEVEL] = before

@@ -135,7 +135,7 @@ class Table:
         bare_name = name[-1:] if name[-1:] in "xyz" else name
         bare = next((column for column in self.columns if column.lower() in (name, bare_name)), None)
         if bare is None:
-            return ""
+            return "; columns of other names are named in a file of --columns"
         likely = f"{bare_name}_{next(iter(units))}"
         return f"; the unit of {bare} is open: call it {likely} …, or give {likely} = {bare!r} … in a file of --columns"
 

@@ -224,7 +224,7 @@ def again(sides):
         (None, change(0, "nan"), INPUT, ["line 5: base_from_flange_x_mm is 'nan'"]),
         (None, change(1, ""), INPUT, ["line 5: base_from_flange_y_mm is ''"]),
         (inverted, None, INPUT, ["contradict each other", "if these are board_from_camera, rename"]),
-        (in_metres, None, INPUT, ["if they are metres, name the columns _m"]),
+        (in_metres, None, INPUT, ["if they are metres, name the columns x_m"]),
     ],
 )
 def test_bad_poses_are_named(command, tmp_path, alter, edit, code, parts):

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import Loop, Motions
+from stcal.io.device import quiet_opencv
 
 SUBSETS = 200
 """Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""
@@ -184,14 +185,15 @@ def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple
     """
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     try:
-        if method in AX_XB:
-            r, t = cv2.calibrateHandEye(*_split(hand, unit_mm), *_split(eye, unit_mm), method=AX_XB[method])
-            x = _rigid(r, t, unit_mm, method)
-            return x, mean_pose(loop.chain(x))
-        mount_from_stand = hand.inverse()
-        r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(
-            *_split(eye, unit_mm), *_split(mount_from_stand, unit_mm), method=AX_ZB[method]
-        )
+        with quiet_opencv():  # of few poses it prints lines of its own
+            if method in AX_XB:
+                r, t = cv2.calibrateHandEye(*_split(hand, unit_mm), *_split(eye, unit_mm), method=AX_XB[method])
+                x = _rigid(r, t, unit_mm, method)
+                return x, mean_pose(loop.chain(x))
+            mount_from_stand = hand.inverse()
+            r_z, t_z, r_x, t_x = cv2.calibrateRobotWorldHandEye(
+                *_split(eye, unit_mm), *_split(mount_from_stand, unit_mm), method=AX_ZB[method]
+            )
     except cv2.error as error:
         raise ConvergenceError(
             "E-HANDEYE-METHOD-FAILS", f"hand-eye: {method} fails in OpenCV ({error.err}); use another method"

@@ -363,7 +363,8 @@ def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ..
     return (
         f"joint values of {away.sum()} of {len(off)} rows, first line {targets.lines[int(away.argmax())]}, lead "
         f"elsewhere than their poses, by {np.median(mm[away]):.4g} mm and {np.degrees(np.median(rad[away])):.3g}° "
-        "(median): they only choose the branch; if they are those of the poses check order, units and conventions",
+        "(median): they only choose the branch; if they are those of the poses, check order, units and conventions; if "
+        "the poses are of the nominal robot's tool, give that robot with --nominal",
     )
 
 
