@@ -124,7 +124,8 @@ def detect_files(
         outcomes[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
         if progress:
             progress(files[i].name)
-    images, skipped = _without_copies([f for f in outcomes if f is not None], forms)
+    grouped = forms and board is not None and board.rows > 0  # a board moves between groups
+    images, skipped = _without_copies([f for f in outcomes if f is not None], forms, grouped)
     if not images:
         first = skipped[0]
         raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
@@ -389,11 +390,17 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
     return Skipped(file.name, f"the same image as {first}{what}", "copy")
 
 
-def _without_copies(outcomes: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
+def _without_copies(
+    outcomes: list[DetectedImage | Skipped], forms: bool, grouped: bool
+) -> tuple[list[DetectedImage], list[Skipped]]:
     """Returns the images without copies of photographs, and the files that are skipped.
 
     A copy adds no information, but would count as a further observation. Of files with equal content, the one with the
-    plainest name is kept; of one photograph in several ``forms``, the lossless one."""
+    plainest name is kept; of one photograph in several ``forms``, the lossless one. With ``grouped``, a photograph in
+    two groups is of one of them only, and nothing tells of which."""
+    if grouped:
+        misplaced = _in_two_groups([outcome for outcome in outcomes if isinstance(outcome, DetectedImage)])
+        outcomes = [misplaced.get(o.file.name, o) if isinstance(o, DetectedImage) else o for o in outcomes]
     detected = [outcome for outcome in outcomes if isinstance(outcome, DetectedImage)]
     plainest: dict[str, DetectedImage] = {}
     for image in sorted(detected, key=lambda image: _plainness(image.file)):
@@ -408,6 +415,21 @@ def _without_copies(outcomes: list[DetectedImage | Skipped], forms: bool) -> tup
     images = [image for image in detected if image.file.name not in copies]
     skipped = [outcome if isinstance(outcome, Skipped) else copies.get(outcome.file.name) for outcome in outcomes]
     return images, [reason for reason in skipped if reason is not None]
+
+
+def _in_two_groups(images: list[DetectedImage]) -> dict[str, Skipped]:
+    """Returns, by name, the images whose content is in two groups that have further images of their own."""
+    groups_of: dict[str, set[str]] = {}
+    for image in images:
+        groups_of.setdefault(image.digest, set()).add(image.file.group)
+    whole = {image.file.group for image in images if len(groups_of[image.digest]) == 1}  # others are copied folders
+    found = {}
+    for image in images:
+        groups = sorted(groups_of[image.digest] & whole)
+        if len(groups) > 1:
+            reason = f"the same photograph is in groups {' and '.join(groups)}, and belongs to one"
+            found[image.file.name] = Skipped(image.file.name, f"{reason}; delete the other file", "copy")
+    return found
 
 
 def _plainness(file: ImageFile) -> tuple[bool, bool, int]:

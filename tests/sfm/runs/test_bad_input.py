@@ -229,6 +229,17 @@ def test_a_folder_of_copies_is_no_group(small_set, stcal_sfm):
 
 
 @pytest.mark.usefixtures("no_page")
+def test_a_photograph_in_two_groups_is_in_none(small_set, stcal_sfm):
+    small = small_set("12", "14")
+    shutil.copy(small.image(3, "12"), small.images / "14" / "IMG_0999.jpg")
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    for name in ("12/IMG_1003.jpg", "14/IMG_0999.jpg"):
+        assert f"skipped {name}: the same photograph is in groups 12 and 14, and belongs to one" in " ".join(
+            out.split()
+        )
+
+
+@pytest.mark.usefixtures("no_page")
 def test_a_group_of_which_nothing_is_left(small_set, stcal_sfm):
     small = small_set("12", "14")
     for i in range(4):
