@@ -201,16 +201,17 @@ def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
         slope = np.stack([window.sampled(part, xy) for part in gradient], axis=2)
         weight = window.weight(xy, gradient[0].shape)
-        normal = np.einsum("nki,nk,nkj->nij", slope, weight, slope) + NOISE * np.eye(2)
-        right = np.einsum("nki,nk,nk->ni", slope, weight, np.einsum("nki,ki->nk", slope, window.offsets))
-        move = np.linalg.solve(normal, right[..., None])[..., 0]
-        beside = np.einsum("nki,nki->nk", slope, window.offsets - move[:, None])
+        weighted = np.swapaxes(slope * weight[..., None], 1, 2)
+        normal = weighted @ slope + NOISE * np.eye(2)
+        right = weighted @ (slope * window.offsets).sum(2)[..., None]
+        move = np.linalg.solve(normal, right)[..., 0]
+        beside = (slope * (window.offsets - move[:, None])).sum(2)
         strength = np.maximum((weight[..., None] * slope**2).sum((1, 2)), NOISE)
         wide = (weight * beside**2).sum(1) > (WIDEST_EDGE * window.half) ** 2 * strength
         pull = slope * (weight * beside)[..., None]
         pull = (pull + pull[:, ::-1]) / 2  # zero where the image is symmetric: blur alone moves no corner
         inverse = np.linalg.inv(normal)
-        covariance = ALIKE_PX2 * inverse @ np.einsum("nki,nkj->nij", pull, pull) @ inverse
+        covariance = ALIKE_PX2 * inverse @ (np.swapaxes(pull, 1, 2) @ pull) @ inverse
         good = window.whole(weight) & ~wide
         return move, np.where(good[:, None, None], covariance, np.nan)
 
@@ -229,9 +230,9 @@ def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> _Corners:
         x, y = window.offsets.T
         design = np.column_stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2])
         level = window.sampled(grey, xy)
-        normal = np.einsum("ki,nk,kj->nij", design, weight, design) + NOISE * np.eye(6)
-        inverse = np.linalg.inv(normal)
-        value = (inverse @ np.einsum("ki,nk,nk->ni", design, weight, level)[..., None])[..., 0]
+        products = (design[:, :, None] * design[:, None]).reshape(len(x), -1)
+        inverse = np.linalg.inv((weight @ products).reshape(-1, 6, 6) + NOISE * np.eye(6))
+        value = (inverse @ ((weight * level) @ design)[..., None])[..., 0]
         bend = value[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
         determinant = bend[:, 0, 0] * bend[:, 1, 1] - bend[:, 0, 1] ** 2
         is_saddle = (determinant < 0) & window.whole(weight)

@@ -253,12 +253,11 @@ def _place(image: ImageCorners) -> np.ndarray:
 def _variances(images, linear: _Linear, covariance: np.ndarray, noise: _Noise) -> _Noise:
     """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
     squared_sum, redundancy, taken_by_poses, blocks = 0.0, np.zeros(2), 0.0, linear.blocks
+    inverse = linear.poses.inverse
     for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
         unknowns_of_tags = _place(image).ravel()
         by_corners = linear.poses.from_kept[i][:, unknowns_of_tags]
-        of_pose = (
-            linear.poses.inverse[i] + by_corners @ covariance[np.ix_(unknowns_of_tags, unknowns_of_tags)] @ by_corners.T
-        )
+        of_pose = inverse[i] + by_corners @ covariance[np.ix_(unknowns_of_tags, unknowns_of_tags)] @ by_corners.T
         board = block[0]
         by_board = np.einsum("p,pij,pik->jk", board.weight, board.by_pose, board.by_pose)
         taken_by_poses += float(np.trace(of_pose @ by_board))

@@ -88,7 +88,7 @@ class BoardShape:
 MAX_STEPS = 200
 EXACTLY = 1e-15
 """Largest relative decrease of χ² that is predicted for a step at convergence."""
-SETTLED_PX = 1e-6
+SETTLED_PX = 1e-5
 """Largest move of a projection at convergence, px. Along a valley, χ² may decrease forever without a visible change."""
 TINY_PX = 1e-3
 """Focal length that stands for invalid parameters."""
@@ -298,7 +298,10 @@ def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
         a, c, e = (model.whiten(d) * root[..., None] for d in derivatives(state, setting, i))
         equations = equations_of_poses(model, a, c, e, normalised(model, state.cameras[k]) * root)
         place = np.concatenate([np.arange(p), p + setting.of_camera(k)])
-        full[np.ix_(place, place)] += equations.normal
+        if len(place) == size:
+            full += equations.normal  # an index of all rows takes as long as all else here
+        else:
+            full[np.ix_(place, place)] += equations.normal
         full_right[place] += equations.right
         block[instant] += equations.block
         block_right[instant] += equations.block_right
@@ -309,10 +312,7 @@ def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations of the kept unknowns, after elimination of the poses and then of each board's dots.
-
-    ``dots_left`` : redundancy of the observations of the dots.
-    """
+    """Normal equations of the kept unknowns, after elimination of the poses and then of each board's dots."""
 
     cost: float
     state: State
@@ -321,7 +321,6 @@ class Normal:
     right: np.ndarray
     boards: tuple[Reduction, ...]
     poses: tuple[Reduction, ...]
-    dots_left: float
 
     @classmethod
     def of(cls, state: State, setting: Setting) -> "Normal":
@@ -343,12 +342,16 @@ class Normal:
             right += full_right[p:] - dots.right
             boards.append(dots)
             poses.append(away)
-        covariance = np.linalg.inv(normal)
-        dots_left = sum(
+        return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses))
+
+    def dots_left(self) -> float:
+        """Returns the redundancy of the observations of the dots."""
+        covariance, setting = np.linalg.inv(self.normal), self.setting
+        left = (
             setting.shape[folder].redundancy(board, covariance, setting.sigma_mm)
-            for board, folder in zip(boards, state.boards(), strict=True)
+            for board, folder in zip(self.boards, self.state.boards(), strict=True)
         )
-        return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses), float(dots_left))
+        return float(sum(left))
 
     def with_flat_boards(self) -> dict[str, BoardShape]:
         """Returns the shapes of the boards, without bends if these are insignificant."""
