@@ -151,8 +151,8 @@ def outcome_report(outcome: Outcome) -> Document:
     turn, shift = result.rms()
     held_out = []
     if outcome.held_out is not None:
-        held_out = [f"held out ({_splits_text(outcome)}): {means_text(outcome.held_out.means())}"]
-        held_out += [f"held out, {text}" for text in _agreeing_text(outcome)]
+        held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
+        held_out += [f"held out, mean {text}" for text in _agreeing_text(outcome)]
     camera = adjusted(outcome)
     answer: list[Block] = [
         tiles(_tiles(outcome)),

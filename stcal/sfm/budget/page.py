@@ -1,5 +1,6 @@
 """The report of an uncertainty budget."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -38,6 +39,11 @@ def verdict_of(test: LengthTestPart) -> str:
         f"{word}: {test.beyond} of {count} lengths beyond U, where 1 in 22 is by chance; {largest}, which reaches "
         f"{test.limit:.2f} by chance in one of 22 tests of {count}"
     )
+
+
+def _in_order(label: str) -> list[tuple[int, str]]:
+    """Returns a sort key that takes the numbers in a label as numbers."""
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", label)]
 
 
 def _known(test: LengthTestPart) -> list[float]:
@@ -93,7 +99,10 @@ def budget_report(file: BudgetFile) -> Document:
         if e.position_mm is not None and e.position_xyz_um is not None
     ]
     rotations = [[face, *_with_u(e.rotation_vector_deg, e.rotation_xyz_mdeg, k)] for face, e in faces.items()]
-    points = [[label, *_with_u(e.position_mm, e.position_xyz_um, k)] for label, e in file.circles.items()]
+    points = [
+        [label, *_with_u(e.position_mm, e.position_xyz_um, k)]
+        for label, e in sorted(file.circles.items(), key=lambda row: _in_order(row[0]))
+    ]
     inputs = [
         [each.title, NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}", *_origin(each)]
         for each in file.sources

@@ -89,7 +89,7 @@ def test_the_text_has_the_transform_with_its_sigma(of_views):
         assert float(turn_sigma) == pytest.approx(math.degrees(of_log[k]), abs=1e-4)
     text = "\n".join(lines)
     assert f"pitch {25 * result.scale:.4f} ± {25 * result.sigma_scale:.4f} mm, stated 25 mm" in text
-    assert "held out (2 × 2 of 10 poses): rotation" in text
+    assert "held out (2 × 2 of 10 poses), mean: rotation" in text
     assert re.search(r"corner in the image +\S+ px +estimated", text)
 
 
