@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.align import best_rotations
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.least_squares import Minima, NormalEquations, PoseStack, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
@@ -163,8 +164,8 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
     h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
     if h[2, 2] < 0:
         h = -h
-    u, _, vt = np.linalg.svd(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
-    return Rigid(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, h[:, 2])
+    rotation, _ = best_rotations(np.column_stack([h[:, 0], h[:, 1], np.cross(h[:, 0], h[:, 1])]))
+    return Rigid(rotation, h[:, 2])
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:

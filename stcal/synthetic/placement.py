@@ -149,7 +149,7 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
     points = np.vstack([shape.body, target_from_board @ shape.outline_board])
     aim = (points.min(0) + points.max(0)) / 2
     views = _Views(
-        _look_along(-direction, shape.axes[1], roll),
+        look_along(-direction, shape.axes[1], roll),
         aim + direction * (distance_mm * rng.uniform(0.9, 1.1, n))[:, None],
     )
     free = np.array([camera.width, camera.height]) / camera.focal / 2 - IMAGE_MARGIN * camera.width / camera.focal
@@ -163,11 +163,13 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
         towards_middle = np.column_stack([(low + high) / 2 - offset, np.ones(n)])
         forward = np.einsum("nji,nj->ni", views.rotations, towards_middle)
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        views = _Views(_look_along(forward, shape.axes[1], roll), views.centres)
+        views = _Views(look_along(forward, shape.axes[1], roll), views.centres)
     return views
 
 
-def _look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.ndarray:
+def look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Returns camera_from_target, (n, 3, 3), of cameras whose axes point along ``forward`` (n, 3), with the direction
+    ``up`` (3,) upwards in the image, then rolled by ``roll`` (n,) rad."""
     x = np.cross(forward, up)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     y = np.cross(forward, x)

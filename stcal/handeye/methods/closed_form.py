@@ -9,6 +9,7 @@ from scipy.optimize import minimize, nnls
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.align import best_rotations
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import Loop, Motions
 from stcal.io.device import quiet_opencv
@@ -116,7 +117,7 @@ def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarr
     u, _, vt = np.linalg.svd(k[subsets].sum(1))
     z, x = u[:, :, 0].reshape(-1, 3, 3), vt[:, 0].reshape(-1, 3, 3)
     sign = np.sign(np.linalg.det(x))[:, None, None]
-    x, z = _nearest_rotation(sign * x), _nearest_rotation(sign * z)
+    x, z = best_rotations(sign * x)[0], best_rotations(sign * z)[0]
     t_x, t_z, scale = _translations(loop, subsets, x, with_scale)
     return x, t_x, z, t_z, scale
 
@@ -150,13 +151,6 @@ def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
     at = np.einsum("mab,smb->sma", hand.rotation, board)
     return np.arccos(np.clip(cosine, -1, 1)), np.linalg.norm(at + hand.translation - t_z[:, None], axis=2)
-
-
-def _nearest_rotation(m: np.ndarray) -> np.ndarray:
-    """Returns the rotations nearest to matrices (s, 3, 3)."""
-    u, _, vt = np.linalg.svd(m)
-    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-    return u @ vt
 
 
 def mean_pose(chain: Poses) -> Rigid:

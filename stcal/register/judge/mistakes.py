@@ -277,8 +277,7 @@ def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
 
 def _turn(transform: Transform) -> np.ndarray:
     """Returns the rotation next to the linear part of a transform."""
-    u, _, vt = np.linalg.svd(parts(transform)[0])
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    return best_rotations(parts(transform)[0])[0]
 
 
 def order_note(change: Change, name: Callable[[int], str]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.geometry.align import align_rigid
+from stcal.geometry.align import align_rigid, best_rotations
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
@@ -184,8 +184,7 @@ def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit 
         seen = base.inverse() @ data.poses()
         turns = np.swapaxes(flange.rotation, 1, 2) @ seen.rotation
         for k, name in enumerate(names):
-            u, _, vt = np.linalg.svd(turns[rows == k].sum(0))
-            rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+            rotation, _ = best_rotations(turns[rows == k].sum(0))
             tools = tools | {name: Rigid(rotation, tools[name].translation)}
     tools = {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}
     placed = replace(robot, world_from_base=base)

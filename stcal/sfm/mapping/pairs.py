@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError
+from stcal.geometry.align import best_rotations
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
@@ -174,8 +175,7 @@ def _is_rotation(xy_a: np.ndarray, xy_b: np.ndarray, camera: Camera) -> bool:
     rays_b = np.column_stack([xy_b, np.ones(len(xy_b))])
     rays_a /= np.linalg.norm(rays_a, axis=1)[:, None]
     rays_b /= np.linalg.norm(rays_b, axis=1)[:, None]
-    u, _, vt = np.linalg.svd(rays_b.T @ rays_a)
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    rotation, _ = best_rotations(rays_b.T @ rays_a)
     error = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1)
     return bool(np.sqrt((error**2).mean()) * camera.focal.max() < RANSAC_PX)
 

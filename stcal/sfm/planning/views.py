@@ -13,6 +13,7 @@ from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.forecast import CentreNoise, Setup
 from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
+from stcal.synthetic.placement import look_along
 from stcal.synthetic.scene import Group, Scene
 
 REACH_DEG = 50.0
@@ -93,13 +94,8 @@ def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
 
 def looking_at(centre: np.ndarray, direction: np.ndarray, up: np.ndarray, distance_mm: float, roll: float) -> Rigid:
     """Returns camera_from_target of a camera that looks at the centre from a direction (3,), rolled by rad."""
-    forward = -direction
-    x = np.cross(forward, up)
-    x /= np.linalg.norm(x)
-    y = np.cross(forward, x)
-    c, s = np.cos(roll), np.sin(roll)
-    rotation = np.array([c * x + s * y, c * y - s * x, forward])
-    return Rigid(rotation, -rotation @ (centre - distance_mm * forward))
+    rotation = look_along(-direction[None], up, np.array([-roll]))[0]
+    return Rigid(rotation, -rotation @ (centre + distance_mm * direction))
 
 
 def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
