@@ -432,7 +432,7 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
     ):
         notes.append(
             "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured "
-            "both, U is too large: state one_thermometer = true at the top of the statement"
+            "both (one_thermometer of the statement), U is too large"
         )
     notes += verified.said()
     notes.append(
