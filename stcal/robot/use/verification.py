@@ -281,7 +281,7 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
     good = np.setdiff1d(np.arange(len(names)), wrong)
     if not len(wrong) or len(wrong) > MOST_ELSEWHERE * len(names) or missed[np.ix_(good, good)].max() > MISSES_MM:
         return ""
-    listed = _few([names[i] for i in wrong])
+    listed = _few([name for i, name in enumerate(names) if i in wrong])
     if len(wrong) == 2:
         exchanged = measured.copy()
         exchanged[wrong] = measured[wrong[::-1]]
