@@ -79,8 +79,8 @@ def convert(
         if tool is not None and max(*map(abs, tool.translation.tolist()), tool.angle_rad()) > 1e-6:
             at = ", ".join(f"{value:.4g}" for value in tool.translation)
             say(
-                f"note: {urdf.to_link} is [tool] of the robot file, at {at} mm and turned by "
-                f"{math.degrees(tool.angle_rad()):.4g}° in the frame of the last row, which is not {urdf.to_link}"
+                f"note: {urdf.to_link} is not the frame of the last row but [tool] of the robot file: {at} mm from it, "
+                f"turned by {math.degrees(tool.angle_rad()):.4g}°"
             )
         write(out, robot_toml(urdf.robot, [f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."]))
         require_robot_written(out, urdf.robot)

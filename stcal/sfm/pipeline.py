@@ -40,7 +40,7 @@ from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
-from stcal.sfm.data.as_drawn import misnamed_groups, not_as_drawn
+from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, seen_by
@@ -266,7 +266,8 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
         result = _solved(task, detection, labelled, model)
         printed = target.with_faces(printed=True).faces
         absent = [face for face in printed if face.id not in result.target.target_from_face]
-        result = replace(result, notes=(*result.notes, *tags_of_no_face(task.files[0], printed, absent)))
+        strange = [f"{NOT_AS_DRAWN}{note}" for note in tags_of_no_face(task.files[0], printed, absent)]
+        result = replace(result, notes=(*result.notes, *strange))
         left_out.update(unadjusted(result))
     return result
 

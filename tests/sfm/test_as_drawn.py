@@ -61,6 +61,9 @@ def seen(group: str, *faces: str) -> list[ImageObservations]:
 def test_groups_that_show_other_faces_than_their_names_say():
     target = reference_target()
     assert misnamed_groups([*seen("12", "1", "2"), *seen("left", "3", "4"), *seen("14", "1")], target) == []
+    aside = [*seen("12", "1", "3"), *seen("12", "1", "3"), *seen("12", "2")[:1]]  # face 2 is in sight once
+    assert len(misnamed_groups(aside, target)) == 1
+    assert misnamed_groups([*seen("12", "1", "2", "3"), *seen("12", "1", "3")], target) == []
     [note] = misnamed_groups([*seen("12", "1", "3"), *seen("14", "1", "4")], target)
     assert note.startswith("not as drawn: group 12 is named after faces 1 and 2 and shows faces 1 and 3: correct")
 

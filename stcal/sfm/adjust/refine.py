@@ -53,7 +53,8 @@ def adjust(model: M, camera: Camera) -> M:
         settled=EXACTLY,
         max_steps=MAX_STEPS,
     )
-    return minimum.required(f"group {model.group}: bundle adjustment", "check the camera file").state
+    remedy = "check the camera file, and the sizes of printed faces in target.toml"
+    return minimum.required(f"group {model.group}: bundle adjustment", remedy).state
 
 
 def _cost(model: GroupModel, camera: Camera) -> float:

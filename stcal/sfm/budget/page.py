@@ -128,7 +128,7 @@ def budget_report(file: BudgetFile) -> Document:
                 [
                     tiles(_headline(file)),
                     *([_what_u_is(file)] if faces else []),
-                    Notes([*([_no_certificate(file)] if _unstated(file) and _is_valid(file) else []), *file.notes]),
+                    Notes([*([] if certifies(file) or not _is_valid(file) else [_no_certificate(file)]), *file.notes]),
                     *([Printed([f"May the run be used? {file.use}"])] if file.use else []),
                     *([file.holds] if file.holds and file.size_known else []),
                     Table(_heads("position of face", "mm", "µm"), positions),
@@ -147,7 +147,7 @@ def budget_report(file: BudgetFile) -> Document:
                 [
                     page_only(
                         "Type A: by statistics of this run; type B: by other knowledge. What is stated comes from the "
-                        "user, what is estimated from this run; what is not stated is taken as exact"
+                        "user's files, what is estimated from this run; what is not stated is taken as exact"
                     ),
                     Table(["<input", "standard uncertainty", "<type", "<σ is", "<from"], inputs, css="text"),
                     *([subheading("Stated sizes and temperatures")] if stated else []),
@@ -208,7 +208,12 @@ def budget_report(file: BudgetFile) -> Document:
 
 def certifies(file: BudgetFile) -> bool:
     """Returns whether the page is a certificate: the run may be used, inputs and required fields are stated."""
-    return _is_valid(file) and not _unstated(file)
+    return _is_valid(file) and not _unstated(file) and not _is_reserved(file)
+
+
+def _is_reserved(file: BudgetFile) -> bool:
+    """Returns whether the run's own answer has a reservation, which no certificate can have."""
+    return file.use.startswith("With care")
 
 
 def _is_valid(file: BudgetFile) -> bool:
@@ -223,6 +228,8 @@ def _unstated(file: BudgetFile) -> list[str]:
 
 
 def _no_certificate(file: BudgetFile) -> str:
+    if _is_reserved(file):
+        return "this is not a certificate: the run says that it is to be used with care; clear that up, and run again"
     unstated = _unstated(file)
     camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""
     return f"this is not a certificate: nothing is stated of {', '.join(unstated)}; state it with --statement{camera}"
@@ -230,7 +237,7 @@ def _no_certificate(file: BudgetFile) -> str:
 
 def _tone(file: BudgetFile) -> str:
     """Returns the tone of the run's own answer."""
-    return "failed" if not file.usable else "care" if file.use.startswith("With care") else "passed"
+    return "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
 
 
 def as_exact(value: float, expanded: float) -> str:
@@ -364,6 +371,11 @@ def _slope(of: Uncertainty, source: SourceRow) -> float:
     return of.sensitivities[source.key] if share > NEGLIGIBLE else 0.0
 
 
+def _measurand_names(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[str]:
+    rotations = [any(u is face.rotation_mdeg for face in file.faces.values()) for _, u in measurands]
+    return [name + ", rotation" * turned for (name, _), turned in zip(measurands, rotations, strict=True)]
+
+
 def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[Block]:
     """Returns a figure with stacked shares of the variances, and its legend."""
     shares = {
@@ -377,13 +389,13 @@ def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list
         height = 0.6 + 0.24 * len(measurands)
         figure = new_figure(9.0, height)
         axes = figure.subplots()
-        figure.subplots_adjust(top=1 - 0.05 / height, bottom=0.5 / height)
+        names = _measurand_names(file, measurands)
+        left = min(0.4 + 0.075 * max(map(len, names)), 4.0) / 9.0  # as wide as the longest name
+        figure.subplots_adjust(left=max(left, 0.125), top=1 - 0.05 / height, bottom=0.5 / height)
         so_far, place = np.zeros(len(measurands)), np.arange(len(measurands))[::-1]
         for row in drawn:
             axes.barh(place, 100 * shares[row.key], left=100 * so_far, height=0.7, color=colours[row.key])
             so_far += shares[row.key]
-        rotations = [any(u is face.rotation_mdeg for face in file.faces.values()) for _, u in measurands]
-        names = [name + ", rotation" * turned for (name, _), turned in zip(measurands, rotations, strict=True)]
         axes.set_yticks(place, names)
         axes.set_xlim(0, 100)
         calm(axes, "share of the variance, %")

@@ -1,7 +1,7 @@
 """Check of the sources of the scale against one another: printed faces, known distances and the board."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,7 +73,12 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
                 trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
     if not trials:
         return impossible(key, title, "only one source of the scale", "state a known distance with scale")
-    return judge(key, title, trials, "sources of the scale", remedy)
+    check = judge(key, title, trials, "sources of the scale", remedy)
+    if check.names and (alone := _alone(networks, board)):
+        name, times = alone
+        size = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
+        return replace(check, reason=f"{size}; {check.reason}", names=(name,), remedy=f"correct the size of {name}")
+    return check
 
 
 def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float] | None:

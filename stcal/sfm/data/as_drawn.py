@@ -19,8 +19,9 @@ MOST_TURNED_DEG = 25.0
 body, or drawn turned, is off by far more."""
 LIKE_DRAWN = 1.3
 """Largest factor between distances of faces and those of their rough poses."""
-SHOWN = 2
-"""Number of images that must show a face before its group counts as one of it."""
+SHOWN, RARELY = 2, 3
+"""Number of images that must show a face before its group counts as one of it, and how many times as many must show it
+as a face that the group is named after."""
 
 
 def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign) -> list[str]:
@@ -83,9 +84,10 @@ def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDes
     for group, images in by_group(observations).items():
         named = faces_in_name(group, ids)
         seen = Counter(face for image in images for face in image.face_ids())
-        shown = [face for face, count in seen.items() if count >= SHOWN]
-        lacking, others = named - seen.keys(), [face for face in shown if face not in named]
-        if named and lacking and others:
+        others = [face for face, count in seen.items() if count >= SHOWN and face not in named]
+        most = max((seen[face] for face in others), default=0)
+        if named and most and any(RARELY * seen[face] < most for face in named):
+            shown = [face for face, _ in seen.most_common(len(named))]
             notes.append(
                 f"{NOT_AS_DRAWN}group {group} is named after {_faces(sorted(named))} and shows {_faces(shown)}: "
                 "correct the names of faces in target.toml, or of folders"

@@ -193,7 +193,7 @@ def left_out(
         if image.name not in model.images:
             known = len(set(image.labels) & set(model.labels))
             reasons[image.name] = (
-                f"{known} of its circles are in the model, {MIN_POINTS} needed; {remedy}"
+                f"{known} of its circles or corners are in the model, {MIN_POINTS} needed; {remedy}"
                 if known < MIN_POINTS
                 else f"fewer than {MIN_POINTS} of its {known} circles fit the model to {MAX_REPROJECTION_PX:g} px; "
                 "check that it is sharp, and that nothing but the camera moved"

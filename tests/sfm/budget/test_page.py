@@ -87,6 +87,8 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
         assert re.search(
             f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page
         )
+    care = full.model_copy(update={"use": "With care: 1 of 19 checks is suspicious."})
+    assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()
     page = budget_report(full).page()
     assert "<h1>Certificate of calibration and uncertainty budget: " in page
     assert "not a certificate" not in page

@@ -48,7 +48,7 @@ def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
     result = calibrate(folder, small.out)
     reasons = {name: why for s in result.solutions for name, why in s.left_out.items()}
     assert list(reasons) == ["12/black.png"]
-    assert "0 of its circles are in the model, 6 needed" in reasons["12/black.png"]
+    assert "0 of its circles or corners are in the model, 6 needed" in reasons["12/black.png"]
 
 
 @pytest.mark.slow
