@@ -254,8 +254,10 @@ def _with_u(values: Sequence[float], sigma: Sequence[float], k: float) -> list[s
 
 def title_of(file: BudgetFile) -> str:
     """Returns the title, which calls the page a certificate only if it is one."""
-    kind = "Certificate of calibration and uncertainty" if certifies(file) else "Uncertainty"
-    return f"{kind} budget: {file.run.target}"
+    if not certifies(file):
+        return f"Uncertainty budget: {file.run.target}"
+    number_of_it = file.fields["number"].strip()  # it stands on every page, which has the title at its foot
+    return f"Certificate of calibration and uncertainty budget: {file.run.target}, no. {number_of_it}"
 
 
 def _what_u_is(file: BudgetFile) -> str:
