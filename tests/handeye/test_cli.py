@@ -444,7 +444,7 @@ def test_errors_of_the_poses_that_agree_are_told_apart(command, tmp_path):
     code, shown, _ = command(source, "--out", out)
     errors = json.loads(out.read_text())["held_out"]
     assert code == 0
-    assert "held out, without the 1 left out above: rotation" in shown
+    assert "held out, mean without the 1 left out above: rotation" in shown
     assert errors["agreeing"]["translation_mm"] < 0.7 * errors["translation_mm"]
 
 
