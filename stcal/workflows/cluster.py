@@ -153,7 +153,9 @@ class _Workers(Executor):
                 if inner.status == "error" and not type(error).__module__.startswith("distributed"):
                     answer.set_exception(error)
                 else:
-                    why = "the connection to the scheduler was lost" if inner.status == "cancelled" else error
+                    # A scheduler that ends cancels the jobs, or resets the connection while a result is on its way.
+                    lost = inner.status == "cancelled" or isinstance(error, OSError)
+                    why = "the connection to the scheduler was lost" if lost else error
                     answer.set_exception(BrokenExecutor(f"the cluster gave a job up: {why}"))
             else:
                 answer.set_result(result)
