@@ -147,9 +147,9 @@ def displacement_variance(*parts: Displacement) -> SamplingVariance:
     )
     known = np.isfinite(square) & (lines > 0)
     square, noise, lines, share = square[known], noise[known], lines[known], passed[known] ** 2
-    certainty = lines * share**2 * (noise + share * PRIOR_PX**2) ** -2
+    weight = lines * share * (noise + share * PRIOR_PX**2) ** -2  # a wide blur passes nothing: 0, not 0 over 0
     prior = PRIOR_LINES * PRIOR_PX**-4
-    of_area = (float((certainty * square / share).sum()) + prior * PRIOR_PX**2) / (float(certainty.sum()) + prior)
+    of_area = (float((weight * square).sum()) + prior * PRIOR_PX**2) / (float((weight * share).sum()) + prior)
     of_area = max(of_area, 0.0)
     certainty = lines * (1 - share) ** 2 * (noise + PRIOR_PX**2) ** -2
     of_points = float((certainty * (square - of_area * share)).sum())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from stcal.boards.area import PRIOR_PX, OuterLines, displacement_variance, told_by_lines
+from stcal.boards.area import PRIOR_PX, Displacement, OuterLines, displacement_variance, told_by_lines
 
 CELLS, WIDTH_PX, BLUR_PX, DARK, RISE, NOISE = 8, 14.3, 0.6, 30.0, 180.0, 0.7
 AT_PX = 20.4
@@ -44,6 +44,14 @@ def told(displaced_px: float, seed: int) -> float:
         np.broadcast_to([1.0, 0.0], (1, 4, 2)),
     )
     return displacement_variance(told_by_lines(grey, outer, CELLS)).of_area
+
+
+def test_a_blur_that_passes_nothing_tells_nothing():
+    """The share of a turned edge underflows to 0: nothing is known of areas beyond the prior, and no σ is lost."""
+    one = np.ones(2)
+    found = displacement_variance(Displacement(1e-6 * one, 1e-6 * one, 4 * one, 0 * one))
+    assert found.of_area == pytest.approx(PRIOR_PX**2)
+    assert found.of(np.zeros(1)) == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -13,6 +13,7 @@ from stcal.geometry.align import align_rigid, best_rotations
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
+from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
 from stcal.robot.kinematics.dh import FITS, require_convention, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
@@ -46,8 +47,6 @@ MOST_JOINTS = 8
 """Largest number of joints of which two or three at a time are tried; their number grows with the third power."""
 LEAST_ORIENTATIONS = 5
 """Number of rows from which on orientations that do not fit are refused: of fewer, chance explains many."""
-UNITS = {"metres": ("m", 1e3), "centimetres": ("cm", 10.0), "inches": ("in", 25.4), "micrometres": ("um", 1e-3)}
-"""Units that are mistaken for mm: endings of columns, and mm of one."""
 PROBED, MOST_MOVES = 8, 4
 """Number of rows by which the place of an instrument is found again, and largest number of times that it moves."""
 AROUND = 0.1
@@ -468,9 +467,9 @@ def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Mea
     yield "joint values are radians in columns of degrees; call the columns q1_rad …", robot, replace(data, q=q * angle)
     yield "joint values are degrees in columns of radians; call the columns q1_deg …", robot, replace(data, q=q / angle)
     lengths = {"distances": data.distances, "positions": data.positions}
-    for unit, (suffix, factor) in UNITS.items():
-        reason = f"lengths are {unit} in columns of mm; call the columns x_{suffix} … or distance_{suffix}"
-        scaled = {name: factor * values for name, values in lengths.items() if values is not None}
+    for unit, words in UNIT_WORDS.items():
+        reason = f"lengths are {words} in columns of mm; call the columns x_{unit} … or distance_{unit}"
+        scaled = {name: LENGTHS[unit] * values for name, values in lengths.items() if values is not None}
         yield reason, robot, replace(data, **scaled)
     reason = "all joint values had the opposite sign; check the rows and the joints' directions"
     yield reason, robot, replace(data, q=np.where(turning, -q, q))

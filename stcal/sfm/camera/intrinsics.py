@@ -469,8 +469,8 @@ def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board:
 def _updated_factors(last: Normal, factors: SigmaFactors) -> SigmaFactors:
     """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy."""
     state, setting = last.state, last.setting
-    image_redundancy = state.redundancy(setting.kept) - last.dots_left()
-    dots = factors.dots
-    if last.dots_left() > MIN_BOARD_REDUNDANCY:
-        dots = max(LEAST_DOTS, dots * sigma_factor(dots_costs(state, setting)[0], last.dots_left()))
+    dots_left, dots = last.dots_left(), factors.dots
+    image_redundancy = state.redundancy(setting.kept) - dots_left
+    if dots_left > MIN_BOARD_REDUNDANCY:
+        dots = max(LEAST_DOTS, dots * sigma_factor(dots_costs(state, setting)[0], dots_left))
     return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots)
