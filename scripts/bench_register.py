@@ -23,9 +23,9 @@ import numpy as np
 from stcal.io.files import json_text
 from stcal.parallel import ONE_THREAD
 from stcal.register import register
-from stcal.register.core.pairs import read_pairs
-from stcal.register.report.file import RegistrationFile
-from stcal.register.report.page import registration_report
+from stcal.register.file import RegistrationFile
+from stcal.register.page import registration_report
+from stcal.register.pairs import read_pairs
 from stcal.register.workspace import findings
 from tests.support.point_pairs import make_scene
 

@@ -67,8 +67,7 @@ def timed_advice() -> float:
     from stcal.sfm.adjust.chain import CalibratedTarget
     from stcal.sfm.adjust.joint import covariance_of
     from stcal.sfm.planning.advise import Known, advise
-    from stcal.sfm.planning.forecast import CentreNoise, Setup
-    from stcal.sfm.planning.nominal import observe, true_models
+    from stcal.sfm.planning.forecast import CentreNoise, Setup, observe, true_models
     from stcal.sfm.planning.views import known_scene
     from stcal.synthetic.scene import SceneOptions, make_scene
 

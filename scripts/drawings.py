@@ -19,12 +19,12 @@ import matplotlib as mpl
 import numpy as np
 
 from stcal.design import reference_board, reference_target
-from stcal.geometry.conic import circle_image_offset, circle_images
+from stcal.geometry.plane import circle_image_offset, circle_images
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.report.figure import COLOURS, FAINT, INK, calm, new_figure
+from stcal.report.svg import COLOURS, FAINT, INK, calm, new_figure
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 

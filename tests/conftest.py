@@ -30,7 +30,7 @@ from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import ImageObservations, WorldModel
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.shared import Once, without_rights
 

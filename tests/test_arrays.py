@@ -12,8 +12,8 @@ from stcal import handeye, robot, sfm
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.io.images import decode
-from stcal.io.photographs.memory import files_of_arrays
 from stcal.robot.kinematics.model import mh80
+from stcal.sfm.detect.files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
 from tests.outcome import fails_with
 

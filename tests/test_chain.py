@@ -17,7 +17,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
-from stcal.locate.data.layout import layout_toml
+from stcal.locate.layout import layout_toml
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import mh80

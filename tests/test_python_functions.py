@@ -22,7 +22,7 @@ import stcal
 from stcal import handeye, locate, register, robot, synthetic
 from stcal.cli.main import app
 from stcal.io.files import json_text
-from stcal.locate.data.layout import layout_toml
+from stcal.locate.layout import layout_toml
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors
 from stcal.robot.use.report import evaluation_file

@@ -28,7 +28,7 @@ from stcal.handeye.data.pairs import Loop, Motions
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.solve import UNIT_MM, handeye
 from stcal.parallel import one_thread
-from stcal.report.figure import save
+from stcal.report.svg import save
 from stcal.workflows.cluster import executor_of
 from tests.support.handeye import Truth, simulated_views
 

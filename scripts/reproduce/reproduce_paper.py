@@ -20,11 +20,10 @@ import matplotlib as mpl
 import numpy as np
 
 from stcal.errors import StcalError
-from stcal.geometry.align import align_rigid
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.labels import dot_cells
 from stcal.parallel import one_thread
-from stcal.report.figure import save
+from stcal.report.svg import save
 from stcal.sfm import run
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.runs.options import RunOptions

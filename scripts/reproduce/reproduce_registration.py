@@ -27,9 +27,9 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.register import register
-from stcal.register.core.liu2017 import Liu2017Options, affine_least_squares, liu2017
+from stcal.register.liu2017 import Liu2017Options, affine_least_squares, liu2017
 from stcal.register.workspace import residual_field
-from stcal.report.figure import save
+from stcal.report.svg import save
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import InverseProblem, solve

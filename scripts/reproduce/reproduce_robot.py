@@ -22,7 +22,7 @@ import numpy as np
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
-from stcal.report.figure import save
+from stcal.report.svg import save
 from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.identification.adjustment import jacobian as jacobian_of
 from stcal.robot.identification.adjustment import observed, residuals

@@ -23,9 +23,8 @@ import numpy as np
 from scipy.stats import norm
 
 from stcal.design import StatedSize, reference_board
-from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Rigid, Similarity, align_rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel
 from stcal.parallel import one_thread
@@ -37,7 +36,7 @@ from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
 from stcal.sfm.budget.combine import Budget, budget
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from stcal.boards.file import load_flat_board
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.model import CameraModel, camera_from_colmap
 from stcal.io.cameras.read import read_camera

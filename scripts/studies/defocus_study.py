@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_images
+from stcal.geometry.plane import circle_images
 from stcal.labels import DotLabel
 from stcal.report.text import text_table
 from stcal.sfm.data.model import Centres, ImageObservations
@@ -25,8 +25,7 @@ from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.centres import measure_centres
 from stcal.sfm.detect.defocus import FAR_BLUR, RESPONSE, RESPONSE_OF_BLUR2, correct_defocus
-from stcal.synthetic.observe import ImageCircles, image_circles
-from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.synthetic.scene import ImageCircles, SceneOptions, image_circles, make_scene
 
 FOCAL_PX, DEPTH_MM, FOCUS_MM, EDGE_PX = 1743.0, 1000.0, 1150.0, 0.55
 MIDDLE_MM, AZIMUTH = np.array([30.0, 20.0]), np.radians(30.0)

@@ -710,7 +710,7 @@ def summary(rows: list[dict]) -> str:
 
 def picture(rows: list[dict], before: list[dict], path: Path) -> None:
     """Recall, the least of circles and dots in all sets, by kind and strength; before beside after."""
-    from stcal.report.figure import INK, SMALL, new_figure, save
+    from stcal.report.svg import INK, SMALL, new_figure, save
 
     panels = [("before", before), ("after", rows)] if before else [("", rows)]
     kinds = [kind for kind in KINDS if any(r["kind"] == kind.name for r in rows)]

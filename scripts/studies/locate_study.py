@@ -30,14 +30,14 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
 from stcal.locate.calibration import CalibrationImages
-from stcal.locate.data.exposures import find_scenes
-from stcal.locate.data.layout import LayoutPlan, TargetLayout
+from stcal.locate.estimate import locate, merge
+from stcal.locate.exposures import find_scenes
+from stcal.locate.layout import LayoutPlan, TargetLayout
+from stcal.locate.patent import PatentOptions
 from stcal.locate.pipeline import LocateOptions, locate_image, run
-from stcal.locate.pose.estimate import locate, merge
-from stcal.locate.pose.patent import PatentOptions
-from stcal.locate.pose.verdict import VerdictOptions, judge
+from stcal.locate.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread
-from stcal.synthetic.exposure import Light, expose
+from stcal.synthetic.optics import Light, expose
 from stcal.workflows.board_views import calibration_images
 from tests.support.areas import homography, rendered, squares_nees, warped
 from tests.support.holdout import PoseTrial, half_calibrated, subset_trials

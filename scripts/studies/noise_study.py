@@ -20,10 +20,10 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
-from stcal.report.figure import save
+from stcal.report.svg import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

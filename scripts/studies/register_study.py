@@ -28,12 +28,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
 from stcal.errors import DegenerateError
-from stcal.geometry.align import align_rigid
-from stcal.geometry.rigid import Affine, Rigid, Similarity, skew
+from stcal.geometry.rigid import Affine, Rigid, Similarity, align_rigid, skew
 from stcal.parallel import one_thread
 from stcal.register import Liu2017Options, Registration, register
-from stcal.register.core.liu2017 import affine_least_squares
-from stcal.register.core.models import parts
+from stcal.register.liu2017 import affine_least_squares
+from stcal.register.models import parts
 from tests.support.point_pairs import CENTRE_MM, SIGMA_MM, cube, make_scene, parameter_error
 
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)

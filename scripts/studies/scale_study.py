@@ -17,16 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from stcal.parallel import one_thread
-from stcal.sfm.adjust.calibration import Calibration, calibrate
-from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import solve_groups
-from stcal.synthetic.observe import image_circles
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.synthetic.scene import Scene, SceneOptions, image_circles, make_scene
 from tests.support.circle_images import simulate_centres
 
 NOISE_PX = 0.02

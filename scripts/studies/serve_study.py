@@ -32,9 +32,9 @@ import cv2
 import numpy as np
 
 from stcal.io.files import json_text
+from stcal.sfm.adjust.calibration import AdjustOptions
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.measurement.serve import CHUNK_BYTES, CONNECTIONS, HELD_BYTES
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -24,11 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry.align import align_rigid
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.parallel import one_thread
 from stcal.register import Registration, register
-from stcal.register.core.models import MODELS, jacobian
+from stcal.register.models import MODELS, jacobian
 from tests.support.point_pairs import cube, directions, make_scene, random_rigid
 
 KINDS = ("anywhere", "one half", "one axis", "turned")

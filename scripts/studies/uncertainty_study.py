@@ -19,7 +19,7 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

@@ -27,15 +27,14 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.labels import CircleLabel, DotLabel
 from stcal.parallel import one_thread
 from stcal.report.text import text_table
-from stcal.sfm.adjust.calibration import calibrate
-from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import Refined
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import MOST_SIGMAS, ranked
@@ -43,11 +42,10 @@ from stcal.sfm.data.model import ImageObservations, WorldModel
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import label_images
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.report.judgement import CAUSE
 from stcal.sfm.runs.solve import LIKELY, explained, refine_or_explain, wrong_file
-from stcal.synthetic.observe import image_circles
-from stcal.synthetic.scene import Group, Scene, SceneOptions, make_scene, second_design
+from stcal.synthetic.scene import Group, Scene, SceneOptions, image_circles, make_scene, second_design
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 from tests.support.photograph import read_set
 

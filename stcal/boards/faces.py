@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stcal.boards.charuco import find_charuco
-from stcal.boards.chessboard import find_chessboard, why_no_chessboard
+from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
 from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, other_dictionaries, view_of_tags

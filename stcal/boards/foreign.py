@@ -13,9 +13,8 @@ from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, Chessb
 from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
 from stcal.io.design import Count, Squares
-from stcal.io.plain_yaml import load_yaml
 from stcal.io.poses.rotations import of_quaternions
-from stcal.io.toml import Finite, Positive, Strict, validated
+from stcal.io.toml import Finite, Positive, Strict, load_yaml, validated
 from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM
 
 KEYS = ("tag_bundles", "standalone_tags")

@@ -69,7 +69,7 @@ def show(
 ) -> None:
     """Print a camera's parameters with σ, its field of view, and how far the lens moves points."""
     from stcal.report.camera import distortion_figure, shown
-    from stcal.report.figure import save
+    from stcal.report.svg import save
 
     camera = _lens(source, name, size).camera
     say("\n".join(shown(camera)))
@@ -89,7 +89,7 @@ def compare(
     """Compare two cameras: by how many pixels their images of a ray differ, after the rotation that fits best."""
     from stcal.io.cameras.difference import compare_cameras
     from stcal.report.camera import comparison_figure, comparison_text
-    from stcal.report.figure import save
+    from stcal.report.svg import save
 
     first_lens, second_lens = _lens(first, name, size, False), _lens(second, name, size, False)
     difference = compare_cameras(first_lens.lens, second_lens.lens)

@@ -30,7 +30,7 @@ def schedule(
     count: Annotated[int, "Print this many exposure times.", Arg(min=1, max=1000)],
 ) -> None:
     """Print exposure times in a geometric series."""
-    from stcal.locate.data.exposures import exposure_times
+    from stcal.locate.exposures import exposure_times
 
     for time in exposure_times(shortest, longest, count):
         say(f"{time:.6g}")
@@ -54,7 +54,7 @@ def capture(
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
     from stcal.io.device import OpenCVSource, SimulatedSource
-    from stcal.locate.data.exposures import capture, exposure_times, scene_folder
+    from stcal.locate.exposures import capture, exposure_times, scene_folder
 
     folder = scene_folder(out, scene)
     exposures = exposure_times(shortest, longest, count)
@@ -91,8 +91,8 @@ def calibrate(
     from stcal.boards.file import load_flat_board
     from stcal.io.cameras.read import read_camera
     from stcal.locate.calibration import calibrate as calibrated
-    from stcal.locate.data.layout import layout_toml, load_plan, require_layout_written
-    from stcal.locate.report.page import calibrated_file, calibrated_text, warnings
+    from stcal.locate.layout import layout_toml, load_plan, require_layout_written
+    from stcal.locate.page import calibrated_file, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
@@ -169,14 +169,14 @@ def run(
     from stcal.geometry.rigid import Poses
     from stcal.io.cameras.read import read_camera
     from stcal.io.table import require_pose_table_written
-    from stcal.locate.data.exposures import find_scenes
-    from stcal.locate.data.layout import load_layout
+    from stcal.locate.chain import goal_chain, goals
+    from stcal.locate.exposures import find_scenes
+    from stcal.locate.layout import load_layout
+    from stcal.locate.page import LocatedFile, accepted, poses_csv, run_report, uncertain
+    from stcal.locate.patent import PatentOptions
     from stcal.locate.pipeline import LocateOptions
     from stcal.locate.pipeline import run as located
-    from stcal.locate.pose.patent import PatentOptions
-    from stcal.locate.pose.verdict import VerdictOptions
-    from stcal.locate.report.chain import goal_chain, goals
-    from stcal.locate.report.page import LocatedFile, accepted, poses_csv, run_report, uncertain
+    from stcal.locate.verdict import VerdictOptions
 
     chain = None
     if hand_eye or registration or robot_poses or offset:

@@ -271,7 +271,7 @@ def several_tables(
 
 def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, Path]]:
     """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
-    from stcal.io.poses.controllers import require_form
+    from stcal.io.poses.programs import require_form
 
     for word in words:
         form, _, path = word.partition("=")

@@ -65,10 +65,10 @@ def register(
 ) -> None:
     """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
-    from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
-    from stcal.register.core.pairs import read_pairs
-    from stcal.register.report.file import RegistrationFile, require_registration_written
-    from stcal.register.report.page import registration_report, sample_size_section
+    from stcal.register.file import RegistrationFile, require_registration_written
+    from stcal.register.liu2017 import Liu2017Options, sample_sizes
+    from stcal.register.page import registration_report, sample_size_section
+    from stcal.register.pairs import read_pairs
     from stcal.register.workspace import findings
 
     if identified and not robot_file:

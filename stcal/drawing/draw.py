@@ -13,8 +13,7 @@ from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.formats import dxf, pdf, svg
 from stcal.drawing.net import net_parts
-from stcal.drawing.parts import Part, board_parts, target_parts
-from stcal.drawing.shapes import said_mm
+from stcal.drawing.parts import Part, board_parts, said_mm, target_parts
 from stcal.drawing.sheets import MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments

@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from stcal.drawing.shapes import LAYERS, Area, Disc, Shape, Text
+from stcal.drawing.parts import LAYERS, Area, Disc, Shape, Text
 from stcal.drawing.sheets import Sheet
 from stcal.errors import InputError
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.drawing.parts import Part, as_seen, face_part
-from stcal.drawing.shapes import Area, Disc, Line, Shape, Text, words_with_room
+from stcal.drawing.parts import Area, Disc, Line, Part, Shape, Text, as_seen, face_part, words_with_room
 from stcal.errors import InputError
 from stcal.io.design import ROUGH_KEYS
 

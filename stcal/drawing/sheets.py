@@ -6,8 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from stcal.drawing.parts import Part
-from stcal.drawing.shapes import WIDTH_PER_HEIGHT, Disc, Line, Shape, Text, extent, moved, said_mm, words_with_room
+from stcal.drawing.parts import WIDTH_PER_HEIGHT, Disc, Line, Part, Shape, Text, extent, moved, said_mm, words_with_room
 from stcal.errors import InputError
 
 APART = 6.0

@@ -1,4 +1,7 @@
-"""Planes, homographies between them, and the two poses from which a camera may see one (Collins & Bartoli 2014)."""
+"""Planes, circles on them and their images, homographies, and the two poses from which a camera may see a plane.
+
+The two poses are those of Collins & Bartoli (2014). The centre of an ellipse is not the image of the circle's
+centre."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,11 +10,59 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.align import best_rotations
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.least_squares import Minima, NormalEquations, PoseStack, minimise, perturbed
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid, best_rotations, skew
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
+
+
+def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
+    """Return points whose ordinary projection is the centre of the ellipse that each circle projects to.
+
+    With centre C, unit normal n and radius r the ellipse centre is the projection of
+    ``C + (r²/C_z)(n_z·n − e_z)`` (from the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C];
+    Hartley & Zisserman, sec. 2.2 and 8.3). ``e_z`` is the optical axis.
+
+    Parameters
+    ----------
+    xyz_camera, normal_camera : (..., 3) arrays
+        Centre and unit normal (either sign), camera frame.
+    radius_mm : (...) array
+        In the unit of ``xyz_camera``.
+    """
+    c, n = np.asarray(xyz_camera, float), np.asarray(normal_camera, float)
+    shift = n[..., 2:] * n - np.array([0.0, 0.0, 1.0])
+    return c + (np.asarray(radius_mm, float) ** 2 / c[..., 2])[..., None] * shift
+
+
+def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`.
+
+    Parameters
+    ----------
+    xyz_camera : (n, 3) array
+        Centres, camera frame; the circles lie wholly in front of it.
+    axes_camera : (3, 2) array
+        Orthonormal directions in the plane, camera frame.
+    radius_mm : (n,) array
+        In the unit of ``xyz_camera``.
+
+    Returns
+    -------
+    centre : (n, 2) array, shape : (n, 2, 2) array
+        Normalised; the rim is ``centre + shape @ unit circle``, shape symmetric.
+    """
+    dual = radius_mm[:, None, None] ** 2 * (axes_camera @ axes_camera.T) - xyz_camera[:, :, None] * xyz_camera[:, None]
+    dual = -dual / dual[:, 2:, 2:]
+    centre = -dual[:, :2, 2]
+    return centre, shape_of_square(dual[:, :2, :2] + centre[:, :, None] * centre[:, None])
+
+
+def shape_of_square(square: np.ndarray) -> np.ndarray:
+    """Return the symmetric shapes S of ellipses, (..., 2, 2), from S·Sᵀ; negative eigenvalues count as zero."""
+    value, vector = np.linalg.eigh(square)
+    return (vector * np.sqrt(np.maximum(value, 0))[..., None, :]) @ np.swapaxes(vector, -1, -2)
+
 
 MAX_STEPS = 100
 EXACT = 1e-22

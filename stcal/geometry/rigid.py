@@ -1,4 +1,8 @@
-"""Rigid, similarity and affine transforms: ``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``."""
+"""Rigid, similarity and affine transforms, exact or with covariance, and their least-squares alignment to points.
+
+``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``. Covariances are those of rotation (rad) and
+translation (mm), left perturbation in the outer frame.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -8,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import MYPY, Array, Brief, freeze, frozen
@@ -429,3 +434,137 @@ class Affine(_ByValue):
         if isinstance(other, Affine):
             return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
         return np.asarray(other, float) @ self.linear.T + self.translation
+
+
+def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
+    """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
+
+    Parameters
+    ----------
+    xyz_a, xyz_b : (n, 3) arrays, n ≥ 3, not collinear
+    weights : (n,) array, optional
+        Not negative; the points of positive weight must not be collinear.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than three points, or collinear ones.
+    """
+    return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
+
+
+def align_similarity(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
+    """Return a_from_b with scale (Umeyama 1991); arguments and errors as :func:`align_rigid`."""
+    return _align(xyz_a, xyz_b, weights, with_scale=True)
+
+
+def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Affine:
+    """Return a_from_b with twelve parameters by linear least squares; arguments as :func:`align_rigid`.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than four points, or b's points are coplanar to rounding.
+    """
+    a, b, w = _checked(xyz_a, xyz_b, weights, 4)
+    mean_a, mean_b = w @ a, w @ b
+    root = np.sqrt(w)[:, None]
+    linear, _, _, s = np.linalg.lstsq(root * (b - mean_b), root * (a - mean_a), rcond=None)
+    if s[2] <= 1e-9 * s[0]:
+        raise DegenerateError(
+            "E-POINTS-COPLANAR", "alignment: the points are coplanar; an affine transform needs points off the plane"
+        )
+    return Affine(linear.T, mean_a - linear.T @ mean_b)
+
+
+def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rotations R, (..., 3, 3), that maximise tr(Rᵀ cross), and these maxima, (...).
+
+    ``cross`` : (..., 3, 3). If it is Σ wᵢ aᵢ bᵢᵀ of centred points, R is the rotation of a_from_b (Kabsch 1976).
+    """
+    u, s, vt = np.linalg.svd(cross)
+    sign = np.ones(s.shape)
+    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return (u * sign[..., None, :]) @ vt, (s * sign).sum(-1)
+
+
+def _checked(xyz_a, xyz_b, weights, needed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points as arrays, and the weights normalised to sum 1; refuse too few points and invalid weights."""
+    a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
+    if a.shape != b.shape or len(a) < needed:
+        raise DegenerateError("E-POINTS-FEW", f"alignment: {len(a)} and {len(b)} points, {needed} or more pairs needed")
+    w = np.ones(len(a)) if weights is None else np.asarray(weights, float)
+    if (w < 0).any() or not w.any():
+        raise DegenerateError("E-ALIGN-WEIGHTS", "alignment: weights are negative or all zero; positive weights needed")
+    return a, b, w / w.sum()
+
+
+def _collinear(centred: np.ndarray) -> bool:
+    values = np.linalg.eigvalsh(centred.T @ centred)
+    if values[1] > 1e-12 * values[2]:  # clear without the SVD, which is slow for a million points
+        return False
+    s = np.linalg.svd(centred, compute_uv=False)
+    return len(s) < 2 or s[1] <= 1e-9 * s[0]
+
+
+def _align(xyz_a, xyz_b, weights, with_scale: bool) -> Similarity:
+    a, b, w = _checked(xyz_a, xyz_b, weights, 3)
+    mean_a, mean_b = w @ a, w @ b
+    da, db = a - mean_a, b - mean_b
+    for points in (da, db):
+        if _collinear(points[w > 0]):
+            raise DegenerateError(
+                "E-POINTS-COLLINEAR", "alignment: the points are collinear; points off the line are needed"
+            )
+    rotation, product = best_rotations((w[:, None] * da).T @ db)
+    scale = float(product / (w @ (db**2).sum(1))) if with_scale else 1.0
+    return Similarity(scale, Rigid(rotation, mean_a - scale * rotation @ mean_b))
+
+
+class ImageFit:
+    """Statistics of a pose's residuals in an image."""
+
+    __slots__ = ()
+    residuals_px: np.ndarray
+    chi2: float
+    redundancy: int
+
+    def rms_px(self) -> float:
+        """Return the RMS of the residuals per coordinate."""
+        return float(np.sqrt((self.residuals_px**2).mean()))
+
+    def chi2_per_redundancy(self) -> float:
+        """Return χ² per redundancy; it is about 1 if the σ of points, target and intrinsics are true."""
+        return self.chi2 / self.redundancy
+
+    def p_value(self) -> float:
+        """Return the probability of residuals at least as large if the stated σ are true."""
+        return float(chdtrc(self.redundancy, self.chi2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UncertainRigid:
+    """A transform a_from_b with ``covariance`` (6, 6) of its errors: R' = exp(w) R, t' = t + dt.
+
+    A covariance of zero means an exact transform.
+    """
+
+    rigid: Rigid
+    covariance: Array
+
+    def __post_init__(self):
+        freeze(self, "covariance", (6, 6), "pose covariance")
+
+    @classmethod
+    def exact(cls, rigid: Rigid) -> "UncertainRigid":
+        """Return the transform with a covariance of zero."""
+        return cls(rigid, np.zeros((6, 6)))
+
+    def __matmul__(self, other: "UncertainRigid") -> "UncertainRigid":
+        """Return a_from_c with its covariance to first order, the errors of both transforms being independent."""
+        arm = self.rigid.rotation @ other.rigid.translation
+        by_self, by_other = np.eye(6), np.zeros((6, 6))
+        by_self[3:, :3] = -skew(arm)
+        by_other[:3, :3] = by_other[3:, 3:] = self.rigid.rotation
+        covariance = by_self @ self.covariance @ by_self.T + by_other @ other.covariance @ by_other.T
+        return UncertainRigid(self.rigid @ other.rigid, (covariance + covariance.T) / 2)

@@ -1,4 +1,7 @@
-"""TOML files, validated by a pydantic model; messages name file and place of a mistake and lengths that are not mm."""
+"""TOML files, validated by a pydantic model, and YAML as other programs write it.
+
+Messages name file and place of a mistake, and lengths that are not mm.
+"""
 
 import json
 import re
@@ -7,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
+import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from stcal.errors import InputError
@@ -102,3 +106,61 @@ class Sized(Strict):
     """A file of hardware, which may state that unusual lengths in it are meant."""
 
     unusual_size: bool = False
+
+
+class _Loader(yaml.SafeLoader):
+    def compose_node(self, parent, index):
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            problem = f"alias *{event.anchor}: write the values out"
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node, deep=False):
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise yaml.MarkedYAMLError(problem=f"the key {twice[:40]} twice", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
+    return loader.construct_mapping(node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+
+
+def load_yaml(text: str):
+    """Return the values of a text.
+
+    ``cv2.FileStorage`` begins its files with ``%YAML:1.0``, which is no valid YAML directive; it is removed.
+
+    Raises yaml.YAMLError: the text is not YAML, has aliases, or a key twice.
+    """
+    return yaml.load(_without_directive(text), _Loader)
+
+
+def load_documents(text: str) -> list:
+    """Return the values of each document of a text, as ``rostopic echo`` ends each with ``---``.
+
+    Raises yaml.YAMLError: the text is not YAML, has aliases, or a key twice.
+    """
+    return list(yaml.load_all(_without_directive(text), _Loader))
+
+
+def _without_directive(text: str) -> str:
+    return re.sub(r"\A\s*%YAML:?[ \t]*[\d.]+[ \t]*(#[^\r\n]*)?(\r\n|\r|\n|\Z)", "", text)
+
+
+def opencv_matrix(name: str, values: np.ndarray) -> list[str]:
+    """Return the lines of a matrix as ``cv2.FileStorage`` writes it, with numbers of full precision."""
+    rows, columns = values.shape
+    numbers = ",\n       ".join(", ".join(repr(float(v)) for v in row) for row in values)
+    return [
+        f"{name}: !!opencv-matrix",
+        f"   rows: {rows}",
+        f"   cols: {columns}",
+        "   dt: d",
+        f"   data: [ {numbers} ]",
+    ]

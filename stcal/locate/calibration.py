@@ -19,8 +19,8 @@ from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homogr
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit, robust_sigma
 from stcal.geometry.variances import sigma_factor
-from stcal.locate.data.layout import LayoutPlan, TargetLayout, obj_from_plane
-from stcal.locate.pose.estimate import PlanarProblem, project
+from stcal.locate.estimate import PlanarProblem, project
+from stcal.locate.layout import LayoutPlan, TargetLayout, obj_from_plane
 from stcal.parallel import one_thread
 
 MAX_STEPS = 60

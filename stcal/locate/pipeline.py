@@ -16,11 +16,11 @@ from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import decode, grey_8bit, grey_of, size_fault
-from stcal.locate.data.exposures import SceneFiles, SceneTags, detect, read_scenes
-from stcal.locate.data.layout import TargetLayout
-from stcal.locate.pose.estimate import Merged, ObjPose, Shift, locate, merge
-from stcal.locate.pose.patent import PatentOptions, PatentPose, locate_as_patent
-from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge, likely_mistake
+from stcal.locate.estimate import Merged, ObjPose, Shift, locate, merge
+from stcal.locate.exposures import SceneFiles, SceneTags, detect, read_scenes
+from stcal.locate.layout import TargetLayout
+from stcal.locate.patent import PatentOptions, PatentPose, locate_as_patent
+from stcal.locate.verdict import Verdict, VerdictOptions, judge, likely_mistake
 
 Method = Literal["joint", "patent"]
 MOVED_SIGMAS = 5.0

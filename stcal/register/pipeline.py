@@ -11,11 +11,25 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
-from stcal.register.core.liu2017 import Liu2017Options, liu2017
-from stcal.register.core.models import MODELS, parts, squares
-from stcal.register.core.pairs import Problem, noise_of
-from stcal.register.core.result import Alternative, Registration, held_out
-from stcal.register.core.robust import (
+from stcal.register.liu2017 import Liu2017Options, liu2017
+from stcal.register.mistakes import (
+    Shifted,
+    Wider,
+    check_mirrored,
+    check_units,
+    mirrored_error,
+    mirrored_ratio,
+    moved_meanwhile,
+    order_note,
+    shifted_rows,
+    two_groups,
+    wider,
+)
+from stcal.register.models import MODELS, parts, squares
+from stcal.register.notes import Subject, by_chance, check_extent, check_supports, notes_of, row_name
+from stcal.register.pairs import Problem, noise_of
+from stcal.register.result import Alternative, Registration, held_out
+from stcal.register.robust import (
     AS_GOOD,
     BY_CHANCE,
     LEAST_SHARE,
@@ -29,20 +43,6 @@ from stcal.register.core.robust import (
     sigma_within,
     turn_between,
 )
-from stcal.register.judge.mistakes import (
-    Shifted,
-    Wider,
-    check_mirrored,
-    check_units,
-    mirrored_error,
-    mirrored_ratio,
-    moved_meanwhile,
-    order_note,
-    shifted_rows,
-    two_groups,
-    wider,
-)
-from stcal.register.judge.notes import Subject, by_chance, check_extent, check_supports, notes_of, row_name
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9

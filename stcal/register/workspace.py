@@ -13,9 +13,9 @@ from scipy.special import chdtrc, chdtri
 from stcal.errors import StcalError
 from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
-from stcal.register.core.models import MODELS, Model, Transform, jacobian
-from stcal.register.core.pairs import Problem, noise_of
-from stcal.register.core.result import ErrorFigures, Registration, held_out
+from stcal.register.models import MODELS, Model, Transform, jacobian
+from stcal.register.pairs import Problem, noise_of
+from stcal.register.result import ErrorFigures, Registration, held_out
 
 MOST_POINTS = 500
 """Largest number of points of the model, evenly chosen from more, as its cost grows with the third power."""

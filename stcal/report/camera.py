@@ -5,7 +5,7 @@ import numpy as np
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, FittedLens, image_grid, rays
 from stcal.io.cameras.photograph import SIGMA_FOCAL
-from stcal.report.figure import INK, SMALL, calm, new_figure
+from stcal.report.svg import INK, SMALL, calm, new_figure
 from stcal.report.text import NONE, text_table
 
 POOR_PX = 0.05

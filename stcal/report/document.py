@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from stcal.errors import InputError
 from stcal.parallel import one_thread
-from stcal.report.figure import uri
+from stcal.report.svg import uri
 from stcal.report.text import NONE, join, number, text_table
 
 MACROS = "report/templates/macros.html.jinja"

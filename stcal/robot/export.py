@@ -17,7 +17,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.poses.columns import ascii_text, fixed, joined, program_name, without_comments
-from stcal.io.poses.controllers import (
+from stcal.io.poses.programs import (
     ABB,
     DEG_DIGITS,
     FANUC,

@@ -15,9 +15,8 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
-from stcal.io.plain_yaml import load_yaml
-from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
-from stcal.io.toml import Strict, validated
+from stcal.io.poses.programs import METRE_MM, from_roll_pitch_yaw
+from stcal.io.toml import Strict, load_yaml, validated
 from stcal.robot.kinematics.dh import robot_between
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import fixed_values, forward

@@ -10,11 +10,11 @@ from .interop.crosscheck import crosscheck as crosscheck
 from .interop.export import export_run as export_run
 from .interop.export_database import export_database as export_database
 from .interop.export_model import export_model as export_model
-from .interop.external import calibrate_models as calibrate_models
 from .interop.gates import initial_pairs as initial_pairs
+from .interop.native import calibrate_models as calibrate_models
 from .make.design import DesignOptions as DesignOptions
-from .make.target import design_tag_body as design_tag_body
-from .make.target import design_target as design_target
+from .make.design import design_tag_body as design_tag_body
+from .make.design import design_target as design_target
 from .measurement.images import MeasureOptions as MeasureOptions
 from .measurement.images import measure as measure
 from .measurement.report import poses_csv as poses_csv

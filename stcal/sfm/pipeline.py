@@ -28,7 +28,6 @@ from stcal.io.images import (
     mosaic_of,
     require_common_size,
 )
-from stcal.io.photographs.memory import files_of_arrays
 from stcal.io.photographs.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread
@@ -43,28 +42,26 @@ from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone
-from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, seen_by
+from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays, seen_by
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.report.judgement import lost_groups
-from stcal.sfm.runs.detection import (
-    DetectedImages,
-    Task,
-    detected_images,
-    labelled_images,
-    require_dots,
-    require_no_calibration,
-)
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import (
+    DetectedImages,
     GroupSolution,
+    Task,
+    detected_images,
     explained,
+    labelled_images,
+    require_dots,
+    require_no_calibration,
     solve_body,
     solve_groups,
     ungrouped,

@@ -14,10 +14,9 @@ from stcal.boards.cells import black_areas, clear_mm
 from stcal.boards.target import body_toml
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.parallel import run_parallel
 from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile, new_dataset

@@ -19,9 +19,8 @@ from stcal.io.cameras.write import save_camera
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
-from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, check_lens, encode, render
-from stcal.synthetic.scene import Scene
+from stcal.synthetic.scene import Scene, image_circles
 
 FIRST_IMAGE = 1000
 

@@ -13,9 +13,8 @@ from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
-from stcal.synthetic.observe import ImageCircles, image_circles, rim_points, together
 from stcal.synthetic.optics import SHARP_PX, WIDEST_PX, ThinLens, blur_evenly, defocused
-from stcal.synthetic.scene import Group, Scene
+from stcal.synthetic.scene import Group, ImageCircles, Scene, image_circles, rim_points, together
 
 WALL_BEHIND_MM = 350.0
 WALL_CELL_MM = 35.0

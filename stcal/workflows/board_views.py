@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.charuco import find_charuco
-from stcal.boards.chessboard import find_chessboard, why_no_chessboard
+from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
 from stcal.boards.design import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
@@ -28,8 +27,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model

@@ -26,7 +26,7 @@ from stcal.io.table import POSE, Table, read_table
 from stcal.parallel import Progress
 from stcal.report.document import Block, Document, Section, bullets, links, listed, plot, tiles
 from stcal.report.document import Table as ShownTable
-from stcal.report.figure import COLOURS, calm, new_figure
+from stcal.report.svg import COLOURS, calm, new_figure
 from stcal.report.text import number
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.report import axes_file, axes_report

@@ -9,17 +9,17 @@ import numpy as np
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import InputError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.rigid import align_rigid
 from stcal.geometry.robust import length_limit
 from stcal.io.table import Table, read_table
 from stcal.parallel import one_thread
 from stcal.register import register
-from stcal.register.core.liu2017 import Liu2017Options
-from stcal.register.core.pairs import WHAT, Pairs
-from stcal.register.core.result import ErrorFigures, Registration
-from stcal.register.report.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
-from stcal.register.report.page import matrix_table
+from stcal.register.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
+from stcal.register.liu2017 import Liu2017Options
+from stcal.register.page import matrix_table
+from stcal.register.pairs import WHAT, Pairs
+from stcal.register.result import ErrorFigures, Registration
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
 from stcal.report.text import number

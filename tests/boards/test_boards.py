@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.charuco import find_charuco
-from stcal.boards.chessboard import find_chessboard
+from stcal.boards.chessboard import find_charuco, find_chessboard
 from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.file import load_flat_board
 from stcal.boards.tags import find_tags, view_of_tags

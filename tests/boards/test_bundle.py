@@ -8,8 +8,8 @@ from stcal.boards.dictionaries import known_dictionary
 from stcal.boards.file import load_flat_board
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
-from stcal.locate.data.exposures import find_scenes
-from stcal.locate.data.layout import load_layout, load_plan
+from stcal.locate.exposures import find_scenes
+from stcal.locate.layout import load_layout, load_plan
 from stcal.locate.pipeline import run
 from tests.outcome import fails_with
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.charuco import find_charuco
+from stcal.boards.chessboard import find_charuco
 from stcal.boards.design import CharucoDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography

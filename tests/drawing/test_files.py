@@ -16,8 +16,7 @@ from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import SUFFIXES, draw
 from stcal.drawing.formats import POINT_MM, pdf
-from stcal.drawing.parts import board_parts, target_parts
-from stcal.drawing.shapes import Disc, Line, Text, extent
+from stcal.drawing.parts import Disc, Line, Text, board_parts, extent, target_parts
 from stcal.drawing.sheets import (
     EDGE,
     FOOT,

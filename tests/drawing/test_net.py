@@ -10,14 +10,13 @@ import pytest
 from stcal.design import TargetDesign, reference_target
 from stcal.drawing.draw import OWN, Drawn, draw, drawn_text, net_for, sheets_of
 from stcal.drawing.net import _overlap, net_parts
-from stcal.drawing.shapes import Disc, Text
+from stcal.drawing.parts import Disc, Text
 from stcal.drawing.sheets import OVERLAP, framed, paper_sheets
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.make.box import sides_of
-from stcal.sfm.make.pattern import make_pattern
+from stcal.sfm.make.pattern import make_pattern, sides_of
 from stcal.synthetic.designs import tag_body
 from tests.drawing.raster import camera_of, page_image
 from tests.outcome import fails_with

@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from stcal.boards.charuco import find_charuco
-from stcal.boards.chessboard import find_chessboard
+from stcal.boards.chessboard import find_charuco, find_chessboard
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.tags import find_aprilgrid, find_tags
 from stcal.design import BoardDesign, TargetDesign, reference_target
 from stcal.drawing.draw import OWN, draw, sheets_of
-from stcal.drawing.parts import board_parts, target_parts
-from stcal.drawing.shapes import Area, Disc
+from stcal.drawing.parts import Area, Disc, board_parts, target_parts
 from stcal.geometry.plane import apply_homography
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions

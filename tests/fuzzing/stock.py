@@ -17,7 +17,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.design import target_toml
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
-from stcal.locate.data.layout import layout_toml
+from stcal.locate.layout import layout_toml
 from stcal.robot.kinematics.conditions import Conditions
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
@@ -25,8 +25,7 @@ from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.interop.export_model import export_model
-from stcal.sfm.make.box import sides_of
-from stcal.sfm.make.pattern import make_pattern
+from stcal.sfm.make.pattern import make_pattern, sides_of
 from stcal.sfm.pipeline import RunOptions, run
 from stcal.sfm.runs.transaction import MarkerFile
 from stcal.synthetic.dataset import write_dataset

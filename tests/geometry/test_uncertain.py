@@ -3,8 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.rigid import Poses, Rigid
-from stcal.geometry.uncertain import UncertainRigid
+from stcal.geometry.rigid import Poses, Rigid, UncertainRigid
 
 
 def drawn(pose: UncertainRigid, count: int, rng) -> Poses:

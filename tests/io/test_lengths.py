@@ -7,7 +7,7 @@ from stcal.boards.file import load_flat_board
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import load_target, target_toml
-from stcal.locate.data.layout import TargetLayout, layout_toml, load_layout, square
+from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
 from stcal.robot.urdf import load_urdf

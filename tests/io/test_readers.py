@@ -24,7 +24,7 @@ from stcal.io.design import load_target
 from stcal.io.files import text_of
 from stcal.io.poses.columns import read_mapped
 from stcal.io.table import read_table
-from stcal.locate.data.layout import load_plan
+from stcal.locate.layout import load_plan
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from stcal.robot.urdf import load_urdf

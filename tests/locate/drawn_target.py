@@ -5,7 +5,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.locate.data.layout import TargetLayout
+from stcal.locate.layout import TargetLayout
 from tests.boards.drawn import photograph
 from tests.support.tags import example_layout
 

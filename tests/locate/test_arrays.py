@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.charuco import find_charuco
+from stcal.boards.chessboard import find_charuco
 from stcal.boards.design import CharucoDesign, TagLayout
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
-from stcal.locate.data.layout import TargetLayout
+from stcal.locate.layout import TargetLayout
 from stcal.locate.pipeline import locate_image
 from tests.outcome import fails_with
 from tests.support.areas import homography, rendered

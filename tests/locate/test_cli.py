@@ -13,7 +13,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
-from stcal.locate.data.layout import layout_toml, load_layout
+from stcal.locate.layout import layout_toml, load_layout
 from tests.boards.drawn import photograph
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 from tests.outcome import ended

@@ -10,10 +10,10 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
-from stcal.locate.data.exposures import find_scenes
-from stcal.locate.data.layout import TargetLayout
+from stcal.locate.exposures import find_scenes
+from stcal.locate.layout import TargetLayout
 from stcal.locate.pipeline import LocateOptions, locate_scene, run
-from stcal.synthetic.exposure import Light, expose, moved
+from stcal.synthetic.optics import Light, expose, moved
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", CAMERA.width, CAMERA.height, "test")

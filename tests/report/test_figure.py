@@ -2,7 +2,7 @@
 
 import pytest
 
-from stcal.report.figure import new_figure, save
+from stcal.report.svg import new_figure, save
 from tests.outcome import fails_with
 
 

@@ -20,9 +20,8 @@ from stcal.io.cameras.model import camera_prior
 from stcal.io.design import load_target, target_toml
 from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
-from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import adjusted
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of

@@ -33,7 +33,7 @@ def test_the_design_differs_in_everything(calibrated):
 
 @pytest.mark.slow
 def test_every_label_is_right(calibrated):
-    from stcal.synthetic.observe import image_circles
+    from stcal.synthetic.scene import image_circles
 
     scene, _, _, result = calibrated
     for image in result.observations():

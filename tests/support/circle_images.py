@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.labels import DotLabel, Label
-from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
-from stcal.synthetic.scene import Scene
+from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Scene, image_circles
 
 
 def circle_conic(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: float) -> np.ndarray:

@@ -12,10 +12,10 @@ from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.locate.calibration import CalibratedLayout, CalibrationImages, calibrate
-from stcal.locate.data.layout import LayoutPlan, TargetLayout
-from stcal.locate.pose.estimate import SeenTags, locate, merge
-from stcal.locate.pose.patent import PatentOptions, locate_as_patent
-from stcal.locate.pose.verdict import Decision, VerdictOptions, judge
+from stcal.locate.estimate import SeenTags, locate, merge
+from stcal.locate.layout import LayoutPlan, TargetLayout
+from stcal.locate.patent import PatentOptions, locate_as_patent
+from stcal.locate.verdict import Decision, VerdictOptions, judge
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.measurement.target import TargetCircles
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.synthetic.scene import Scene
 
 FLATNESS_MM = 0.02

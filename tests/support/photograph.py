@@ -10,15 +10,14 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.special import ndtr
 
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
-from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.plane import circle_image_offset
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.io.images import decode
 from stcal.labels import BOARD
-from stcal.synthetic.observe import rim_points
+from stcal.synthetic.scene import rim_points
 
 EDGE_PX = 0.7
 """Gaussian blur of what is drawn: about that of the lens."""

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Affine, Rigid
-from stcal.register.core.models import Transform, parts
+from stcal.register.models import Transform, parts
 
 SIGMA_MM = 0.15
 HALF_MM = 100.0
@@ -114,7 +114,7 @@ def make_scene(
 
 
 def parameter_error(found: Transform, truth: Transform) -> np.ndarray:
-    """The step (p,) from truth to found: that of :func:`~stcal.register.core.models.unit_covariance`."""
+    """The step (p,) from truth to found: that of :func:`~stcal.register.models.unit_covariance`."""
     (linear, translation), (true_linear, true_translation) = parts(found), parts(truth)
     if not isinstance(found, Affine):
         scale = np.cbrt(np.linalg.det(linear) / np.linalg.det(true_linear))

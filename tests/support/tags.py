@@ -10,7 +10,7 @@ from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.locate.data.layout import TargetLayout, square
+from stcal.locate.layout import TargetLayout, square
 
 CAMERA = Camera(1600, 1200, [1350.0, 1350.0], [799.5, 599.5], [-0.1, 0.05, 0, 0, 0, 0, 0, 0])
 PLACES = (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.synthetic.exposure import Light, Sensor, expose, lit, moved
+from stcal.synthetic.optics import Light, Sensor, expose, lit, moved
 from tests.outcome import fails_with
 
 RAMP = np.tile(np.linspace(20, 200, 300).astype(np.uint8), (200, 1))

@@ -10,10 +10,9 @@ import pytest
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.synthetic.dataset import TruthFile
-from stcal.synthetic.observe import ImageCircles, image_circles
 from stcal.synthetic.optics import ThinLens, blur_evenly
 from stcal.synthetic.render import RenderOptions, _add_circles, check_lens, render
-from stcal.synthetic.scene import SceneOptions, make_scene, seen_wide, wide_options
+from stcal.synthetic.scene import ImageCircles, SceneOptions, image_circles, make_scene, seen_wide, wide_options
 from tests.outcome import fails_with
 
 OPTIONS = SceneOptions(seed=1, width=972, height=648, images_per_group=2, groups=(("1", "2"), ("1", "5")))

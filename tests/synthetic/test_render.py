@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.synthetic.observe import image_circles, rim_points
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
 from tests.outcome import fails_with
 
 OPTIONS = SceneOptions(seed=1, width=648, height=432, images_per_group=2, groups=(("1", "2"), ("1", "5")))

@@ -8,8 +8,7 @@ import pytest
 from stcal.design import TargetDesign, reference_target
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.synthetic.observe import image_circles, rim_points
-from stcal.synthetic.scene import SceneOptions, make_scene, second_design
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
 from tests.outcome import fails_with
 from tests.support.circle_images import simulate_centres
 

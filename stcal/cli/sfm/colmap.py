@@ -125,7 +125,7 @@ def faces(
 ) -> None:
     """Find scale and faces of a COLMAP model made or edited elsewhere; its labels are found by image and keypoint."""
     from stcal.sfm.interop.crosscheck import faces_text
-    from stcal.sfm.interop.external import calibrate_models
+    from stcal.sfm.interop.native import calibrate_models
     from stcal.sfm.runs.saved import load_run
 
     if out is not None and not out.parent.is_dir():

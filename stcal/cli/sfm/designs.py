@@ -260,7 +260,7 @@ def _scene(
 ) -> "Scene":
     """Returns a scene of the designs, with faces at their rough poses, before the camera of a file or the options."""
     from stcal.io.cameras.read import read_camera
-    from stcal.sfm.planning.nominal import nominal_poses
+    from stcal.sfm.planning.forecast import nominal_poses
     from stcal.sfm.planning.session import pairs_of_faces
     from stcal.synthetic.scene import make_scene
 
@@ -398,9 +398,8 @@ def design(
     dodecahedron of tags. Forecast its σ."""
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.detect.sightings import likeness_notes
-    from stcal.sfm.make.box import faces_of, size_of
-    from stcal.sfm.make.design import DesignOptions, made_text
-    from stcal.sfm.make.target import design_tag_body, design_target
+    from stcal.sfm.make.design import DesignOptions, design_tag_body, design_target, made_text
+    from stcal.sfm.make.pattern import faces_of, size_of
     from stcal.sfm.planning.file import plan_text
     from stcal.sfm.planning.session import PlanOptions
     from stcal.synthetic.designs import made_text as body_text

@@ -158,8 +158,8 @@ def detect(
     """Detect circles only, and write detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
-    from stcal.sfm.runs.detection import require_no_calibration
     from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.solve import require_no_calibration
     from stcal.sfm.runs.text import detection_text
 
     options = RunOptions(

@@ -13,9 +13,9 @@ from stcal.handeye.data.formats.record import Said, require_each_once
 from stcal.handeye.data.inputs import partners, read_robot, require_own, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.plain_yaml import load_yaml
 from stcal.io.quaternions import require_unit
 from stcal.io.table import LENGTHS, read_table
+from stcal.io.toml import load_yaml
 
 YAML = (".yaml", ".yml")
 TIME = "time_s"

@@ -9,8 +9,7 @@ from scipy.optimize import minimize, nnls
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.align import best_rotations
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid, best_rotations
 from stcal.handeye.data.pairs import Loop, Motions
 from stcal.io.device import quiet_opencv
 

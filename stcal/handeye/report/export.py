@@ -16,10 +16,13 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.result import HandEye
-from stcal.io.plain_yaml import load_yaml, opencv_matrix
 from stcal.io.poses.columns import program_name
-from stcal.io.poses.controllers import ABB, FANUC, KUKA, REMARK, UR, require_form
-from stcal.io.poses.static import (
+from stcal.io.poses.programs import (
+    ABB,
+    FANUC,
+    KUKA,
+    REMARK,
+    UR,
     Static,
     fixed_joint,
     messages,
@@ -30,6 +33,7 @@ from stcal.io.poses.static import (
     read_ros1_launch,
     read_ros2_commands,
     read_ros2_launch,
+    require_form,
     ros1_launch,
     ros2_commands,
     ros2_launch,
@@ -37,6 +41,7 @@ from stcal.io.poses.static import (
     xyzw,
 )
 from stcal.io.table import require_poses_written
+from stcal.io.toml import load_yaml, opencv_matrix
 
 CAMERA_FRAME = "camera_optical_frame"
 """Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""

@@ -17,7 +17,7 @@ from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.result import HandEye
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode, grey_8bit, thumbnail
-from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
+from stcal.report.svg import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
 from stcal.report.text import number, telling_names
 
 CELLS = 60

@@ -7,10 +7,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.photograph import camera_of_photograph, is_photograph

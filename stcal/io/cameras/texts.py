@@ -11,7 +11,7 @@ from io import BytesIO
 import numpy as np
 
 from stcal.errors import InputNote
-from stcal.io.plain_yaml import load_documents
+from stcal.io.toml import load_documents
 
 TAB = 4
 """Spaces in place of a tab, which YAML does not allow."""

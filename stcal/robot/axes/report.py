@@ -10,7 +10,7 @@ import stcal
 from stcal.geometry.arrays import rms
 from stcal.io.json import ByName, Matrix, Part, Pose, ResultFile, Vector3
 from stcal.report.document import Document, Section, Table, bullets, legend, page_only, plot
-from stcal.report.figure import AXIS_COLOURS, INK, calm, new_figure
+from stcal.report.svg import AXIS_COLOURS, INK, calm, new_figure
 from stcal.report.text import number
 from stcal.robot.axes.checks import Pair
 from stcal.robot.axes.fit import AxisFit

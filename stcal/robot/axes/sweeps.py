@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid, align_rigid, skew
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.report.document import Html, plot
-from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
+from stcal.report.svg import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
 from stcal.robot.identification.adjustment import Observed, State, as_seen, tips_of
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.forward import joint_frames

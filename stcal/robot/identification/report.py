@@ -9,7 +9,7 @@ from pydantic import Field
 
 from stcal.io.json import Matrix, Part, ResultFile
 from stcal.report.document import Block, Document, Notes, Section, Table, fold, listed, page_only, plot, subheading
-from stcal.report.figure import COLOURS, calm, new_figure
+from stcal.report.svg import COLOURS, calm, new_figure
 from stcal.report.text import NONE, number
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.geometry.align import align_rigid, best_rotations
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.quaternions import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of

@@ -15,7 +15,7 @@ from stcal.io.files import require_written
 from stcal.io.quaternions import COLUMNS
 from stcal.io.table import read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
-from stcal.report.figure import COLOURS, INK, SMALL, calm, locator, new_figure, plane
+from stcal.report.svg import COLOURS, INK, SMALL, calm, locator, new_figure, plane
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import tips_of
 from stcal.robot.identification.drawings import Drawn, residual_plots

@@ -14,9 +14,9 @@ from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
+from stcal.sfm.adjust.faces import Shape
 from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
 from stcal.sfm.adjust.scale import known_points
-from stcal.sfm.adjust.shape import Shape
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 

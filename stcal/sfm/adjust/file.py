@@ -28,9 +28,9 @@ from stcal.io.json import (
 )
 from stcal.io.table import POSE_MM, pose_values
 from stcal.labels import CircleLabel
+from stcal.sfm.adjust.calibration import AdjustOptions, Solve
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.options import AdjustOptions, Solve
 
 
 class FacePoses(Part):

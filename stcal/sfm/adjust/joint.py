@@ -13,12 +13,11 @@ from scipy.linalg import solve_triangular
 
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import ConvergenceError, ScaleError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minimum, minimise
 from stcal.geometry.normal_equations import constrained_inverse
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, DotLabel, dot_cells

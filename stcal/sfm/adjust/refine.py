@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import blocks_of, reduce
-from stcal.geometry.plane import fit_plane
+from stcal.geometry.plane import circle_image_offset, fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label

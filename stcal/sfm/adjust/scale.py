@@ -8,9 +8,8 @@ import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, ScaleReference, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError, ScaleError
-from stcal.geometry.align import align_rigid, align_similarity
 from stcal.geometry.arrays import freeze
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Rigid, Similarity, align_rigid, align_similarity
 from stcal.labels import CircleLabel, Label, dot_cells
 from stcal.sfm.data.model import ImageObservations, WorldModel
 

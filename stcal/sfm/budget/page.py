@@ -21,7 +21,7 @@ from stcal.report.document import (
     subheading,
     tiles,
 )
-from stcal.report.figure import COLOURS, calm, new_figure
+from stcal.report.svg import COLOURS, calm, new_figure
 from stcal.report.text import NONE, number, significant
 from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncertainty
 

@@ -15,7 +15,7 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
-from stcal.sfm.adjust.options import FLATNESS_MM
+from stcal.sfm.adjust.calibration import FLATNESS_MM
 from stcal.sfm.adjust.uncertainty import (
     BOARD,
     CIRCLES,

@@ -16,7 +16,7 @@ from stcal.report.document import (
     plots,
     subheading,
 )
-from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
+from stcal.report.svg import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
 from stcal.report.text import HEADS, number, transform_rows
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian

@@ -7,10 +7,9 @@ import numpy as np
 from scipy.special import fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.geometry.align import align_similarity
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import align_similarity, skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget

@@ -14,11 +14,10 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.parallel import run_briefly
-from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.checks.culprits import Guilt
 from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge

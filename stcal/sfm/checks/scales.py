@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, known_distances
 from stcal.errors import DegenerateError
-from stcal.geometry.align import align_similarity
+from stcal.geometry.rigid import align_similarity
 from stcal.labels import DotLabel
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points

@@ -12,9 +12,8 @@ from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, counted
-from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factors, with_sigma
+from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.network import Network, free_network, solve_score
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.checks.board import KINDS, board_checks, measure_radii, pitch_check, radius_checks, rim_check

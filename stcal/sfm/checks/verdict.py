@@ -15,8 +15,8 @@ from scipy.special import fdtrc
 
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.robust import ratio_limit
-from stcal.sfm.report.checks import ORDER
 from stcal.sfm.report.judgement import CAUSE, not_first
+from stcal.sfm.report.sections import ORDER
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 SUSPICIOUS = 1e-3

@@ -11,8 +11,13 @@ from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity, TargetDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset, circle_images, shape_of_square
-from stcal.geometry.plane import fit_homography, homography_jacobian
+from stcal.geometry.plane import (
+    circle_image_offset,
+    circle_images,
+    fit_homography,
+    homography_jacobian,
+    shape_of_square,
+)
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import BOARD, DotLabel, Label, dot_cells
 from stcal.sfm.data.model import ImageObservations
@@ -133,7 +138,7 @@ def project_circles(
     """Project circles, centres (n, 3), normals (n, 3), radii (n,), target frame, mm, by h poses camera_from_target.
 
     ``rotation`` : (h, 3, 3); ``translation`` : (h, 3). The derivatives include the eccentricity of
-    :func:`stcal.geometry.conic.circle_image_offset`.
+    :func:`stcal.geometry.plane.circle_image_offset`.
     """
     back = np.swapaxes(rotation, 1, 2)
     rotated, axis = xyz @ back, normal @ back

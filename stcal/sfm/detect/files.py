@@ -1,10 +1,10 @@
-"""Detection in all files, in parallel. Results are cached by content of the image and options."""
+"""Detection in all images, from files or memory, in parallel. Results are cached by content of image and options."""
 
 import hashlib
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import combinations
@@ -23,13 +23,17 @@ from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
     ImageFile,
+    ImageFiles,
     Skipped,
     decode,
     grey_8bit,
+    grey_of,
+    name_fault,
     require_common_size,
     same_photograph,
     size_fault,
     thumbnail,
+    without_excluded,
 )
 from stcal.labels import parse_label, parse_labels
 from stcal.sfm.data.model import Centres
@@ -483,3 +487,28 @@ def require_upright(images: tuple[DetectedImage, ...]) -> None:
             f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored; flip the images back, "
             "or use the files that the camera wrote",
         )
+
+
+def files_of_arrays(images: Mapping[str, Sequence[np.ndarray]], exclude: Sequence[str] = ()) -> ImageFiles:
+    """Return images in memory as files that carry their content, named ``12/0.png``, ``12/1.png`` … by group.
+
+    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of images that are not
+    used.
+
+    Raises InputError: no image, an array that is none, or a name that leads out of a folder; and as for
+    :func:`stcal.io.images.chosen_images`.
+    """
+    named = [(group, f"{group}/{k}.png", image) for group, arrays in images.items() for k, image in enumerate(arrays)]
+    if not named:
+        raise InputError("E-IMAGES-NONE", "images: no image in memory; give arrays by the name of their group")
+    for group, name, _ in named:
+        if fault := name_fault(name) or ("is no name of one folder" if "/" in group or not group else None):
+            raise InputError("E-IMAGES-GROUP", f"images: group {group!r} {fault}; give a plain name, such as 12")
+
+    def file(group: str, name: str, image: np.ndarray) -> ImageFile:
+        content = cv2.imencode(".png", grey_of(image, name), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        return ImageFile(Path(name), name, group, content)
+
+    with ThreadPoolExecutor() as pool:  # encoding releases the interpreter
+        files = list(pool.map(file, *zip(*named, strict=True)))
+    return without_excluded(files, [], exclude, "memory")

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.plane_bundle import PlaneBundle
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import ImageObservations

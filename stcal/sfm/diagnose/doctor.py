@@ -9,10 +9,9 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.parallel import Progress, run_in_order
@@ -22,7 +21,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import leaves_a_pattern_out
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advice, in_order
-from stcal.sfm.report.trust import Words
+from stcal.sfm.report.sections import Words
 from stcal.sfm.runs.saved import AnyRun, SavedRun, read_target_model, saved_run
 
 MIN_MAPPED = 3

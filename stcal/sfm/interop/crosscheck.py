@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, MappingError
-from stcal.geometry.align import align_similarity
 from stcal.geometry.arrays import require_arguments, rms
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Poses, Rigid, align_similarity
 from stcal.io.json import read_json
 from stcal.parallel import Progress
 from stcal.report.text import number, text_table
@@ -20,9 +19,8 @@ from stcal.sfm.adjust.refine import refine
 from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported, copy_database
 from stcal.sfm.interop.export_model import ExportedModel
-from stcal.sfm.interop.external import faces_from_models
 from stcal.sfm.interop.gates import MIN_INLIERS
-from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
+from stcal.sfm.interop.native import NativeColmap, faces_from_models, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import image_ids

@@ -15,7 +15,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.model import camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
-from stcal.io.poses.colmap_images import image_lines
+from stcal.io.poses.programs import image_lines
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, ImageObservations, MetricModel, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap

@@ -12,11 +12,10 @@ from scipy.sparse.csgraph import connected_components
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError
-from stcal.geometry.align import best_rotations
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, best_rotations
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.database import match_labels

@@ -11,7 +11,7 @@ import numpy as np
 from stcal.errors import InputError, StcalError
 from stcal.io.images import Skipped
 from stcal.report.document import environment
-from stcal.report.figure import AXIS_COLOURS, COLOURS
+from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
 from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.measurement.report import poses_file

@@ -20,8 +20,7 @@ from stcal.geometry.plane import (
     weigh,
     weights_of,
 )
-from stcal.geometry.rigid import Rigid
-from stcal.geometry.uncertain import ImageFit
+from stcal.geometry.rigid import ImageFit, Rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels

@@ -25,7 +25,7 @@ from stcal.report.document import (
     plots,
 )
 from stcal.report.document import Table as ShownTable
-from stcal.report.figure import COLOURS, calm, locator, new_figure, plane, round_below
+from stcal.report.svg import COLOURS, calm, locator, new_figure, plane, round_below
 from stcal.report.text import number, text_table
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import fit_verdict

@@ -10,10 +10,9 @@ import numpy as np
 from stcal.boards.target import load_body
 from stcal.design import TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.plane import fit_plane
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.json import read_result
 from stcal.labels import CircleLabel, circle_labels

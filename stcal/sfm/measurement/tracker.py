@@ -8,9 +8,8 @@ from threadpoolctl import ThreadpoolController
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_8bit, grey_fine, require_grey

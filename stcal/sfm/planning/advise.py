@@ -25,10 +25,11 @@ from stcal.sfm.planning.forecast import (
     PositionsWith,
     Setup,
     forecast,
+    observe,
+    true_models,
     variance_shares,
     worst_of,
 )
-from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes

@@ -29,8 +29,7 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.mapping.incremental import assemble
 from stcal.sfm.mapping.placed import unknown_lens
-from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, variance_shares
-from stcal.sfm.planning.nominal import nominal_poses
+from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, nominal_poses, variance_shares
 from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_with_board, widest_aperture_mm
 from stcal.sfm.planning.views import PlannedView, axes_of, looking_at, single
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene

@@ -24,9 +24,10 @@ from stcal.sfm.planning.forecast import (
     Forecast,
     Setup,
     forecast,
+    observe,
+    true_models,
     variance_shares,
 )
-from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene, seen_by
 

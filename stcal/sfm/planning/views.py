@@ -12,9 +12,8 @@ from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.forecast import CentreNoise, Setup
-from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
 from stcal.synthetic.placement import look_along
-from stcal.synthetic.scene import Group, Scene
+from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, image_circles
 
 REACH_DEG = 50.0
 """Largest distance of candidates from the middle of a group's views, in azimuth and in elevation."""

@@ -11,9 +11,8 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import DegenerateError, InputError, InputNote
-from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.files import TABLE_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.io.table import FARTHEST, LENGTHS

@@ -8,8 +8,19 @@ from itertools import chain
 import numpy as np
 
 from stcal.labels import dot_cells, parse_label, parse_labels
-from stcal.report.figure import AXIS_COLOURS, COLOURS, INK, SMALL, round_below
-from stcal.report.svg import Axes, Drawing, Space, arrows, red_blue, ticks
+from stcal.report.svg import (
+    AXIS_COLOURS,
+    COLOURS,
+    INK,
+    SMALL,
+    Axes,
+    Drawing,
+    Space,
+    arrows,
+    red_blue,
+    round_below,
+    ticks,
+)
 from stcal.report.text import number
 
 

@@ -27,10 +27,17 @@ from stcal.report.document import (
 )
 from stcal.report.text import cells, join, number
 from stcal.sfm.report import figures
-from stcal.sfm.report.checks import checks_section, crosscheck_section, published_section
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
 from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
-from stcal.sfm.report.trust import Words, headline, settings, trust
+from stcal.sfm.report.sections import (
+    Words,
+    checks_section,
+    crosscheck_section,
+    headline,
+    published_section,
+    settings,
+    trust,
+)
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""

@@ -9,8 +9,8 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.io.toml import LEAST
+from stcal.sfm.adjust.calibration import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.options import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.data.as_drawn import faces_in_name
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import GraphKind, PairOptions

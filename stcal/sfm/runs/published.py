@@ -7,9 +7,8 @@ import numpy as np
 
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
-from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.adjust.uncertainty import calibrated_target

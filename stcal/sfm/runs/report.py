@@ -6,8 +6,8 @@ from pydantic import Field
 
 from stcal.io.images import name_fault
 from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, Pose, ResultFile, Vector, Vector3
+from stcal.sfm.adjust.calibration import Solve
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.options import Solve
 from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.verdict import Verdict
 from stcal.sfm.report.judgement import Judgement

@@ -1,4 +1,7 @@
-"""Solution of one group, from labels to a corrected model: pairs, mapping, refinement. It is cached by its inputs."""
+"""The first stages of a run: detection in all images, and the solution of each group.
+
+A group is solved from labels to a corrected model: pairs, mapping, refinement. The result is cached by its inputs.
+"""
 
 import hashlib
 import json
@@ -10,12 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.design import CornerBoard
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
+from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError, ScaleError, StcalError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept, made_by
-from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
+from stcal.io.cameras.model import CameraModel
+from stcal.io.files import save
+from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, ImageFiles, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress, counted, run_briefly
 from stcal.report.text import significant
@@ -25,15 +32,113 @@ from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
 from stcal.sfm.checks.culprits import MOVED, MOVED_REMEDY, moved_apart
 from stcal.sfm.checks.verdict import Check
-from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
+from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group, detections_csv
 from stcal.sfm.data.patterns import pitch_hint
-from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
+from stcal.sfm.detect.board_alone import is_board_alone, label_boards
+from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
+from stcal.sfm.detect.labels import Detection, LabelledImage, label_images, label_once, leaves_a_board_out
+from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
 from stcal.sfm.report.judgement import LEFT_OUT_WHOLE, OF_WHOLE_SET
 from stcal.sfm.runs.options import RunOptions, unknown_faces
+from stcal.sfm.runs.transaction import RunFolder
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class DetectedImages(Brief):
+    """The circles and corners of all images.
+
+    ``detection`` : what was measured, and the images ``skipped``; ``labelled`` : images with their labels, in the
+    database's order; ``notes`` : on the camera, and on what no image shows.
+    """
+
+    detection: DetectionResult
+    labelled: tuple[LabelledImage, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def images(self) -> dict[str, Detection]:
+        """Labels, centres and covariances, px, by the name of the image."""
+        return {
+            (seen := image.observations).name: Detection(
+                seen.labels, seen.centre_px, seen.covariance_px2, tuple(image.notes)
+            )
+            for image in self.labelled
+        }
+
+
+def require_no_calibration(out: str | Path) -> None:
+    """Refuses a folder for detections that holds a finished calibration.
+
+    Raises
+    ------
+    InputError
+        It holds one.
+    """
+    if (Path(out) / "faces.json").exists():
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
+        )
+
+
+def require_dots(board: BoardDesign | None, option: str) -> None:
+    """Refuses a board of corners for an option whose method finds dots.
+
+    Raises
+    ------
+    InputError
+        The board is one of corners; the message begins with the option.
+    """
+    if isinstance(board, CornerBoard):
+        raise InputError(
+            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """The subject of all stages of a run.
+
+    ``files`` : the photographs; ``folder`` : the claimed folder; ``board`` : without rows where there is none.
+    """
+
+    files: ImageFiles
+    folder: RunFolder
+    target: TargetDesign
+    board: BoardDesign
+    options: RunOptions
+    progress: Progress
+
+
+def labelled_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, list[LabelledImage]]:
+    """Detects and labels the images, and writes ``detections.csv`` into the folder."""
+    detection, labelled = detected_images(task, camera)
+    save(task.folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
+    return detection, labelled
+
+
+def detected_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, list[LabelledImage]]:
+    """Detects and labels the images by the rules that the options ask for."""
+    (chosen, skipped), target, options, cache = task.files, task.target, task.options, task.folder.cache
+    step = counted(task.progress, "detect", len(chosen))
+    dots = task.board if task.board.rows else None
+    published = options.solve == "paper"
+    if published:
+        require_dots(dots, "--solve paper")
+        PublishedPattern.of(target)
+    detector = detect_published if published else None
+    detection = detect_files(chosen, camera, target, dots, options.ellipses, cache, options.workers, step, detector)
+    detection = replace(detection, skipped=(*skipped, *detection.skipped))
+    require_upright(detection.images)
+    if dots is not None and (options.board_only or is_board_alone(detection)):
+        return detection, label_boards(detection, target, dots)
+    if published:
+        return detection, label_once(detection, target, dots)
+    return detection, label_images(detection, target, dots, options.ellipses, cache, options.workers)
+
 
 CACHE_VERSION = 7
 SHOW_MORE = "show two faces of it at once, or one by more corners"

@@ -15,9 +15,9 @@ from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
-from stcal.sfm.report.checks import count_verdicts
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import images_left_out
+from stcal.sfm.report.sections import count_verdicts
 from stcal.sfm.runs.result import Comparison, RunResult
 from stcal.sfm.runs.solve import GroupSolution
 

@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
 from stcal.handeye.report.export import FORMS, ROS_FORMS, exported, opencv_yaml, read_urdf, ros_yaml, tree, urdf_joint
 from stcal.io.poses.columns import program_name
-from stcal.io.poses.static import read_messages
+from stcal.io.poses.programs import read_messages
 from tests.outcome import fails_with
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.io.poses.colmap_images import image_lines
+from stcal.io.poses.programs import image_lines
 from tests.outcome import fails_with
 
 A, B, C = (f"{i} 1 0 0 0 0 0 {i} 1 {name}\n" for i, name in ((1, "a.jpg"), (2, "b c.jpg"), (3, "0003")))

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, read_robot
 from stcal.handeye.data.robot_poses import read_robot_poses
-from stcal.io.poses.columns import read_rotations
-from stcal.io.poses.matrices import find_matrices
+from stcal.io.poses.columns import find_matrices, read_rotations
 from stcal.io.table import Table
 from tests.handeye.written import line
 from tests.outcome import fails_with

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board
-from stcal.geometry.align import align_similarity
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Rigid, Similarity, align_similarity
 from stcal.sfm.adjust.refine import adjust, eccentricity_px, refine
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -159,7 +158,7 @@ def test_circles_carry_covariances_in_the_target_frame(scene, labels_only):
 
 def test_eccentricity_has_the_size_of_the_notes():
     """At 1 m, f = 5580 px, r = 8 mm and 45°: 0.18 px (field notes, from the dual conic)."""
-    from stcal.geometry.conic import circle_image_offset
+    from stcal.geometry.plane import circle_image_offset
 
     normal = np.array([[0, np.sin(np.pi / 4), -np.cos(np.pi / 4)]])
     centre = np.array([[0, 0, 1000.0]])

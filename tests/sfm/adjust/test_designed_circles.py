@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.sfm.adjust.calibration import calibrate
-from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with

@@ -5,10 +5,9 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import chain_faces, measure_chains
 from stcal.sfm.adjust.faces import FaceInGroup, face_frame
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.uncertainty import Derivatives
 from stcal.synthetic.scene import SceneOptions, make_scene

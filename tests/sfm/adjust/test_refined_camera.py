@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.model import camera_prior
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import refine
-from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with

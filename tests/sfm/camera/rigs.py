@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import projection_sigma

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from stcal.design import reference_board
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.camera import Camera, parameter_names
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.io.cameras.model import camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration

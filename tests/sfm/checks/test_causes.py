@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.labels import CircleLabel
 from stcal.sfm.checks.causes import _turned, cause_of_file
 from stcal.sfm.checks.culprits import moved_apart
 from stcal.sfm.checks.verdict import ranked
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
-from stcal.synthetic.observe import image_circles
-from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.sfm.checks.test_checks import Lab
 
 

@@ -11,10 +11,9 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust import joint
-from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
 from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import faces
@@ -24,11 +23,10 @@ from stcal.sfm.checks.images import moved_check
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.pipeline import run
-from stcal.sfm.report.checks import checks_section, count_verdicts
+from stcal.sfm.report.sections import checks_section, count_verdicts
 from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, render
-from stcal.synthetic.scene import SceneOptions, make_scene
+from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
 NOISE_PX = 0.005

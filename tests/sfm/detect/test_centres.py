@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import circle_image_offset
 from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.centres import measure_centres
 from tests.levels import sampled

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.static import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
+from stcal.io.poses.programs import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
 from stcal.labels import parse_label
 from stcal.sfm.interop.export import FORMS, export_run
 from stcal.sfm.interop.export.content import content_of
-from stcal.sfm.interop.export.solids import EDGES
+from stcal.sfm.interop.export.viewers import EDGES
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import fails_with
 

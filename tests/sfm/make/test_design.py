@@ -12,9 +12,18 @@ from stcal.io.design import load_board, load_target, target_toml
 from stcal.lookalikes import MIN_COMMON
 from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import design
-from stcal.sfm.make.box import NAMES, faces_of, sides_of, size_of
 from stcal.sfm.make.design import DesignOptions, make_target
-from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern, unnamed_cases
+from stcal.sfm.make.pattern import (
+    HIDDEN,
+    LARGE,
+    LEAST_CIRCLES,
+    NAMES,
+    faces_of,
+    make_pattern,
+    sides_of,
+    size_of,
+    unnamed_cases,
+)
 from stcal.sfm.planning.bodies import plan
 from stcal.sfm.planning.session import PlanOptions
 from stcal.synthetic.designs import face_of_drawing, second_design

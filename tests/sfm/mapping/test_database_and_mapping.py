@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from stcal.errors import InputError
-from stcal.geometry.align import align_similarity
+from stcal.geometry.rigid import align_similarity
 from stcal.sfm.mapping.database import (
     from_colmap_px,
     image_ids,

@@ -17,7 +17,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.sfm.interop.export_database import copy_database
-from stcal.sfm.interop.external import calibrate_models, faces_from_models
+from stcal.sfm.interop.native import calibrate_models, faces_from_models
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import seeded_mapping
 from stcal.sfm.mapping.models import find_models, open_model, read_model, write_model

@@ -33,9 +33,10 @@ from stcal.sfm.planning.forecast import (
     Setup,
     _rim_integrals,
     forecast,
+    observe,
+    true_models,
     variance_shares,
 )
-from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
 from stcal.sfm.planning.session import plan_with_board as make_plan
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
@@ -542,7 +543,7 @@ def test_plan_out_of_reach(stcal_sfm):
     ],
 )
 def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
-    from stcal.sfm.planning.nominal import nominal_poses
+    from stcal.sfm.planning.forecast import nominal_poses
 
     target, _, _ = second_design()
     target = replace(target, faces=tuple(replace(face, rough_target_from_face=None) for face in target.faces))
@@ -555,7 +556,7 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
 
 @pytest.mark.slow
 def test_plan_of_another_design_with_its_faces(tmp_path):
-    from stcal.sfm.planning.nominal import nominal_poses
+    from stcal.sfm.planning.forecast import nominal_poses
 
     target, board, poses = second_design()
     path = tmp_path / "faces.json"

@@ -13,12 +13,12 @@ from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from stcal.report.document import environment
-from stcal.report.figure import round_below
+from stcal.report.svg import round_below
 from stcal.report.text import number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
 from stcal.sfm.report.page import report_html
-from stcal.sfm.report.trust import factor_in_words
+from stcal.sfm.report.sections import factor_in_words
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}

@@ -22,8 +22,8 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_toml, target_toml
 from stcal.io.images import decode
 from stcal.sfm.detect import files
-from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import encode, render
+from stcal.synthetic.scene import image_circles
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
 from tests.shared import own_copy
 

@@ -33,8 +33,7 @@ from stcal.handeye.data.formats.record import (
 )
 from stcal.handeye.data.formats.tree import ROS
 from stcal.io.files import MB, TABLE_BYTES
-from stcal.io.poses.columns import find_column, places_of, read_rotations
-from stcal.io.poses.matrices import MatrixColumns, find_matrices
+from stcal.io.poses.columns import MatrixColumns, find_column, find_matrices, places_of, read_rotations
 from stcal.io.poses.rotations import of_quaternions, require_finite, said_convention, turned_values
 from stcal.io.table import LENGTHS, Table
 

@@ -16,11 +16,11 @@ from stcal.handeye.data.formats.numeric import NPY, NPZ, TABLE, load_npy, load_n
 from stcal.handeye.data.formats.record import Content, Frames, Said, Side, Unit, require_each_once
 from stcal.handeye.data.formats.tree import read_tree
 from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
-from stcal.io.plain_yaml import load_yaml
-from stcal.io.poses.colmap_images import floats_of, image_lines
 from stcal.io.poses.columns import without_comments
+from stcal.io.poses.programs import floats_of, image_lines
 from stcal.io.poses.rotations import of_quaternions, require_finite, turned_values
 from stcal.io.table import is_comment, read_table, separator_stated
+from stcal.io.toml import load_yaml
 
 IMAGES_TEXT, IMAGES_BINARY = "images.txt", "images.bin"
 _IMAGE = re.compile(r"\d+(?:\s+\S+){7}\s+\d+\s+\S.*")

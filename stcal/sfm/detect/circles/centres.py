@@ -7,9 +7,8 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.circles import bands
 from stcal.sfm.detect.circles.candidates import Ellipses
-from stcal.sfm.detect.circles.fits import CUSP, Fits
+from stcal.sfm.detect.circles.fits import BAND_PX, CUSP, Fits, boxes, intruders, local_ideal_maps
 
 MIN_NOISE2 = 1e-12
 """Noise variance, in squared grey values, that counts as no noise."""
@@ -192,12 +191,12 @@ class _Rims:
 
 def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> _Rims:
     """Fits circles of similar size side by side, as many as a processor's cache holds pixels."""
-    half = bands.boxes(ellipses)
-    to_ideal = bands.local_ideal_maps(camera, ellipses.centre_px, half)
-    masks = bands.intruders(ellipses, neighbours, half)
+    half = boxes(ellipses)
+    to_ideal = local_ideal_maps(camera, ellipses.centre_px, half)
+    masks = intruders(ellipses, neighbours, half)
     size = ellipses.radius_px()
     order = np.argsort(size, kind="stable")
-    pixels = np.cumsum(2 * np.pi * size[order] * 2 * bands.BAND_PX)
+    pixels = np.cumsum(2 * np.pi * size[order] * 2 * BAND_PX)
     ends = np.flatnonzero(np.diff(pixels // PIXELS_AT_ONCE)) + 1
     parts = [
         _rims(Fits(image, ellipses.select(own), half[own], to_ideal[own], [masks[i] for i in own]))

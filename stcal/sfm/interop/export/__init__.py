@@ -9,9 +9,9 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import save, unwritable
-from stcal.io.poses.static import Static, read_messages, read_ros1_launch, read_ros2_launch
+from stcal.io.poses.programs import Static, read_messages, read_ros1_launch, read_ros2_launch
 from stcal.io.table import require_poses_written
-from stcal.sfm.interop.export import solids, tables, viewers
+from stcal.sfm.interop.export import tables, viewers
 from stcal.sfm.interop.export.content import Content, content_of
 from stcal.sfm.interop.export.viewers import write_rrd
 from stcal.sfm.runs.saved import AnyRun, saved_run
@@ -45,8 +45,8 @@ FORMS = {
     "ros1": Form(".launch", tables.launch_ros1, FRAMES_ONLY, read_ros1_launch),
     "opencv": Form(".yml", tables.opencv, "cameras", tables.read_opencv),
     "csv": Form(".csv", tables.table, "cameras, correlations", tables.read_table),
-    "ply": Form(".ply", solids.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),
-    "dxf": Form(".dxf", solids.dxf, "cameras, correlations; σ is in extended data"),
+    "ply": Form(".ply", viewers.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),
+    "dxf": Form(".dxf", viewers.dxf, "cameras, correlations; σ is in extended data"),
     "gltf": Form(".gltf", viewers.gltf, "the lens's distortion but as numbers in extras"),
     "glb": Form(".glb", viewers.glb, "the lens's distortion but as numbers in extras"),
     RERUN: Form(".rrd", None, "the lens's distortion; covariances but as ellipsoids"),

@@ -11,8 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.plain_yaml import load_yaml, opencv_matrix
-from stcal.io.poses.static import (
+from stcal.io.poses.programs import (
     Static,
     fixed_joint,
     messages,
@@ -20,6 +19,7 @@ from stcal.io.poses.static import (
     ros2_launch,
     static_of_joint,
 )
+from stcal.io.toml import load_yaml, opencv_matrix
 from stcal.sfm.interop.export.content import Content
 
 COLUMNS = (

@@ -1,0 +1,384 @@
+"""Poses in the form of other programs: static transforms of ROS, robot controllers, COLMAP's ``images.txt``.
+
+ROS has lengths in metres: messages, joints of URDF, and programs that publish them. Controllers are those of KUKA, ABB,
+Universal Robots, FANUC and Yaskawa.
+"""
+
+import ast
+import json
+import re
+import shlex
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.poses.columns import fixed, joined, without_comments
+
+ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+"""Arguments of ROS 2's ``static_transform_publisher``."""
+METRE_DIGITS, QUATERNION_DIGITS = 12, 15
+"""Digits of the arguments, which are written without exponents; the last digit of a length is 10⁻⁹ mm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Static:
+    """A static transform in a tree of frames; ``pose`` : parent_from_child."""
+
+    parent: str
+    child: str
+    pose: Rigid
+
+
+def metres(pose: Rigid) -> list[float]:
+    """Return the translation of a pose in metres."""
+    return [float(v) / METRE_MM for v in pose.translation]
+
+
+def xyzw(pose: Rigid) -> list[float]:
+    """Return the quaternion of a pose in the order of ROS, w ≥ 0."""
+    return [float(v) for v in Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True)]
+
+
+def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
+    """Return the pose of a translation in metres and a quaternion; inverse of :func:`metres` and :func:`xyzw`."""
+    turn = Rotation.from_quat([float(v) for v in quaternion_xyzw]).as_matrix()
+    return Rigid(turn, [METRE_MM * float(v) for v in translation_m])
+
+
+def messages(statics: Iterable[Static]) -> str:
+    """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
+    return "---\n".join(yaml.safe_dump(_message(static), sort_keys=False, allow_unicode=True) for static in statics)
+
+
+def read_messages(text: str) -> list[Static]:
+    """Return the transforms in a text of :func:`messages`."""
+    statics = []
+    for document in yaml.safe_load_all(text):
+        transform = document["transform"]
+        pose = pose_of_metres([transform["translation"][c] for c in "xyz"], [transform["rotation"][c] for c in "xyzw"])
+        statics.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
+    return statics
+
+
+def _message(each: Static) -> dict:
+    w, x, y, z = (float(v) for v in Poses.of([each.pose]).quaternions()[0])
+    return {
+        "header": {"frame_id": each.parent},
+        "child_frame_id": each.child,
+        "transform": {
+            "translation": dict(zip("xyz", metres(each.pose), strict=True)),
+            "rotation": {"x": x, "y": y, "z": z, "w": w},
+        },
+    }
+
+
+def fixed_joint(each: Static) -> str:
+    """Return a fixed joint of URDF."""
+    name = quoteattr(f"{each.parent}_to_{each.child}")
+    origin = " ".join(repr(v) for v in metres(each.pose))
+    angles = " ".join(repr(float(v)) for v in roll_pitch_yaw(each.pose))
+    return (
+        f'<joint name={name} type="fixed">\n'
+        f"  <parent link={quoteattr(each.parent)}/>\n"
+        f"  <child link={quoteattr(each.child)}/>\n"
+        f'  <origin xyz="{origin}" rpy="{angles}"/>\n'
+        "</joint>\n"
+    )
+
+
+def static_of_joint(joint: ElementTree.Element) -> Static:
+    """Return the transform of a joint of :func:`fixed_joint`."""
+    parts = {part.tag: part.attrib for part in joint}
+    place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
+    pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
+    return Static(parts["parent"]["link"], parts["child"]["link"], pose)
+
+
+def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
+    """Return a shell script with a call of ``ros2 run tf2_ros static_transform_publisher`` for each transform.
+
+    All calls but the last one continue in the background. ``said`` : lines of a comment.
+    """
+    calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
+    head = ["#!/bin/sh", *(f"# {line}" for line in said)]
+    return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
+
+
+def read_ros2_commands(text: str) -> list[Static]:
+    """Return the transforms in a script of :func:`ros2_commands`."""
+    calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
+    return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
+
+
+def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
+    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it.
+
+    Raises InputError: a name has white space, at which ``roslaunch`` would split it.
+    """
+    lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
+    for static in statics:
+        names = static.parent, static.child
+        if spaced := [name for name in names if name.split() != [name]]:
+            raise InputError(
+                "E-FRAME-NAME",
+                f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name",
+            )
+        words = [
+            *plain_numbers(metres(static.pose), METRE_DIGITS),
+            *plain_numbers(xyzw(static.pose), QUATERNION_DIGITS),
+            *names,
+        ]
+        node = f"{static.child}_broadcaster".replace("/", "_")
+        lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
+        lines.append(f"      args={quoteattr(' '.join(words))} />")
+    return "\n".join(lines) + "\n</launch>\n"
+
+
+def read_ros1_launch(text: str) -> list[Static]:
+    """Return the transforms in a launch file of :func:`ros1_launch`."""
+    statics = []
+    for node in ElementTree.fromstring(text).findall("node"):
+        words = node.attrib["args"].split()
+        statics.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
+    return statics
+
+
+def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
+    """Return a launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
+    lines = [f"# {line}" for line in said]
+    lines += ["from launch import LaunchDescription", "from launch_ros.actions import Node", "", ""]
+    lines += ["def generate_launch_description() -> LaunchDescription:", "    nodes = ["]
+    for static in statics:
+        lines += ["        Node(", '            package="tf2_ros",']
+        lines += ['            executable="static_transform_publisher",', '            output="log",']
+        lines += ["            arguments=["]
+        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(static)]
+        lines += ["            ],", "        ),"]
+    return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
+
+
+def read_ros2_launch(text: str) -> list[Static]:
+    """Return the transforms in a launch file of :func:`ros2_launch`."""
+    words = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.keyword) and node.arg]
+    lists = [ast.literal_eval(node) for node in words if isinstance(node, ast.List)]
+    return [_static_of_arguments(arguments) for arguments in lists]
+
+
+def _arguments(each: Static) -> list[str]:
+    values = [*plain_numbers(metres(each.pose), METRE_DIGITS), *plain_numbers(xyzw(each.pose), QUATERNION_DIGITS)]
+    pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *zip(ARGUMENTS, values, strict=True)]
+    return [word for pair in pairs for word in pair]
+
+
+def _static_of_arguments(words: list[str]) -> Static:
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    values = [given[name] for name in ARGUMENTS]
+    return Static(given["--frame-id"], given["--child-frame-id"], pose_of_metres(values[:3], values[3:]))
+
+
+def plain_numbers(values, digits: int) -> list[str]:
+    """Return the texts of numbers without exponents, and without a minus before zero."""
+    return [fixed(v, digits) for v in values]
+
+
+METRE_MM = 1000.0
+"""Millimetres per metre, the unit of ROS, URDF and Universal Robots."""
+MM_DIGITS, DEG_DIGITS, UNIT_DIGITS = 6, 9, 12
+"""Digits of printed mm (to a nanometre), of degrees, and of quaternions, radians and metres."""
+YASKAWA_MM_DIGITS, YASKAWA_DEG_DIGITS = 3, 4
+"""Digits of the fields of a JBI file."""
+REMARK = 32
+"""Largest number of characters of a remark, in a FANUC program and in a JBI file."""
+NUMBER = r"(-?\d+\.\d+)"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseText:
+    """The text form of a pose.
+
+    ``write`` : returns the text of a pose; ``form`` : pattern of that text with its numbers as groups; ``pose`` :
+    returns the pose of these numbers.
+    """
+
+    write: Callable[[Rigid], str]
+    form: re.Pattern[str]
+    pose: Callable[[Sequence[float]], Rigid]
+
+    def read(self, text: str) -> list[Rigid]:
+        """Return all poses of a text, without those in comments."""
+        return [self.pose([float(v) for v in match.groups()]) for match in self.form.finditer(without_comments(text))]
+
+    def first(self, text: str) -> Rigid:
+        """Return the first pose of a text, without those in comments."""
+        return self.read(text)[0]
+
+
+def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
+    """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order.
+
+    At a pitch of ±90° only the sum or difference of roll and yaw is determined. Roll is therefore computed from the
+    rotation that remains after pitch and yaw. This keeps full precision at and near ±90°, where angles computed from
+    single matrix elements lose half of their digits.
+    """
+    r = pose.rotation
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    yaw = np.arctan2(r[1, 0], r[0, 0])
+    remaining = from_roll_pitch_yaw([0.0, pitch, yaw]).T @ r
+    return np.array([np.arctan2(remaining[2, 1], remaining[1, 1]), pitch, yaw])
+
+
+def from_roll_pitch_yaw(angles) -> np.ndarray:
+    """Return the rotation (3, 3) of roll, pitch and yaw, rad: the inverse of :func:`roll_pitch_yaw`."""
+    return Rotation.from_euler("xyz", angles).as_matrix()
+
+
+def _by_angles(pose: Rigid) -> np.ndarray:
+    """Return x, y, z in mm, and degrees about the fixed axes X, Y, Z in this order, (6,)."""
+    return np.append(pose.translation, np.degrees(roll_pitch_yaw(pose)))
+
+
+def _of_angles(values: Sequence[float]) -> Rigid:
+    return Rigid(from_roll_pitch_yaw(np.radians(values[3:])), values[:3])
+
+
+def _kuka(pose: Rigid) -> str:
+    x, y, z, c, b, a = _by_angles(pose)
+    place = [f"{axis} {fixed(v, MM_DIGITS)}" for axis, v in zip("XYZ", (x, y, z), strict=True)]
+    return ",".join([*place, *(f"{axis} {fixed(v, DEG_DIGITS)}" for axis, v in zip("ABC", (a, b, c), strict=True))])
+
+
+def _abb(pose: Rigid) -> str:
+    turn = joined(Poses.of([pose]).quaternions()[0], UNIT_DIGITS)
+    return f"[{joined(pose.translation, MM_DIGITS)}],[{turn}]"
+
+
+def _of_abb(values: Sequence[float]) -> Rigid:
+    *place, w, x, y, z = values
+    return Rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), place)
+
+
+def _ur(pose: Rigid) -> str:
+    return f"p[{joined([*(pose.translation / METRE_MM), *pose.log()[:3]], UNIT_DIGITS, ', ')}]"
+
+
+def _of_ur(values: Sequence[float]) -> Rigid:
+    return Rigid.exp([*values[3:], *(METRE_MM * v for v in values[:3])])
+
+
+def _fanuc(pose: Rigid) -> str:
+    values = _by_angles(pose)
+    place = ",\t".join(f"{c} = {fixed(v, MM_DIGITS)}  mm" for c, v in zip("XYZ", values[:3], strict=True))
+    turn = ",\t".join(f"{c} = {fixed(v, DEG_DIGITS)} deg" for c, v in zip("WPR", values[3:], strict=True))
+    return f"\t{place},\n\t{turn}"
+
+
+def _yaskawa(pose: Rigid) -> str:
+    values = _by_angles(pose)
+    return f"{joined(values[:3], YASKAWA_MM_DIGITS)},{joined(values[3:], YASKAWA_DEG_DIGITS)}"
+
+
+KUKA = PoseText(
+    _kuka,
+    re.compile(",".join(f"{axis} {NUMBER}" for axis in "XYZABC")),
+    lambda v: _of_angles([*v[:3], *reversed(v[3:])]),
+)
+"""Form of KUKA: mm, and degrees A about Z, B about the new Y, C about the newest X: Rz(A) Ry(B) Rx(C)."""
+ABB = PoseText(_abb, re.compile(rf"\[{','.join([NUMBER] * 3)}\],\[{','.join([NUMBER] * 4)}\]"), _of_abb)
+"""Form of ABB: mm, and quaternion q1 (the real part) to q4."""
+UR = PoseText(_ur, re.compile(rf"p\[{', '.join([NUMBER] * 6)}\]"), _of_ur)
+"""Form of Universal Robots: metres, and rotation vector in rad."""
+FANUC = PoseText(_fanuc, re.compile(r",\s+".join(rf"{axis} = {NUMBER} +(?:mm|deg)" for axis in "XYZWPR")), _of_angles)
+"""Form of FANUC: mm, and degrees W, P, R about the fixed X, Y, Z in this order: Rz(R) Ry(P) Rx(W)."""
+YASKAWA = PoseText(_yaskawa, re.compile(rf"^C\d+={','.join([NUMBER] * 6)}$", re.MULTILINE), _of_angles)
+"""Form of Yaskawa: mm, and degrees Rx, Ry, Rz as FANUC's W, P, R; one C line of a JBI file."""
+
+
+def require_form(form: str, forms: Collection[str]) -> None:
+    """Refuses a form of ``--export`` that is not one of ``forms``.
+
+    Raises InputError: the form is unknown; the message names the known ones.
+    """
+    if form not in forms:
+        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(forms)} needed")
+
+
+CELLS = 10
+"""Cells of an image's first line: id, four of the rotation, three of the translation, camera, name."""
+POINT_CELLS = 3
+"""Cells of a point in an image's second line: x, y, id."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageLine:
+    """The first line of an image.
+
+    ``number`` : of the line; ``pose`` : qw, qx, qy, qz, tx, ty, tz; ``name`` : of the image; ``followed`` : whether its
+    second line is there. Programs that remove empty lines also remove those.
+    """
+
+    number: int
+    pose: list[float]
+    name: str
+    followed: bool
+
+
+def image_lines(text: str, where: str) -> list[ImageLine]:
+    """Return the images of ``images.txt``, also of one from which empty lines were removed.
+
+    Raises InputError: a line is neither an image's nor a list of points; the message names it.
+    """
+    images: list[ImageLine] = []
+    pending: tuple[int, list[float], str] | None = None  # an image whose second line is to come
+    for number, line in enumerate(text.splitlines(), 1):
+        record = _record(line)
+        if pending is not None:
+            images.append(ImageLine(*pending, followed=record is None))
+            pending = None
+            if record is None:
+                if not _are_points(line):
+                    raise InputError(
+                        "E-MODEL-UNREADABLE",
+                        f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
+                        "model anew",
+                    )
+                continue
+        elif not line.strip() or line.lstrip().startswith("#"):
+            continue
+        if record is None:
+            raise InputError(
+                "E-MODEL-UNREADABLE",
+                f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
+            )
+        pending = (number, *record)
+    if pending is not None:
+        images.append(ImageLine(*pending, followed=False))
+    return images
+
+
+def _record(line: str) -> tuple[list[float], str] | None:
+    """Return pose and name of an image's first line; None for any other line."""
+    cells = line.split(maxsplit=CELLS - 1)
+    pose = floats_of(cells[1:8])
+    if len(cells) < CELLS or pose is None or floats_of([cells[0], cells[8]]) is None or _are_points(line):
+        return None
+    return pose, cells[9].strip()
+
+
+def _are_points(line: str) -> bool:
+    cells = line.split()
+    return len(cells) % POINT_CELLS == 0 and floats_of(cells) is not None
+
+
+def floats_of(cells: list[str]) -> list[float] | None:
+    """Return the numbers of the cells; None if a cell is no number."""
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError:
+        return None

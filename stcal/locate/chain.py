@@ -1,0 +1,468 @@
+"""Chain base_from_goal = base_from_flange · flange_from_camera · camera_from_goal, its plausibility, and the poses that
+``locate run`` gives in the base beside camera_from_obj."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
+from stcal.io.join import table_of
+from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
+from stcal.io.quaternions import READINGS
+from stcal.io.table import LENGTHS, UNIT_WORDS
+from stcal.locate.pipeline import Located
+
+MOVING, FIXED = "flange_from_camera", "base_from_camera"
+ROBOT = "base_from_flange_"
+
+
+class HandEyeRead(Part):
+    """Part of the file of ``stcal handeye`` that is read here."""
+
+    format: Literal["stcal handeye 1"] = "stcal handeye 1"
+    flange_from_camera: Pose | None = None
+    base_from_camera: Pose | None = None
+    covariance: PoseCovariance | None = None
+
+
+class RegistrationRead(Part):
+    """Part of the file of ``stcal register`` that is read here: a is the camera's frame, b the robot's base."""
+
+    format: Literal["stcal registration 1"] = "stcal registration 1"
+    model: str
+    method: str
+    b_from_a: Matrix4
+    covariance: Matrix
+
+
+@runtime_checkable
+class HandEyeResult(Protocol):
+    """What is used of :class:`stcal.handeye.HandEye`."""
+
+    @property
+    def transforms(self) -> Mapping[str, Rigid]: ...
+
+    @property
+    def covariance(self) -> np.ndarray | None: ...
+
+
+class WithMatrix(Protocol):
+    """A transform of any kind."""
+
+    def matrix(self) -> np.ndarray: ...
+
+
+@runtime_checkable
+class RegistrationResult(Protocol):
+    """What is used of :class:`stcal.register.Registration`: a is the camera's frame, b the robot's base."""
+
+    @property
+    def model(self) -> str: ...
+
+    @property
+    def method(self) -> str: ...
+
+    @property
+    def b_from_a(self) -> WithMatrix: ...
+
+    @property
+    def covariance(self) -> np.ndarray: ...
+
+
+class OffsetFile(Part):
+    """File of the goal's pose in the target's frame, which is exact."""
+
+    obj_from_goal: Pose
+
+
+ROTATION_WITHIN = 1e-6
+"""Largest element of RᵀR − 1 of a rotation. The file of a rigid registration holds all digits."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class GoalChain(Brief):
+    """Chain of transforms from the camera to the robot's base, made by :func:`~stcal.locate.goal_chain`.
+
+    Parameters
+    ----------
+    mount : UncertainRigid
+        flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm.
+    moving : bool
+        Whether the camera is on the flange.
+    flange : dict of UncertainRigid
+        base_from_flange by scene, mm; empty for a fixed camera.
+    offset : Rigid
+        obj_from_goal, mm, which is exact.
+    source : str
+        Origin of ``mount``, for messages.
+    poses_source : str
+        Origin of ``flange``, for messages.
+    """
+
+    mount: UncertainRigid
+    moving: bool
+    flange: dict[str, UncertainRigid]
+    offset: Rigid
+    source: str = "hand-eye file"
+    poses_source: str = "robot poses"
+
+    def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
+        """Returns the goal's pose in the robot's base. Its covariance holds the errors of all links of the chain.
+
+        Raises InputError: the robot has no pose for this scene.
+        """
+        chain = self.mount @ camera_from_obj @ UncertainRigid.exact(self.offset)
+        if not self.moving:
+            return chain
+        if scene not in self.flange:
+            raise InputError(
+                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or remove its exposures"
+            )
+        return self.flange[scene] @ chain
+
+    def without_pose(self, scenes: Sequence[str]) -> list[str]:
+        """Returns the scenes without a robot pose."""
+        return [scene for scene in scenes if self.moving and scene not in self.flange]
+
+    def require_poses(self, scenes: Sequence[str]) -> None:
+        """Refuses scenes without a robot pose, by InputError."""
+        if missing := self.without_pose(scenes):
+            raise InputError(
+                "E-ROBOT-POSES-SCENE",
+                f"{self.poses_source}: none of scene {missing[0]}; add a row, or remove the scene",
+            )
+
+
+def _mounted(
+    hand_eye: HandEyeResult | Rigid | str | Path, robot_poses: Mapping[str, Rigid] | str | Path | None
+) -> tuple[str, UncertainRigid]:
+    """Returns the name of the camera's pose, and the pose. For a transform without a name, the presence of robot poses
+    decides."""
+    if isinstance(hand_eye, Rigid):
+        return FIXED if robot_poses is None else MOVING, UncertainRigid.exact(hand_eye)
+    if isinstance(hand_eye, str | Path):
+        mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
+        either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
+        given = {name: Rigid.from_matrix(matrix) for name, matrix in either.items() if matrix is not None}
+        if len(given) != 1:
+            raise InputError(
+                "E-HANDEYE-FILE",
+                f"hand-eye file {hand_eye}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed",
+            )
+    else:
+        mounted = hand_eye
+        given = {name: pose for name, pose in hand_eye.transforms.items() if name in (MOVING, FIXED)}
+    [(name, pose)] = given.items()
+    return name, UncertainRigid(pose, np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance)
+
+
+def read_registered(
+    registration: RegistrationResult | str | Path, offset: Rigid | str | Path | None = None
+) -> GoalChain:
+    """Reads the result of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
+
+    Raises InputError: a file does not follow ``data_layout.md``, or the registration is not rigid.
+    """
+    if isinstance(registration, str | Path):
+        advice = "give the file of stcal register --out"
+        read = read_result(registration, RegistrationRead, "registration file", advice)
+        source, where, matrix = "registration file", f"registration file {registration}", read.b_from_a
+    else:
+        read, source, where = registration, "registration", "registration"
+        matrix = registration.b_from_a.matrix()
+    linear = matrix[:3, :3]
+    residual = float(np.abs(linear.T @ linear - np.eye(3)).max())
+    if read.covariance.shape != (6, 6) or residual > ROTATION_WITHIN or np.linalg.det(linear) < 0:
+        kind = read.method if read.method == "liu2017" else read.model
+        raise InputError(
+            "E-REGISTER-FILE",
+            f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from 1); base_from_camera needs one, "
+            "register with --model rigid",
+        )
+    mount = UncertainRigid(Rigid.from_matrix(matrix), read.covariance)
+    return GoalChain(mount, False, {}, _offset(offset), source)
+
+
+def _offset(offset: Rigid | str | Path | None) -> Rigid:
+    if offset is None or isinstance(offset, Rigid):
+        return offset or Rigid()
+    read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
+    return Rigid.from_matrix(read.obj_from_goal)
+
+
+def read_robot_poses(
+    path: str | Path, quaternions: Order = "wxyz", key: str = "scene", columns: str | Path | None = None
+) -> dict[str, UncertainRigid]:
+    """Reads base_from_flange of each scene from the columns ``x_mm … qz``, or ``base_from_flange_x_mm …``.
+
+    Column ``key`` names the scenes; ``columns`` : map of the columns.
+    """
+    table = table_of(path, columns, "robot poses", quaternions)
+    prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
+    poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
+    pose_of_scene = {}
+    for row, (name, pose) in enumerate(zip(table.text(key), poses, strict=True)):
+        if name in pose_of_scene:
+            raise InputError(
+                "E-TABLE-ROW-REPEATED",
+                f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed",
+            )
+        pose_of_scene[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])
+    return pose_of_scene
+
+
+NEAR_BASE_MM, NEAR_FLANGE_MM = 20.0, 2.0
+"""Least distances of flange or camera from the base's origin, which is in the robot's foot, and of a camera with its
+housing from the flange's origin. Lengths in metres that are read as mm are smaller: 20 m become 20 mm, 2 m become 2 mm.
+Exact zeros are taken as intended."""
+STILL, STILL_RAD = 0.02, np.radians(2)
+"""Largest RMS variation between scenes of a target that stands still: share of its distance from the camera, angle."""
+FAR_BETTER, BETTER = 30.0, 5.0
+"""Factors by which the product of both variations, and the variation in position, must shrink in another convention.
+A target that moves does not stand still to 2 % of its distance in another convention by chance."""
+UNITS = ("m", "in")
+"""Units in which lengths may be given by mistake instead of mm."""
+
+
+def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str, ...]:
+    """Returns notes on doubtful robot poses or hand-eye transforms, judged by camera_from_obj of the scenes.
+
+    A target that stands still while the flange turns reveals the convention. A single scene, a flange that stands still
+    too, or a target that moves reveal nothing.
+
+    Raises InputError: the target would stand still in another unit or convention only; the message says which.
+    """
+    scenes = [scene for scene in seen if scene in chain.flange]
+    if chain.moving and len(scenes) > 1:
+        flange = Poses.of([chain.flange[scene].rigid for scene in scenes])
+        _require_standing(chain.mount.rigid, flange, Poses.of([seen[scene].rigid for scene in scenes]))
+    return (*_robot_near(chain), *_camera_near(chain))
+
+
+def _robot_near(chain: GoalChain) -> Iterator[str]:
+    distance = max((float(np.linalg.norm(each.rigid.translation)) for each in chain.flange.values()), default=0.0)
+    if 0 < distance < NEAR_BASE_MM:
+        yield (
+            f"robot poses: the flange is within {distance:.2g} mm of the base's origin in all scenes, more than "
+            f"{NEAR_BASE_MM:g} mm expected: if lengths are metres, name the columns _m"
+        )
+
+
+def _camera_near(chain: GoalChain) -> Iterator[str]:
+    distance = float(np.linalg.norm(chain.mount.rigid.translation))
+    frame, least = ("flange", NEAR_FLANGE_MM) if chain.moving else ("base", NEAR_BASE_MM)
+    if 0 < distance < least:
+        yield (
+            f"{chain.source}: the camera is {distance:.2g} mm from the origin of the {frame}, more than {least:g} mm "
+            "expected: if its lengths are metres, multiply them by 1000"
+        )
+
+
+def _require_standing(mount: Rigid, flange: Poses, seen: Poses) -> None:
+    variation = _varies(flange @ mount @ seen)
+    allowed = STILL * float(np.median(np.linalg.norm(seen.translation, axis=1))), STILL_RAD
+    if variation[0] < allowed[0] and variation[1] < allowed[1]:
+        return
+    for reason, robot, camera in _guesses(mount, flange):
+        mm, rad = _varies(robot @ camera @ seen)
+        gain = variation[0] / max(mm, 1e-9) * variation[1] / max(rad, 1e-9)
+        if mm < min(allowed[0], variation[0] / BETTER) and rad < allowed[1] and gain > FAR_BETTER:
+            raise InputError(
+                "E-LOCATE-VARIES",
+                f"robot poses and hand-eye: the target's pose in the base varies by {variation[0]:.3g} mm and "
+                f"{np.degrees(variation[1]):.3g}° (RMS of {len(seen)} scenes), but by {mm:.2g} mm and "
+                f"{np.degrees(rad):.2g}° if {reason}",
+            )
+
+
+def _guesses(mount: Rigid, flange: Poses) -> Iterator[tuple[str, Poses, Rigid]]:
+    """Yields frequent mistakes with their remedy, and base_from_flange and flange_from_camera after the remedy."""
+    for reading in READINGS:
+        yield f"the robot's quaternions were {reading.held}; {reading.remedy}", reading.poses(flange), mount
+    yield "the robot's poses were flange_from_base; give base_from_flange", flange.inverse(), mount
+    yield "the hand-eye were camera_from_flange; give flange_from_camera", flange, mount.inverse()
+    for unit in UNITS:
+        larger = replace(flange, translation=LENGTHS[unit] * flange.translation)
+        yield f"the robot's lengths were {UNIT_WORDS[unit]}; name the columns _{unit}", larger, mount
+        camera = Rigid(mount.rotation, LENGTHS[unit] * mount.translation)
+        yield f"the hand-eye's lengths were {UNIT_WORDS[unit]}; multiply them by {LENGTHS[unit]:g}", flange, camera
+
+
+def _varies(found: Poses) -> tuple[float, float]:
+    """Returns the RMS deviations from the mean pose: mm and rad."""
+    turns = Rotation.from_matrix(np.array(found.rotation))
+    rad = (turns.mean().inv() * turns).magnitude()
+    mm = np.linalg.norm(found.translation - found.translation.mean(axis=0), axis=1)
+    return float(np.sqrt((mm**2).mean())), float(np.sqrt((rad**2).mean()))
+
+
+def camera_from_obj(located: Located) -> Rigid | None:
+    """Returns camera_from_obj by the method that was asked for, or None."""
+    if located.patent is not None:
+        return located.patent.camera_from_obj
+    return None if located.pose is None else located.pose.camera_from_obj
+
+
+def uncertain(located: Located) -> UncertainRigid:
+    """Returns camera_from_obj with its covariance, which is zero for the patent's method."""
+    if located.pose is None:
+        pose = camera_from_obj(located)
+        if pose is None:
+            raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
+        return UncertainRigid.exact(pose)
+    return UncertainRigid(located.pose.camera_from_obj, located.pose.covariance)
+
+
+def accepted(results: Sequence[Located]) -> list[Located]:
+    """Returns the results whose pose may be used."""
+    return [each for each in results if each.verdict.decision == "accept"]
+
+
+@require_arguments
+def goal_chain(
+    hand_eye: HandEyeResult | Rigid | str | Path | None = None,
+    registration: RegistrationResult | str | Path | None = None,
+    *,
+    robot_poses: Mapping[str, Rigid] | str | Path | None = None,
+    offset: Rigid | str | Path | None = None,
+    key: str = "scene",
+    columns: str | Path | None = None,
+    quaternions: Order = "wxyz",
+) -> GoalChain:
+    """Returns the chain base_from_goal = base_from_flange · flange_from_camera · camera_from_obj · obj_from_goal.
+
+    For a fixed camera, base_from_camera stands in place of the first two.
+
+    Parameters
+    ----------
+    hand_eye : HandEye, Rigid, str or Path, optional
+        Result of :func:`stcal.handeye.handeye`, or its file; or an exact transform, mm: flange_from_camera with
+        ``robot_poses``, base_from_camera without.
+    registration : Registration, str or Path, optional
+        Result of :func:`stcal.register.register`, or its file, in place of ``hand_eye``. It must be rigid; a is the
+        frame of a fixed camera, b the robot's base.
+    robot_poses : dict of Rigid, str or Path, optional
+        base_from_flange of each scene by its name, mm, exact; or a table of them (CSV), whose covariances are used.
+        Needed for a camera on the flange only.
+    offset : Rigid, str or Path, optional
+        obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
+    key : str
+        Column of the table that names the scenes.
+    columns : str or Path, optional
+        File with the columns, delimiter … of the table (TOML).
+    quaternions : {"wxyz", "xyzw"}
+        Order of the table's quaternions: by the names of their columns, or x, y, z, w in the order of the columns.
+
+    Returns
+    -------
+    GoalChain
+        For :func:`~stcal.locate.goals` and :func:`~stcal.locate.poses_csv`.
+
+    Raises
+    ------
+    InputError
+        Neither or both of ``hand_eye`` and ``registration`` are given, robot poses are missing or not needed, the
+        registration is not rigid, or a file does not follow ``data_layout.md``.
+    """
+    if hand_eye is not None and registration is not None:
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"--hand-eye {_named(hand_eye)}, --registration {_named(registration)}: both lead to the base; give one",
+        )
+    if hand_eye is None and robot_poses is not None:
+        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
+    if registration is not None:
+        return read_registered(registration, offset)
+    if hand_eye is None and offset is not None:
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
+        )
+    if hand_eye is None:
+        raise InputError(
+            "E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base"
+        )
+    name, mount = _mounted(hand_eye, robot_poses)
+    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
+    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
+    moving = name == MOVING
+    if moving and robot_poses is None:
+        raise InputError(
+            "E-OPTION-MISSING",
+            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
+        )
+    if not moving and robot_poses is not None:
+        raise InputError(
+            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
+        )
+    if robot_poses is None:
+        return GoalChain(mount, moving, {}, _offset(offset), source)
+    if isinstance(robot_poses, str | Path):
+        flange = read_robot_poses(robot_poses, quaternions, key, columns)
+        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
+    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
+    return GoalChain(mount, moving, exact, _offset(offset), source)
+
+
+def _named(given: object) -> str:
+    return str(given) if isinstance(given, str | Path) else type(given).__name__
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Goals(Brief):
+    """Goals of the accepted scenes in the robot's base.
+
+    Parameters
+    ----------
+    base_from_goal : dict of Rigid
+        Pose by scene, mm.
+    covariance : dict of (6, 6) array
+        Covariance of each, of rotation (rad) and translation (mm), left perturbation in the base. It holds the errors
+        of all links of the chain; the patent's method states none of its own.
+    notes : tuple of str
+        Doubts about the robot's poses or the transform to it.
+    """
+
+    base_from_goal: dict[str, Rigid]
+    covariance: dict[str, np.ndarray]
+    notes: tuple[str, ...] = ()
+
+
+@require_arguments
+def goals(results: Sequence[Located], chain: GoalChain) -> Goals:
+    """Returns where the robot has to go: the goal's pose in the robot's base, of each accepted scene.
+
+    Parameters
+    ----------
+    results : sequence of Located
+        Results of :func:`~stcal.locate.run` or :func:`~stcal.locate.locate_image`, by whose names the robot's poses are
+        found.
+    chain : GoalChain
+        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`.
+
+    Returns
+    -------
+    Goals
+        Of accepted poses only, so that no robot moves to a rejected one.
+
+    Raises
+    ------
+    InputError
+        A scene has no robot pose; or the target stands still between the scenes only in another unit or convention of
+        the robot's poses or the transform, which the message names.
+    """
+    chain.require_poses([each.name for each in results])
+    seen = {each.name: uncertain(each) for each in accepted(results)}
+    notes = on_chain(chain, seen)
+    found = {name: chain.base_from_goal(name, pose) for name, pose in seen.items()}
+    return Goals(
+        {name: each.rigid for name, each in found.items()},
+        {name: each.covariance for name, each in found.items()},
+        notes,
+    )

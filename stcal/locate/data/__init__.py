@@ -1,1 +1,0 @@
-"""Data of locate: the target's layout, its scenes, and the photographs of its calibration."""

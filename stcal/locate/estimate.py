@@ -1,0 +1,558 @@
+"""Pose camera_from_obj from the corners of one scene, with covariance, and the second pose that may fit as well.
+Corners of several exposures are merged, and it is tested whether the scene stood still."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from stcal.boards.edges import corners_by_edges
+from stcal.boards.tags import Tags
+from stcal.errors import DegenerateError
+from stcal.geometry import least_squares
+from stcal.geometry.arrays import Brief, freeze, require_arguments
+from stcal.geometry.camera import Camera, intrinsic_basis
+from stcal.geometry.least_squares import (
+    Minima,
+    Normal,
+    NormalEquations,
+    PoseStack,
+    block_diagonal,
+    minimise,
+    select_rows,
+)
+from stcal.geometry.plane import (
+    MAX_OUTLIER_SHARE,
+    MAX_SIGMA_RAD,
+    Descend,
+    Weighed,
+    covariance_of_both,
+    poses_of_plane,
+    step_between,
+    two_minima,
+    weigh,
+    weights_of,
+)
+from stcal.geometry.rigid import ImageFit, Poses, Rigid, skew
+from stcal.io.cameras.model import CameraPrior
+from stcal.locate.layout import TargetLayout
+
+SETTLED = 1e-5
+"""Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
+WEIGH_STEPS, WEIGHED = 60, 1e-6
+"""Largest number of steps, and the least decrease of χ²: a step of less than σ/1000 is the last. Errors that many
+corners share, such as those of the intrinsics, can move a pose by many σ due to single corners."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanarProblem:
+    """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion.
+
+    ``xy`` : (n, 2) corners in {obj}, mm; ``seen`` : (n, 2) their normalised coordinates; ``noise`` : (2n, 2n)
+    covariance of ``seen``; ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``shape`` : (2n, 2n) covariance of ``xy``,
+    mm²; ``common`` : (n, 2, q) derivative of ``seen`` by parameters that several corners share: shifts of each tag's
+    edges and of each tag, and the intrinsics if they are not exact; ``prior`` : (q, q) covariance of these parameters.
+    """
+
+    xy: np.ndarray
+    seen: np.ndarray
+    noise: np.ndarray
+    px_by_seen: np.ndarray
+    shape: np.ndarray
+    common: np.ndarray
+    prior: np.ndarray
+
+    def select(self, keep: np.ndarray) -> "PlanarProblem":
+        """Returns the selected corners."""
+        rows = (2 * keep[:, None] + np.arange(2)).ravel()
+        points = (self.xy[keep], self.seen[keep], self.noise[np.ix_(rows, rows)], self.px_by_seen[keep])
+        return PlanarProblem(*points, self.shape[np.ix_(rows, rows)], self.common[keep], self.prior)
+
+    def in_px(self, residual: np.ndarray) -> np.ndarray:
+        """Returns the residuals (n, 2) in the image with distortion, px."""
+        return (self.px_by_seen @ residual[..., None])[..., 0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProjectedCorners:
+    """Residuals of h poses.
+
+    ``residual`` : (h, n, 2) measured minus projected; ``by_pose`` : (h, n, 2, 6) and ``by_corner`` : (h, n, 2, 2) its
+    negative derivatives; ``before`` : (h,) whether all corners are in front of the camera.
+    """
+
+    poses: Poses | PoseStack
+    residual: np.ndarray
+    by_pose: np.ndarray
+    by_corner: np.ndarray
+    before: np.ndarray
+
+
+def project(problem: PlanarProblem, poses: Poses | PoseStack) -> ProjectedCorners:
+    """Returns the residuals of h poses, and their derivatives."""
+    turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
+    xyz = turned + poses.translation[:, None]
+    depth = xyz[..., 2]
+    before = (depth > 0).all(1)
+    depth = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
+    uv = xyz[..., :2] / depth[..., None]
+    by_point = np.zeros((*uv.shape, 3))
+    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
+    by_point[..., 2] = -uv / depth[..., None]
+    by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+    return ProjectedCorners(poses, problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], before)
+
+
+def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
+    """Returns the descent with residuals of single corners whitened near a pose by noise, shared and layout errors."""
+    by_corner = project(problem, pose).by_corner[0]
+    n = len(problem.xy)
+    noise, shape_of_corner = (
+        matrix.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)] for matrix in (problem.noise, problem.shape)
+    )
+    shared = problem.common @ problem.prior @ np.swapaxes(problem.common, 1, 2)
+    full = noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
+    return partial(_descend, problem, np.linalg.inv(np.linalg.cholesky(full)))
+
+
+def _descend(problem: PlanarProblem, whiten: np.ndarray, poses: PoseStack, huber: float) -> Minima:
+    """Returns the minima next to h poses, with Huber's loss on residuals that are whitened by ``whiten`` (n, 2, 2)."""
+
+    def evaluate(poses: PoseStack) -> Normal:
+        view = project(problem, poses)
+        return Normal.of((whiten @ view.residual[..., None])[..., 0], whiten @ view.by_pose, view.before, huber)
+
+    return least_squares.descend(evaluate, poses, SETTLED)
+
+
+def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Weighed:
+    """Estimates a pose with the full covariance of its corners.
+
+    The covariance is the sum of image noise (divided by Huber's ``weights`` (n,)), shared errors, and the layout's
+    covariance.
+    """
+    root = np.repeat(np.sqrt(weights), 2)
+    noise = problem.noise / (root[:, None] * root)
+    common = problem.common.reshape(2 * len(problem.xy), -1)
+    noise += common @ problem.prior @ common.T
+    by_corner = block_diagonal(project(problem, pose).by_corner[0])
+    full = (noise + by_corner @ problem.shape @ by_corner.T)[None]
+
+    def linearise(poses: PoseStack) -> NormalEquations:
+        view = project(problem, poses)
+        r, a = view.residual.reshape(1, -1, 1), view.by_pose.reshape(1, -1, 6)
+        solved = np.linalg.solve(full, np.concatenate([a, r], axis=2))
+        weighted = np.swapaxes(a, 1, 2) @ solved
+        cost = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
+        return NormalEquations(np.where(view.before, cost, np.inf), weighted[..., :6], -weighted[..., 6])
+
+    # A second solution that is far worse need not converge: it only shows that the first one is better.
+    minimum = minimise(
+        pose, linearise, PoseStack.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
+    ).state
+    view = project(problem, minimum)
+    return weigh(view.residual, view.by_pose, full, minimum)
+
+
+START_PX = 2.0
+"""Scale of the loss that selects a start, in px: typical error of one tag's pose at the other tags."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SeenTags(Brief):
+    """Corners of a layout's tags in one scene.
+
+    Parameters
+    ----------
+    rows : (k,) int array
+        Rows of the tags in the layout.
+    corners_px : (k, 4, 2) array
+        Corners in the image, with distortion.
+    covariance_px2 : (k, 8, 8) array
+        Covariances of the four corners of each tag, including the layout's additional σ of single corners.
+    edge_sigma_px : (k,) array
+        σ of the common shift of all edges of a tag.
+    """
+
+    rows: np.ndarray
+    corners_px: np.ndarray
+    covariance_px2: np.ndarray
+    edge_sigma_px: np.ndarray
+
+    def __post_init__(self):
+        freeze(self, "rows", (None,), "rows", int)
+        k = len(self.rows)
+        freeze(self, "corners_px", (k, 4, 2), "tags' corners")
+        freeze(self, "covariance_px2", (k, 8, 8), "corners' covariances")
+        freeze(self, "edge_sigma_px", (k,), "edges' σ")
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def select(self, keep) -> "SeenTags":
+        """Returns the selected tags."""
+        return SeenTags(self.rows[keep], self.corners_px[keep], self.covariance_px2[keep], self.edge_sigma_px[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ObjPose(ImageFit, Brief):
+    """Pose of the target in one scene.
+
+    Parameters
+    ----------
+    camera_from_obj : Rigid
+        The pose, mm.
+    covariance : (6, 6) array
+        Covariance, rad and mm, left perturbation in the camera frame.
+    rows : (k,) int array
+        Rows of the tags used in the layout.
+    outliers : tuple of int
+        Rows of the tags that were left out because they contradict the others.
+    residuals_px : (4k, 2) array
+        Measured minus projected corners.
+    weights : (4k,) array
+        Huber's weights.
+    chi2 : float
+        χ² of the residuals with their full covariance.
+    redundancy : int
+        Number of measured coordinates minus the six unknowns of the pose.
+    foreshortening : float
+        Cosine between the target's normal and the line of sight to the middle of its corners.
+    extent_px : float
+        Extent of the corners in the image across their longer direction.
+    delta_chi2 : float
+        χ² of the second solution minus that of the pose; infinite if there is no second solution.
+    second : Rigid or None
+        The second solution, camera_from_obj.
+    """
+
+    camera_from_obj: Rigid
+    covariance: np.ndarray
+    rows: np.ndarray
+    outliers: tuple[int, ...]
+    residuals_px: np.ndarray
+    weights: np.ndarray
+    chi2: float
+    redundancy: int
+    foreshortening: float
+    extent_px: float
+    delta_chi2: float = np.inf
+    second: Rigid | None = None
+
+    def sigma_rad(self) -> float:
+        """Returns σ of the rotation about the worst axis."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    def sigma_mm(self) -> float:
+        """Returns σ of the translation along the worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+
+
+@require_arguments
+def locate(
+    seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
+) -> ObjPose:
+    """Estimates the target's pose camera_from_obj from the corners of its tags in one scene.
+
+    The first step minimises the corners' residuals with Huber's loss. It starts from the best pose of all tags together
+    or of a single tag, and from the mirror image of this pose. The second step weighs the residuals by their full
+    covariance.
+
+    Parameters
+    ----------
+    seen : SeenTags
+        Corners of the layout's tags, px.
+    layout : TargetLayout
+        The target, with the covariance of its corners.
+    camera : Camera
+        The camera at the size of the image.
+    prior : CameraPrior, optional
+        Covariance of the intrinsics; they are exact if None.
+    where : str
+        Name of the scene, for messages.
+
+    Returns
+    -------
+    ObjPose
+        The better minimum, with the second solution if there is one.
+
+    Raises
+    ------
+    DegenerateError
+        There is no tag, the tags contradict one another, or the corners do not determine the rotation.
+    ConvergenceError
+        No minimum is reached.
+    """
+    if not len(seen):
+        raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
+    problem = problem_of(seen, layout, camera, prior)
+    start = PoseStack.of(_start(problem, where))
+    keep, outliers, all_corners = np.arange(len(seen)), [], problem
+    failure = f"{where}: no pose found; check layout and camera file"
+    while True:
+        middle = Rigid(np.eye(3), np.append(problem.xy.mean(0), 0.0))
+        two = two_minima(partial(descent_near, problem), start, middle, failure)
+        minima = two.minima
+        excess = minima.length[0].reshape(-1, 4).max(1) / two.outlier_limit
+        worst = int(excess.argmax())
+        if excess[worst] <= 1:
+            break
+        outliers.append(int(seen.rows[keep[worst]]))
+        keep = np.delete(keep, worst)
+        if len(outliers) > MAX_OUTLIER_SHARE * len(seen):
+            names = ", ".join(str(layout.tags[row][1]) for row in sorted(outliers))
+            raise DegenerateError(
+                "E-LOCATE-CONTRADICTS",
+                f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout "
+                "and camera file belong to the images",
+            )
+        problem = all_corners.select((4 * keep[:, None] + np.arange(4)).ravel())
+        start = minima.poses[[0]]
+    pose = _answer(problem, minima, seen.rows[keep], tuple(outliers))
+    if pose.sigma_rad() > MAX_SIGMA_RAD:
+        raise DegenerateError(
+            "E-LOCATE-OPEN", f"{where}: its tags do not determine the rotation; show more tags, or larger ones"
+        )
+    return pose
+
+
+def problem_of(
+    detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None
+) -> PlanarProblem:
+    """Returns the corners with their full noise model."""
+    rows = (8 * detected.rows[:, None] + np.arange(8)).ravel()
+    pixels = detected.corners_px.reshape(-1, 2)
+    ideal = camera.normalised_from_pixel(pixels)
+    px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
+    seen_by_px = np.linalg.inv(px_by_seen)
+    common = np.concatenate([_by_edges(detected, seen_by_px), _by_tag(len(detected), seen_by_px)], axis=2)
+    common_covariance = np.diag(
+        np.append(detected.edge_sigma_px**2, np.full(2 * len(detected), layout.tag_sigma_px**2))
+    )
+    if prior is not None:
+        by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
+        common = np.concatenate([common, by_camera], axis=2)
+        common_covariance = np.asarray(block_diag(common_covariance, prior.covariance))
+    of_tags = block_diagonal(seen_by_px.reshape(-1, 4, 2, 2))
+    noise = block_diagonal(of_tags @ detected.covariance_px2 @ np.swapaxes(of_tags, 1, 2))
+    xy = layout.corners_mm[detected.rows].reshape(-1, 2)
+    return PlanarProblem(
+        xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance
+    )
+
+
+def _by_edges(detected: SeenTags, back: np.ndarray) -> np.ndarray:
+    """Returns the derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
+    k = len(detected)
+    jacobian = np.zeros((k, 4, 2, k))
+    jacobian[np.arange(k), :, :, np.arange(k)] = corners_by_edges(detected.corners_px)
+    return back @ jacobian.reshape(4 * k, 2, k)
+
+
+def _by_tag(k: int, back: np.ndarray) -> np.ndarray:
+    """Returns the derivative (4k, 2, 2k) of the corners by the shift of each whole tag, px."""
+    jacobian = np.zeros((k, 4, 2, k, 2))
+    jacobian[np.arange(k), :, :, np.arange(k)] = np.eye(2)
+    return back @ jacobian.reshape(4 * k, 2, 2 * k)
+
+
+def _start(problem: PlanarProblem, where: str) -> Rigid:
+    """Returns the pose that fits most corners, among those from all corners together and from each tag alone."""
+    tags = [slice(4 * k, 4 * k + 4) for k in range(len(problem.xy) // 4)]
+    for sets in ([slice(None)], tags):
+        poses = _poses(problem, sets)
+        if poses is None:
+            continue
+        view = project(problem, poses)
+        distance = np.linalg.norm((problem.px_by_seen @ view.residual[..., None])[..., 0], axis=2)
+        score = np.where(view.before, np.log1p((distance / START_PX) ** 2).sum(1), np.inf)
+        best = int(score.argmin())
+        # If all corners agree with one pose, none is wrong, and poses of single tags are not needed.
+        if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or distance[best].max() < 2 * START_PX):
+            return poses[best]
+    raise DegenerateError(
+        "E-LOCATE-NO-POSE", f"{where}: no pose explains the tags' corners; check layout, camera file and tags"
+    )
+
+
+def _poses(problem: PlanarProblem, sets: list[slice]) -> Poses | None:
+    """Returns both poses of each set of corners, or None if no set gives a pose."""
+    poses = []
+    for corners in sets:
+        try:
+            poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
+        except DegenerateError:
+            continue
+    return Poses.of(poses) if poses else None
+
+
+def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: tuple[int, ...]) -> ObjPose:
+    """Chooses the better minimum, and returns it with the other one as the second solution."""
+    weights = weights_of(found.length)
+    if len(weights) == 1:
+        return _collected(problem, weighed(problem, found.poses, weights[0]), weights[0], rows, outliers)
+    # Both minima use the same weights, the smaller of the two. Otherwise an outlier of one minimum could decide.
+    pair = [weighed(problem, found.poses[[i]], weights.min(0)) for i in range(2)]
+    delta = float(pair[1].chi2[0] - pair[0].chi2[0])
+    better = int(delta < 0)
+    best = weighed(problem, found.poses[[better]], weights[better])
+    pose = _collected(problem, best, weights[better], rows, outliers)
+    return replace(pose, delta_chi2=abs(delta), second=pair[1 - better].poses.rigid(0))
+
+
+def _collected(problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows, outliers: tuple[int, ...]) -> ObjPose:
+    """Returns the pose of one minimum, without a second solution."""
+    pose = best.poses.rigid(0)
+    middle = pose @ np.append(problem.xy.mean(0), 0.0)
+    offset = problem.in_px(problem.seen - problem.seen.mean(0))
+    covariance = np.linalg.inv(best.normal[0])
+    return ObjPose(
+        camera_from_obj=pose,
+        covariance=(covariance + covariance.T) / 2,
+        rows=rows,
+        outliers=outliers,
+        residuals_px=problem.in_px(best.residual[0]),
+        weights=weights,
+        chi2=float(best.chi2[0]),
+        redundancy=2 * len(problem.xy) - 6,
+        foreshortening=float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle)),
+        extent_px=float(np.ptp(offset @ np.linalg.svd(offset, full_matrices=False)[2][1])),
+    )
+
+
+def covering_both(pose: ObjPose) -> ObjPose:
+    """Returns the pose with a covariance that also covers its second solution, weighted by the odds of both."""
+    if pose.second is None:
+        return pose
+    step = step_between(PoseStack.of(pose.camera_from_obj), PoseStack.of(pose.second))
+    return replace(pose, covariance=covariance_of_both(pose.covariance, step, pose.delta_chi2))
+
+
+PRIOR_SHARE, PRIOR_WEIGHT = 0.5, 20.0
+"""Prior of the share of a corner's variance that differs between exposures, and its weight in differences."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shift:
+    """Shift of the tags' middles between two exposures.
+
+    ``tags`` : number of tags in common; ``shift_px`` : median of their shifts; ``sigma_px`` : σ of one tag's shift.
+    """
+
+    exposures: tuple[str, str]
+    tags: int
+    shift_px: float
+    sigma_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """Result of :func:`merge`: the merged corners of all exposures.
+
+    ``seen`` : the layout's tags with merged corners; ``counts`` : (e,) number of the layout's tags in each exposure;
+    ``share`` : share of the corners' variance that differs between exposures; ``shifts`` : shift of each exposure
+    against the one with the most tags in common; ``repeated`` : tags of the layout that an exposure shows more than
+    once; ``unknown`` : tags that are not in the layout.
+    """
+
+    seen: SeenTags
+    counts: tuple[int, ...]
+    share: float
+    shifts: tuple[Shift, ...]
+    repeated: tuple[tuple[str, int], ...]
+    unknown: tuple[tuple[str, int], ...]
+
+
+def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] = ()) -> Merged:
+    """Returns weighted means of the corners over the exposures, with their covariance.
+
+    Exposures of one scene share much of a corner's error: print, lens, sampling of its edges by the pixels. The shared
+    part does not average out. It is estimated by comparing the differences between exposures with their stated σ. If
+    the differences exceed these, the σ are increased. The σ due to print, lens and flatness (the layout's ``sigma_px``)
+    is common to all exposures.
+    """
+    rows = layout.rows()
+    places = [{rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows} for tags in exposures]
+    used = np.array(sorted({row for place in places for row in place}), int)
+    corners, covariance, joint, edge = _stacked(exposures, places, used)
+    visible = np.isfinite(corners[..., 0, 0])
+    # At a right angle, a corner shifts by √2 times the shift of its edges.
+    variance = np.trace(covariance, axis1=-2, axis2=-1) + 2 * edge[..., None] ** 2
+    weight = np.where(visible[..., None], 1 / variance, 0.0)
+    weight_share = weight / weight.sum(0)
+    mean = (weight_share[..., None] * np.where(visible[..., None, None], corners, 0)).sum(0)
+    share = _differing_share(corners, covariance, mean, visible)
+    growth, differing = max(share, 1.0), min(share, 1.0)
+    root = np.repeat(weight_share, 2, axis=2)[..., None] * np.linalg.cholesky(joint)
+    independent = np.einsum("enij,enlj->nil", root, root)
+    common = np.einsum("enij,fnlj->nil", root, root)
+    merged = growth * (differing * independent + (1 - differing) * common) + layout.sigma_px**2 * np.eye(8)
+    names = names or [str(k + 1) for k in range(len(exposures))]
+    repeated = {tag for tags in exposures for tag in tags.repeated if tag in rows}
+    unknown = {tag for tags in exposures for tag in tags.tags if tag not in rows}
+    return Merged(
+        SeenTags(used, mean, merged, (weight_share.mean(2) * edge).sum(0)),
+        tuple(int(n) for n in visible.sum(1)),
+        share,
+        _shifts(corners, covariance, visible, names),
+        tuple(sorted(repeated)),
+        tuple(sorted(unknown)),
+    )
+
+
+def _stacked(exposures, places, used: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Returns corners (e, n, 4, 2), covariances of each and of a tag's four, and σ of the edges' common shift, (e, n).
+
+    For tags that are not seen these are NaN, 1 px² and 0.
+    """
+    corners = np.full((len(exposures), len(used), 4, 2), np.nan)
+    edge = np.zeros(corners.shape[:2])
+    covariance = np.tile(np.eye(2), (len(exposures), len(used), 4, 1, 1))
+    joint = np.tile(np.eye(8), (len(exposures), len(used), 1, 1))
+    for e, (tags, place) in enumerate(zip(exposures, places, strict=True)):
+        visible = [k for k, row in enumerate(used) if row in place]
+        columns = [place[used[k]] for k in visible]
+        corners[e, visible] = tags.corners_px[columns]
+        covariance[e, visible] = tags.covariance_px2[columns]
+        joint[e, visible] = tags.joint_px2[columns]
+        edge[e, visible] = tags.edge_sigma_px()[columns]
+    return corners, covariance, joint, edge
+
+
+def _differing_share(corners, covariance, mean, there) -> float:
+    """Returns the share of the corners' stated variance that appears as differences between exposures.
+
+    A common shift of a tag's edges is removed before.
+    """
+    difference = np.where(there[..., None, None], corners - mean, 0)
+    direction = corners_by_edges(mean)
+    difference -= (
+        (difference * direction).sum((2, 3), keepdims=True)
+        / (direction * direction).sum((1, 2))[:, None, None]
+        * direction
+    )
+    square = np.einsum("enki,enkij,enkj->enk", difference, np.linalg.inv(covariance), difference)
+    repeated = there.sum(0) > 1
+    # Bounds the influence of a tag that one exposure gets wrong.
+    square = np.minimum(square[:, repeated], 25.0)
+    dof = 7 * float((there.sum(0)[repeated] - 1).sum())
+    return float((square.sum() + PRIOR_SHARE * PRIOR_WEIGHT) / (dof + PRIOR_WEIGHT))
+
+
+def _shifts(corners, covariance, there, names) -> tuple[Shift, ...]:
+    """Returns the shift of each exposure against the one with most tags in common, among exposures with more tags."""
+    order = sorted(range(len(there)), key=lambda e: -int(there[e].sum()))
+    middle = corners.mean(2)
+    variance = np.trace(covariance, axis1=-2, axis2=-1).mean(2) / 4
+    shifts = []
+    for place, e in enumerate(order):
+        others = [(int((there[e] & there[f]).sum()), f) for f in order[:place]]
+        common, f = max(others, default=(0, -1))
+        if common:
+            both = there[e] & there[f]
+            length = np.linalg.norm(middle[e, both] - middle[f, both], axis=1)
+            sigma = np.sqrt((variance[e, both] + variance[f, both]).mean())
+            shifts.append(Shift((names[f], names[e]), common, float(np.median(length)), float(sigma)))
+    return tuple(shifts)

@@ -1,1 +1,0 @@
-"""Reports and files of locate, for people, programs and robots."""

@@ -1,1 +1,0 @@
-"""Checks whether the points determine the transform, and of mistakes in the data."""

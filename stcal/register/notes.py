@@ -1,0 +1,347 @@
+"""Checks whether the points determine the transform, and notes on what a user should check, one line each."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import Affine, Similarity, best_rotations
+from stcal.geometry.robust import ratio_limit
+from stcal.register.liu2017 import ASSUMED
+from stcal.register.mistakes import (
+    SHOWN,
+    UNIT_WITHIN,
+    UNITS,
+    Shifted,
+    Wider,
+    moved_meanwhile,
+    neighbours_alike,
+    order_note,
+    outlier_notes,
+)
+from stcal.register.models import Model, squares
+from stcal.register.pairs import Problem
+from stcal.register.result import Alternative
+from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Covariance, Fitted
+
+WIDER_THAN = 10.0
+"""Least spread √Σd² of points off a line (affine: off a plane), in σ. The turn about it then has σ ≤ 0.1 rad."""
+SYMMETRY_UP_TO = 200
+"""Largest number of points checked for symmetry. Larger sets are clouds, not layouts with labels."""
+IN_CYCLE = 6
+"""Number of points of a cycle that a note names."""
+
+
+def spreads(xyz: np.ndarray) -> np.ndarray:
+    """Returns the root square sums (3,) of centred points along their principal axes, the longest first, mm."""
+    centred = xyz - xyz.mean(0)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred)[::-1], 0))
+
+
+def by_chance(agreeing: int, n: int, sigma_mm: float) -> DegenerateError:
+    """Returns the error of point pairs that agree no better than chance."""
+    return DegenerateError(
+        "E-REGISTER-CHANCE",
+        f"registration: {agreeing} of {n} point pairs agree to {sigma_mm:.4g} mm, no better than chance; check that "
+        "row i of both is the same point",
+    )
+
+
+def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
+    """Refuses points that do not determine the model at their σ.
+
+    Raises DegenerateError: the points lie along a line, or in a plane for the affine model; or σ is as large as their
+    whole extent.
+    """
+    n, spread = len(xyz_a), spreads(xyz_a)
+    needed = WIDER_THAN * sigma_mm
+    off_line = float(np.hypot(spread[1], spread[2]))
+    length = spread[0] / np.sqrt(n)
+    if n > model.needed and spread[0] < needed:
+        raise by_chance(n, n, sigma_mm)
+    if off_line < needed:
+        raise DegenerateError(
+            "E-POINTS-COLLINEAR",
+            f"registration: the {n} points lie along a line, {off_line / np.sqrt(n):.4g} mm RMS off it ({length:.4g} "
+            f"mm along it); {needed / np.sqrt(n):.4g} mm needed at σ {sigma_mm:.4g} mm; measure points off the line",
+        )
+    if model.name == "affine" and spread[2] < needed:
+        raise DegenerateError(
+            "E-POINTS-COPLANAR",
+            f"registration: the {n} points lie in a plane, {spread[2] / np.sqrt(n):.4g} mm RMS off it ({length:.4g} mm "
+            f"along it); {needed / np.sqrt(n):.4g} mm needed for the affine model at σ {sigma_mm:.4g} mm; measure "
+            "points off the plane, or use the rigid model",
+        )
+
+
+def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:
+    """Returns the indices of points that are indispensable: if one of them is left out, :func:`check_extent` refuses
+    the others."""
+    n = len(xyz_a)
+    centred = xyz_a - xyz_a.mean(0)
+    scatter = centred.T @ centred
+    held = np.linalg.eigvalsh(scatter)[: 1 if model.name == "affine" else 2].sum()
+    taken = n / (n - 1) * (centred**2).sum(1)  # upper bound of a point's part of these eigenvalues: few pass it
+    rows = np.flatnonzero(held - taken < (1 + 1e-6) * (WIDER_THAN * sigma_mm) ** 2 + 1e-9 * np.trace(scatter))
+    own = centred[rows]
+    values = np.maximum(np.linalg.eigvalsh(scatter - n / (n - 1) * own[:, :, None] * own[:, None, :]), 0)
+    off = values[:, 0] if model.name == "affine" else values[:, 0] + values[:, 1]
+    return rows[np.sqrt(off) < WIDER_THAN * sigma_mm]
+
+
+def check_supports(
+    model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_mm: float, name: Callable[[int], str]
+) -> None:
+    """Refuses a set with outliers in which a single point determines a turn, as any wrong point would have fitted
+    there.
+
+    Raises DegenerateError if the others would be refused by :func:`check_extent` without that point.
+    """
+    rows = np.flatnonzero(inliers)
+    alone = single_supports(model, xyz_a[rows], sigma_mm)
+    if len(alone):
+        kind, first = "plane" if model.name == "affine" else "line", name(int(rows[alone[0]]))
+        raise DegenerateError(
+            "E-REGISTER-DEGENERATE",
+            f"registration: only {first} keeps the {len(rows)} points that agree off a {kind}, and any "
+            f"wrong point would fit there as well; measure more points off the {kind}",
+        )
+
+
+def row_name(row: int, lines: Sequence[int] | None) -> str:
+    """Returns a point's name for messages: its line in the file, else its row from 1."""
+    return f"row {row + 1}" if lines is None else f"line {lines[row]}"
+
+
+def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
+    """Returns a turn that maps the points onto themselves but not each onto itself: angle (rad), permutation (n,).
+
+    Candidates map the point farthest from the centroid and one off that line to others at the same distances. Of
+    several turns the one with the smallest misfit is returned. The result is None if there is no turn, or points are
+    too close together for the tolerance.
+    """
+    n = len(xyz)
+    if not 3 <= n <= SYMMETRY_UP_TO:
+        return None
+    centred = xyz - xyz.mean(0)
+    if pdist(centred).min() < 4 * tolerance_mm:
+        return None
+    radius = np.linalg.norm(centred, axis=1)
+    first = int(radius.argmax())
+    second = int(np.linalg.norm(np.cross(centred, centred[first]), axis=1).argmax())
+    apart = np.linalg.norm(centred[:, None] - centred, axis=2)
+    fits = (
+        (np.abs(radius - radius[first]) < 2 * tolerance_mm)[:, None]
+        & (np.abs(radius - radius[second]) < 2 * tolerance_mm)
+        & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
+    )
+    tree = KDTree(centred)
+    least, best = np.inf, None
+    for i, j in np.argwhere(fits):
+        if (i, j) == (first, second):
+            continue
+        turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
+        # from two points, then from all: the first two carry their own noise
+        turn = best_rotations(centred[_nearest(tree, centred @ turn.T)].T @ centred)[0]
+        to = _nearest(tree, centred @ turn.T)
+        turn = best_rotations(centred[to].T @ centred)[0]
+        misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
+        is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
+        if is_one and misfit <= 2 * tolerance_mm and misfit < least:
+            least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
+    return best
+
+
+def _nearest(tree: KDTree, xyz: np.ndarray) -> np.ndarray:
+    """Returns the indices (n,) of the tree's points nearest to points (n, 3)."""
+    return np.asarray(tree.query(xyz)[1])
+
+
+def symmetry_note(found: tuple[float, np.ndarray], rows: np.ndarray, name: Callable[[int], str]) -> str:
+    """Returns one line on the turn and the points that it exchanges."""
+    angle, to = found
+    start = int(np.flatnonzero(to != np.arange(len(to)))[0])
+    cycle, at = [start], int(to[start])
+    while at != start:
+        cycle.append(at)
+        at = int(to[at])
+    steps = ", ".join(
+        f"{name(int(rows[i]))} → {name(int(rows[j]))}" for i, j in pairwise([*cycle, start][: IN_CYCLE + 1])
+    )
+    return (
+        f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({steps}"
+        f"{', …' if len(cycle) > IN_CYCLE or (to != np.arange(len(to))).sum() > len(cycle) else ''}); labels exchanged "
+        "like that would fit as well, so check that rows are the same points"
+    )
+
+
+LOW_REDUNDANCY = 6
+"""Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""
+MAJORITY = 0.5
+"""Fraction of the point pairs below which a note says that few agree."""
+SMALL_MM = 20.0
+"""Extent of points below which they may be in metres: 20 m are 20 mm then. Few parts that are measured are smaller."""
+TIGHT = 2.5
+"""Threshold in σ below which the covariance of few points is too small. 2.5 σ cuts off a tenth of the good points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Subject:
+    """A registration to judge.
+
+    Parameters
+    ----------
+    problem : problem
+    method : str
+    fitted : fitted
+    alternative : alternative or None
+    ambiguous : whether the alternative is about as good
+    other : a wider model that explains the points
+    shifted : inliers that are shifted together
+    covariance : covariance
+    factor : ratio of the residuals to the given σ; None if none was given
+    lines : lines of the file that name the points
+    """
+
+    problem: Problem
+    method: str
+    fitted: Fitted
+    alternative: Alternative | None
+    ambiguous: bool
+    other: Wider | None
+    shifted: Shifted | None
+    covariance: Covariance
+    factor: float | None
+    lines: Sequence[int] | None
+
+    def name(self, row: int) -> str:
+        """Returns a point's name for messages."""
+        return row_name(row, self.lines)
+
+
+def notes_of(subject: Subject) -> list[str]:
+    """Returns all notes."""
+    other = subject.other
+    sigma = subject.fitted.sigma if other is None else other.sigma_mm
+    notes = [*_agreement(subject), *_noise(subject, other), *_layout(subject, sigma)]
+    return notes + outlier_notes(subject.problem, subject.fitted, subject.name)
+
+
+def _agreement(subject: Subject) -> list[str]:
+    fitted, other = subject.fitted, subject.alternative
+    agree, count = int(fitted.inliers.sum()), len(fitted.inliers)
+    notes = []
+    if agree < MAJORITY * count:
+        notes.append(f"only {agree} of {count} point pairs agree; check the others before you trust the transform")
+    if other is not None:
+        shown = ", ".join(subject.name(i) for i in other.rows[:SHOWN])
+        more = ", …" if len(other.rows) > SHOWN else ""
+        start = "AMBIGUOUS: " if subject.ambiguous else ""
+        notes.append(
+            f"{start}{len(other.rows)} of the other points agree on another transform, {other.apart_mm:.4g} mm and "
+            f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}{more}); did an instrument move between them?"
+        )
+    if subject.method == "liu2017":
+        notes.append(ASSUMED)
+    if subject.method == "least-squares":
+        notes += _far_rows(subject)
+    return notes
+
+
+def _far_rows(subject: Subject) -> list[str]:
+    """Returns notes on rows that the robust method would examine."""
+    problem = subject.problem
+    redundancy = problem.redundancy
+    square = squares(problem.residuals(subject.fitted.transform))
+    bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
+    far = np.flatnonzero(square > bound)
+    if not len(far):
+        return []
+    worst = int(far[square[far].argmax()])
+    return [
+        f"{len(far)} points lie farther off than noise would put them, the farthest {subject.name(worst)} at "
+        f"{np.sqrt(square[worst]):.4g} mm; use the robust method"
+    ]
+
+
+def _noise(subject: Subject, other: Wider | None) -> list[str]:
+    fitted, notes = subject.fitted, []
+    inside, transform = subject.problem[fitted.inliers], fitted.transform
+    if other is not None:
+        notes.append(other.note)
+        inside, transform = other.problem, other.transform
+    residuals = inside.residuals(transform)
+    if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
+        notes.append(
+            "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
+            "other, and a transform is valid only where its points are; see the residual field"
+        )
+    if other is None and subject.method != "liu2017":
+        change = moved_meanwhile(subject.problem, transform)
+        notes += [] if change is None else [order_note(change, subject.name)]
+    if subject.shifted is not None:
+        notes.append(_two_groups(subject, subject.shifted))
+    if subject.factor is not None and subject.covariance.scaled:
+        notes.append(
+            f"residuals exceed the σ given {subject.factor:.3g} times, which is beyond chance; the covariance is "
+            f"scaled by this factor"
+        )
+    enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
+    if len(inside) <= enough and subject.covariance.scaled:
+        more = enough + 2 - len(inside)
+        notes.append(f"of {len(inside)} points a wrong one cannot be identified: measure {more} more")
+    redundancy = subject.covariance.redundancy
+    if redundancy < LOW_REDUNDANCY:
+        notes.append(f"σ rests on {redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
+    if fitted.threshold < TIGHT * fitted.sigma and subject.method == "robust":
+        notes.append(
+            f"the threshold of {fitted.threshold:.4g} mm is only {fitted.threshold / fitted.sigma:.2g} σ and cuts off "
+            "good points; leave it out to have it estimated"
+        )
+    return notes
+
+
+def _two_groups(subject: Subject, shifted: Shifted) -> str:
+    inliers = np.flatnonzero(subject.fitted.inliers)
+    shown = ", ".join(subject.name(int(inliers[i])) for i in shifted.rows[:SHOWN])
+    more = ", …" if len(shifted.rows) > SHOWN else ""
+    by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
+    where = ", and lie together" if shifted.together else ""
+    return (
+        f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
+        f"{shifted.count - len(shifted.rows)}{where} ({shown}{more}): two groups, and the data do not show which is "
+        f"right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
+    )
+
+
+def _layout(subject: Subject, sigma: float) -> list[str]:
+    """Returns notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
+    model, fitted, notes = subject.problem.model, subject.fitted, []
+    rows = np.flatnonzero(fitted.inliers)
+    inside, transform = subject.problem.xyz_a[rows], fitted.transform
+    if len(rows) <= LEVERAGE_UP_TO and subject.method != "liu2017":
+        alone = single_supports(model, inside, sigma)
+        kind = "plane" if model.name == "affine" else "line"
+        notes += [
+            f"only {subject.name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
+            for row in rows[alone[:SHOWN]].tolist()
+        ]
+    if model.name != "affine" and spreads(inside)[2] < WIDER_THAN * sigma:
+        notes.append("the points lie in a plane: a mirrored frame would not be noticed")
+    if isinstance(transform, Affine) and np.linalg.det(transform.linear) < 0:
+        notes.append("the transform is a reflection: one of the frames is left-handed")
+    if isinstance(transform, Similarity):
+        scale = transform.scale
+        for factor, (name, _) in UNITS.items():
+            if abs(max(scale, 1 / scale) / factor - 1) < UNIT_WITHIN:
+                notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {name}?")
+    extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (subject.problem.xyz_a, subject.problem.xyz_b))
+    if 0 < extent < SMALL_MM:
+        notes.append(f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m")
+    found = symmetry(inside, fitted.threshold if np.isfinite(fitted.threshold) else 4 * sigma)
+    return notes if found is None else [*notes, symmetry_note(found, rows, subject.name)]

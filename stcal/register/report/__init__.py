@@ -1,1 +1,0 @@
-"""Results of a registration as text, page, pictures and file."""

@@ -1,0 +1,597 @@
+"""The robust method: consensus of a subset, then σ, inliers and the final fit over all points together.
+
+1. A consensus, point pairs that agree on one transform, is searched, and again within itself until its points are
+   consistent with one σ.
+2. Fit, σ and inliers are updated in turn until the set stays the same. A point is an outlier if its residual, with the
+   fit's own uncertainty (deletion residual), exceeds the F(3, ν) bound that any point of a clean set exceeds in one
+   case of a thousand (5 σ for a hundred points), or if it exceeds the given threshold.
+3. The consensus is tested for chance: a-contrario again, now against points that lie anywhere among the others
+   (Moisan & Stival 2004).
+4. The other points are searched for another transform on which they agree as well.
+
+In the search, random minimal samples are scored, and the best are concentrated. The score needs no threshold. For a
+transform and the k points nearest to it, x = RSS_k / RSS_n compares their square sum with that of the least-squares fit
+to all n. Were all residuals Gaussian of one σ, x would follow Beta((3k − p)/2, 3(n − k)/2) for a set chosen beforehand;
+for the best of all C(n, k) sets of all sizes the chance is at most Σ C(n, k) P(x): a number of false alarms in the
+sense of Moisan & Stival (2004, a-contrario RANSAC), but with Gaussian least squares as the background, so that neither
+a threshold nor a volume enters. The set that minimises it is the consensus; a minimum above ``FALSE_ALARMS`` means that
+nothing contradicts one σ for all points. Chernoff's bound stands for the Beta distribution (it is never below it, and
+has no underflow). Refinement is the concentration step of least trimmed squares (Rousseeuw & Van Driessen 2006): fit to
+the set, choose the set anew.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import comb
+
+import numpy as np
+from scipy.optimize import root_scalar
+from scipy.special import chdtr, chdtrc, chdtri, gammaln
+
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.robust import ratio_limit
+from stcal.register.models import Model, Transform, hypotheses, leverages, parts, unit_covariance
+from stcal.register.pairs import Problem
+
+CONTRADICTED_AT = 0.01
+"""Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
+WIDE = 8.0
+"""Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Covariance:
+    """Covariance of a transform's parameters.
+
+    ``matrix`` : (p, p) parameters as of :func:`~stcal.register.models.unit_covariance`; ``scaled`` : whether it is
+    derived from the residuals; False if it is derived from the given σ; ``redundancy`` : degrees of freedom of the σ
+    that it is derived from; infinite if this σ was given.
+    """
+
+    matrix: Array
+    scaled: bool
+    redundancy: float
+
+    def __post_init__(self):
+        freeze(self, "matrix", (None, None), "covariance")
+
+
+def kept_share(cut: float) -> float:
+    """Returns the fraction of points within ``cut`` σ, from χ²₃."""
+    return float(chdtr(3, cut**2))
+
+
+def kept_variance(cut: float) -> float:
+    """Returns the fraction of the total sum of squares that points within ``cut`` σ contribute, from χ²₅."""
+    return float(chdtr(5, cut**2))
+
+
+def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
+    """Estimates σ of points from residuals that were cut off at a threshold.
+
+    Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ.
+    Below c = 1 the points fill the sphere almost uniformly and give no information on σ.
+
+    Parameters
+    ----------
+    square_sum : square sum of the residuals of the points used, mm²
+    model : model
+    count : number of points used
+    threshold : threshold at which residuals were cut off, mm; infinite if none was
+
+    Returns
+    -------
+    float
+        σ per axis, mm, at most the threshold.
+    """
+    sigma = float(np.sqrt(square_sum / model.redundancy(count)))
+    if sigma == 0 or threshold > WIDE * sigma:
+        return sigma
+
+    def excess(candidate: float) -> float:
+        cut = threshold / candidate
+        return candidate**2 * kept_variance(cut) / kept_share(cut) - sigma**2
+
+    if excess(threshold) < 0:
+        return threshold
+    bracket = (sigma, threshold)
+    return float(root_scalar(excess, method="brentq", bracket=bracket, xtol=1e-9 * sigma, rtol=1e-9).root)
+
+
+def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold: float) -> Covariance:
+    """Returns the covariance of a fit.
+
+    A given σ is kept unless χ² contradicts it. Cutting off at c σ increases the variance of the estimate by the factor
+    χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
+
+    ``inliers`` : points that the transform is fitted to; ``b_from_a`` : transform; ``sigma`` : estimated σ, mm of a
+    point of mean σ; ``threshold`` : threshold at which residuals were cut off, mm; infinite if none was.
+    """
+    model, noise = inliers.model, inliers.noise
+    redundancy = float(inliers.redundancy)
+    used, scaled = sigma, True
+    if noise.sigma_mm is not None:
+        scaled = bool(chdtrc(redundancy, redundancy * (sigma / noise.sigma_mm) ** 2) < CONTRADICTED_AT)
+        if not scaled:
+            used, redundancy = noise.sigma_mm, np.inf
+    matrix = used**2 * unit_covariance(model, b_from_a, inliers.xyz_a, noise.precision)
+    if used > 0 and threshold < WIDE * used:
+        cut = threshold / used
+        matrix = matrix * kept_share(cut) / kept_variance(cut)
+    return Covariance(matrix, scaled, redundancy)
+
+
+def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
+    """Adds a common shift (3,), mm, as an error to the covariance of a fit between two groups of points."""
+    p = len(covariance.matrix)
+    by_step = np.zeros(p)
+    by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm
+    return replace(covariance, matrix=covariance.matrix + np.outer(by_step, by_step))
+
+
+FALSE_ALARMS = 1e-4
+"""Expectation of sets declared in data without outliers. It is small because a chance set of few points claims a
+σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
+LEAST_REDUNDANCY = 6
+"""Redundancy of the smallest consensus: four points rigidly, five in similarity, six affinely."""
+MISSED = 1e-9
+"""Chance that no sample is free of outliers, for which the number of samples is chosen."""
+LEAST_SHARE = 0.25
+"""Smallest share of a consensus that the number of samples is chosen to find. A smaller one may be missed."""
+CLEAN_PER_WIDE = 3
+"""Number of clean samples assumed for each one wide enough to lead to the optimum; measured: every second one does."""
+EXHAUSTIVE = 2000
+"""Largest number of possible samples that are all tried (23 points rigidly)."""
+BATCH = 500
+"""Number of samples scored at once."""
+MOST_SAMPLES = 20_000
+"""Largest number of samples, above any need: ``LEAST_SHARE`` takes 3900 samples of three points, 15 900 of four."""
+REFINED = 6
+"""Number of the best samples of a batch that are refined."""
+MAX_STEPS = 30
+"""Largest number of concentration steps. They end after a few: each lowers the score, and the sets are finite."""
+TINY = 1e-24
+"""Relative square sums, as a share of the points' own, below which they are rounding errors."""
+
+Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Score of squared distances (s, n): value of each row (less is better), and the largest square in the row's set."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consensus:
+    """A set of points that agree on a transform.
+
+    ``inliers`` : (n,) bool array; ``value`` : score, less is better; ``samples`` : number of samples; 0 if all possible
+    ones were tried.
+    """
+
+    inliers: np.ndarray
+    value: float
+    samples: int
+
+
+def by_scale(model: Model, count: int, total: float) -> Score:
+    """Returns a score that minimises the logarithm of the number of false alarms.
+
+    ``total`` : sum of squares of the least-squares fit to all points.
+    """
+    k = np.arange(model.sample, count)
+    k = k[3 * k > model.parameters]  # sets too small to be trusted are scored, too; if one wins, the result is refused
+    a, b = (3 * k - model.parameters) / 2, 3 * (count - k) / 2
+    tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ordered = np.sort(square, axis=1)
+        share = np.cumsum(ordered, axis=1)[:, k - 1] / total
+        value = tests + chernoff(share, a, b)
+        best = value.argmin(1)
+        rows = np.arange(len(square))
+        return value[rows, best], ordered[rows, k[best] - 1]
+
+    return score
+
+
+def chernoff(share: float | np.ndarray, a: float | np.ndarray, b: float | np.ndarray) -> np.ndarray:
+    """Returns Chernoff's bound of log P(Beta(a, b) ≤ share).
+
+    The bound of P is (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1.
+    """
+    limit = a / (a + b)
+    share = np.clip(share, TINY, limit)
+    return a * np.log(share / limit) + b * np.log((1 - share) / (1 - limit))
+
+
+def by_share(model: Model, count: int) -> Score:
+    """Returns the score by least trimmed squares of the larger half.
+
+    Its breakdown point is highest (Rousseeuw 1984).
+    """
+    k = max((count + model.parameters // 3 + 1) // 2, model.sample + 1)
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ordered = np.partition(square, k - 1, axis=1)[:, :k]
+        return ordered.sum(1), ordered[:, k - 1]
+
+    return score
+
+
+def by_threshold(threshold: float) -> Score:
+    """Returns the score by the square sum, cut off at the threshold (MSAC, Torr & Zisserman 2000)."""
+
+    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.minimum(square, threshold**2).sum(1), np.full(len(square), threshold**2)
+
+    return score
+
+
+def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
+    """Returns the best set that random samples lead to.
+
+    Parameters
+    ----------
+    problem : problem
+    score : score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    Consensus or None
+        None if no sample leads to a set of enough points.
+    """
+    count, size = len(problem), problem.model.sample
+    drawn, needed, best = 0, 1.0, None
+    every = None
+    if comb(count, size) <= EXHAUSTIVE:
+        every = np.array(list(combinations(range(count), size)))
+    while drawn < needed:
+        samples = every if every is not None else _random_samples(count, size, rng)
+        drawn += len(samples)
+        found = _best_of(problem, score, samples)
+        if found is not None and (best is None or found.value < best.value):
+            best = found
+        if every is not None:
+            break
+        share = max(best.inliers.mean() if best is not None else 0, LEAST_SHARE)
+        clean = min(share, 1 - 1e-9) ** size
+        needed = min(CLEAN_PER_WIDE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
+    return None if best is None else Consensus(best.inliers, best.value, 0 if every is not None else drawn)
+
+
+def _best_of(problem: Problem, score: Score, samples: np.ndarray) -> Consensus | None:
+    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
+    square = _squares_of_many(linear, translation, problem)
+    value, cut = score(square)
+    best = None
+    for i in np.argsort(value, kind="stable")[:REFINED]:
+        found = _concentrated(problem, score, square[i] <= cut[i])
+        if found is not None and (best is None or found.value < best.value):
+            best = found
+    return best
+
+
+def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consensus | None:
+    """Alternates between fitting and selecting the set until the score decreases no more."""
+    best = None
+    for _ in range(MAX_STEPS):
+        if inliers.sum() < problem.model.sample:
+            break
+        try:
+            transform = problem[inliers].fit()
+        except (DegenerateError, ConvergenceError):
+            break
+        square = problem.squares(transform)
+        value, cut = score(square[None])
+        if best is not None and value[0] >= best.value:
+            break
+        inliers = square <= cut[0]
+        best = Consensus(inliers, float(value[0]), 0)
+    return best
+
+
+def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Problem) -> np.ndarray:
+    """Returns the squared distances (s, n) under s transforms."""
+    turned = (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
+    residual = problem.xyz_b.T - translation[:, :, None]
+    residual -= turned
+    precision = problem.noise.precision
+    if precision is not None and precision.ndim == 3:
+        weighted = np.einsum("nij,sjn->sin", precision, residual, optimize=True)
+        return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
+    plain = np.einsum("sin,sin->sn", residual, residual)
+    return plain if precision is None else plain * precision
+
+
+def _random_samples(count: int, size: int, rng: np.random.Generator) -> np.ndarray:
+    """Returns random indices (s, size), all different within each sample."""
+    drawn = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
+    return drawn[(np.diff(drawn, axis=1) > 0).all(1)]
+
+
+SUBSET = 500
+"""Number of points on which samples are scored. It gives σ and shares to 2 %."""
+CLEAN_SETS_WITH_OUTLIER = 0.001
+"""Probability that a clean set has any point that is called an outlier."""
+LEVERAGE_UP_TO = 10_000
+"""Largest number of points for which leverage is considered; beyond it the fit's uncertainty adds under 0.02 % to a
+residual."""
+MAX_ROUNDS = 50
+"""Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
+NESTED = 6
+"""Depth of consensus within a consensus, as gross errors hide smaller ones."""
+BY_CHANCE = 0.01
+"""Largest number of false alarms of a consensus that is accepted, per file."""
+DISTINCT = 5.0
+"""Least distance between two distinct transforms, in σ."""
+MOST_OF_REST = 0.5
+"""Least share of the outliers that must agree on another transform. A few of many outliers always lie near some
+transform by chance; half of them do not."""
+AS_GOOD = 0.5
+"""Share of the result's points with which a second transform makes the result ambiguous. If 60 % of the points are
+wrong and all in one other motion, the true ones are 40 : 60 of the wrong."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """A transform with the points that agree on it.
+
+    Parameters
+    ----------
+    transform : b_from_a
+    inliers : (n,) bool array
+    sigma : σ per axis, mm of a point of mean σ
+    threshold : largest distance of inliers, mm of a point of mean σ; infinite if no residual was cut off
+    samples : number of random samples; 0 if none or all possible ones were tried
+    """
+
+    transform: Transform
+    inliers: np.ndarray
+    sigma: float
+    threshold: float
+    samples: int = 0
+
+
+def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
+    """Returns the transform with its inliers and σ.
+
+    ``problem`` : problem; ``threshold`` : largest distance of inliers, mm of a point of mean σ; estimated if not given;
+    ``seed`` : seed of the random samples.
+
+    Raises DegenerateError if too few points agree, or no more than could agree by chance. Raises ConvergenceError: if
+    a fit with covariances did not converge.
+    """
+    rng = np.random.default_rng(seed)
+    count = len(problem)
+    subset = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
+    if threshold is None:
+        inliers, samples = _consensus(subset, rng)
+    else:
+        consensus = search(subset, by_threshold(threshold), rng)
+        if consensus is None:
+            raise _too_few_agree(problem.model, count, threshold)
+        inliers, samples = consensus.inliers, consensus.samples
+    start = settled(subset, inliers, threshold, samples)
+    if count > SUBSET:
+        near = problem.squares(start.transform) <= start.threshold**2
+        start = settled(problem, near, threshold, samples)
+    return start
+
+
+def _consensus(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, int]:
+    """Returns the mask of the points that agree, and the number of samples."""
+    rows, samples = np.arange(len(problem)), 0
+    model = problem.model
+    for _ in range(NESTED):
+        if len(rows) <= model.sample or model.redundancy(len(rows) - 1) <= 0:
+            break
+        subset = problem[rows]
+        total = subset.squares(subset.fit()).sum()
+        if total <= len(rows) * subset.rounding_mm() ** 2:
+            break
+        consensus = search(subset, by_scale(model, len(rows), total), rng)
+        samples += consensus.samples if consensus is not None else 0
+        if consensus is None or consensus.value > np.log(FALSE_ALARMS):
+            break
+        _check_trust(model, consensus)
+        rows = rows[consensus.inliers]
+    mask = np.zeros(len(problem), bool)
+    mask[rows] = True
+    return mask, samples
+
+
+def _check_trust(model: Model, found: Consensus) -> None:
+    agree = int(found.inliers.sum())
+    if model.redundancy(agree) < LEAST_REDUNDANCY:
+        raise DegenerateError(
+            "E-REGISTER-DISAGREE",
+            f"registration: only {agree} of {len(found.inliers)} point pairs agree on one {model.name} transform, at "
+            f"least {-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more "
+            "points",
+        )
+
+
+def _too_few_agree(model: Model, count: int, threshold: float | None) -> DegenerateError:
+    within = "" if threshold is None else f" within {threshold:.4g} mm"
+    larger = "" if threshold is None else ", or give a larger threshold"
+    return DegenerateError(
+        "E-REGISTER-DISAGREE",
+        f"registration: fewer than {model.needed} of {count} point pairs agree on one {model.name} transform{within}; "
+        f"check the order of the rows and the units{larger}",
+    )
+
+
+def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
+    """Updates fit, σ and inliers in turn until the set stays the same. Of a cycle of sets the largest is returned.
+
+    Parameters
+    ----------
+    problem : problem
+    inliers : (n,) first set of inliers
+    threshold, samples : : as in :func:`robust_fit` and :class:`Fitted`
+
+    Returns
+    -------
+    Fitted
+
+    Raises
+    ------
+    DegenerateError
+        If too few points agree.
+    """
+    model = problem.model
+    fit_of_set: dict[bytes, Fitted] = {}
+    floor = problem.rounding_mm()
+    for _ in range(MAX_ROUNDS):
+        count = int(inliers.sum())
+        if count < model.needed:
+            raise _too_few_agree(model, len(inliers), threshold)
+        transform = problem[inliers].fit()
+        square = problem.squares(transform)
+        sigma = max(sigma_within(square[inliers].sum(), model, count, threshold or np.inf), floor)
+        if threshold is not None:
+            cut, chosen = threshold, square <= threshold**2
+        else:
+            cut, chosen = _chosen(problem, transform, square, inliers, sigma)
+        key = np.packbits(inliers).tobytes()
+        if key in fit_of_set:
+            cycle = list(fit_of_set)
+            return max((fit_of_set[k] for k in cycle[cycle.index(key) :]), key=lambda f: f.inliers.sum())
+        fit_of_set[key] = Fitted(transform, inliers, sigma, cut, samples)
+        # a test that leaves too few points is not applied
+        enough = min(LEAST_REDUNDANCY, model.redundancy(count))
+        too_few = threshold is None and model.redundancy(int(chosen.sum())) < enough
+        if too_few or (chosen == inliers).all():
+            return fit_of_set[key]
+        inliers = chosen
+    return max(fit_of_set.values(), key=lambda f: f.inliers.sum())
+
+
+def _chosen(
+    problem: Problem, transform: Transform, square: np.ndarray, used: np.ndarray, sigma: float
+) -> tuple[float, np.ndarray]:
+    """Returns the threshold at the middle of the points, mm, and the mask of the points that pass the test."""
+    total, redundancy = len(problem), problem.model.redundancy(int(used.sum()))
+    beyond = CLEAN_SETS_WITH_OUTLIER / total
+    outside = 3 * sigma**2 * ratio_limit(beyond, 3, redundancy)
+    if total > LEVERAGE_UP_TO:
+        return float(np.sqrt(outside)), square <= outside
+    deletion = deletion_squares(problem, transform, used)
+    passed = deletion <= outside
+    if redundancy > 3:  # a point that was used is tested against the σ of the others
+        rest = np.maximum(redundancy * sigma**2 - deletion[used], 0) / (redundancy - 3)
+        passed[used] = deletion[used] <= 3 * ratio_limit(beyond, 3, redundancy - 3) * np.maximum(rest, 1e-300)
+    return float(np.sqrt(outside)), passed
+
+
+def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
+    """Returns the squares of each point's residual from a fit without this point.
+
+    r (1 − H)⁻¹ r for points that were used, r (1 + H)⁻¹ r for others, with whitened residuals r and H of
+    :func:`~stcal.register.models.leverages` (Cook & Weisberg 1982, Residuals and Influence in Regression).
+
+    Parameters
+    ----------
+    problem : problem
+    transform : fit to the points used
+    used : (n,) bool array
+
+    Returns
+    -------
+    (n,) array
+        rᵀ C⁻¹ r, C the residual's covariance at unit noise.
+    """
+    added = leverages(problem.model, transform, problem.xyz_a, used, problem.noise.precision)
+    own = np.where(used, -1.0, 1.0)[:, None, None]
+    value, vector = np.linalg.eigh(np.eye(3) + own * added)
+    turned = np.einsum("nij,ni->nj", vector, problem.whitened(transform))
+    return (turned**2 / np.maximum(value, 1e-9)).sum(1)
+
+
+def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -> float:
+    """Returns the logarithm of the number of sets that would agree as well if the points lay anywhere among the others.
+
+    Moisan & Stival's (2004) number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of a
+    box that a cube of half side r takes, at most 1 along each axis.
+
+    Parameters
+    ----------
+    problem : Problem
+    fitted : Fitted
+    extent : (3,) array, optional
+        Sides of this box, mm; by default those of the inliers along their principal axes (thin if they are coplanar).
+
+    Returns
+    -------
+    float
+        Its logarithm.
+    """
+    model, every = problem.model, len(problem)
+    rows = np.arange(every)[:: max(1, every // LEVERAGE_UP_TO)]
+    share = problem[rows]
+    count, k = len(rows), np.arange(model.sample + 1, len(rows) + 1)
+    if not len(k):
+        return 0.0
+    order = np.sort(np.linalg.norm(share.residuals(fitted.transform), axis=1))
+    sides = np.ptp(_along_axes(share.xyz_b[fitted.inliers[rows]]), axis=0) if extent is None else extent
+    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(sides, 1e-300)).prod(1)
+    choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
+    value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
+    return float(value.min())
+
+
+def _along_axes(points: np.ndarray) -> np.ndarray:
+    """Returns the points along their own principal axes."""
+    centred = points - points.mean(0)
+    return centred @ np.linalg.eigh(centred.T @ centred)[1]
+
+
+def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
+    """Returns the transform on which the outliers agree within the same threshold.
+
+    Parameters
+    ----------
+    problem : problem
+    fitted : transform of the inliers
+    seed : seed as in :func:`robust_fit`
+
+    Returns
+    -------
+    Fitted or None
+        None if the outliers agree no better than by chance.
+    """
+    model = problem.model
+    outside = np.flatnonzero(~fitted.inliers)
+    if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
+        return None
+    rng = np.random.default_rng(seed + 1)
+    tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
+    redundancy = model.redundancy(int(fitted.inliers.sum()))
+    # σ may be so large
+    threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
+    consensus = search(problem[tried], by_threshold(threshold), rng)
+    if consensus is None or consensus.inliers.sum() <= model.sample:
+        return None
+    transform = problem[tried[consensus.inliers]].fit()
+    outliers = problem[outside]
+    near = outliers.squares(transform) <= threshold**2
+    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(outliers), AS_GOOD * fitted.inliers.sum()):
+        return None
+    points = outliers.xyz_a[near]
+    if np.sqrt(((transform @ points - fitted.transform @ points) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
+        return None  # good points that a tight threshold cut off
+    # wrong points lie anywhere as far off the transform found as the farthest of them
+    off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
+    alone = Fitted(transform, near, fitted.sigma, threshold)
+    if chance(outliers, alone, np.full(3, 2 * off)) > np.log(BY_CHANCE):
+        return None
+    mask = np.zeros(len(problem), bool)
+    mask[outside[near]] = True
+    return Fitted(transform, mask, fitted.sigma, threshold, consensus.samples)
+
+
+def turn_between(one: Transform, two: Transform) -> float:
+    """Returns the angle between the rotations of two rigid or similarity transforms, rad."""
+    (a, _), (b, _) = parts(one), parts(two)
+    cosine = (np.trace(a @ b.T) / np.cbrt(np.linalg.det(a) * np.linalg.det(b)) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1, 1)))

@@ -1,0 +1,350 @@
+"""Sections of a run's page: how far to trust it, its settings, its checks, the cross-check and the published method."""
+
+import math
+from dataclasses import dataclass
+
+from stcal.labels import parse_label
+from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
+from stcal.report.text import NONE, cells, join, number
+from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.judgement import CHANCE, Judgement
+
+SOLVES = {
+    "joint": "joint: one adjustment over all groups",
+    "chain": "chain: group by group, then combined",
+    "paper": "paper: as published by Zhang & Wei (2017), for comparison",
+}
+SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
+SCALES |= {"drawing": "unknown: the drawing defines the unit"}
+FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """Words for what was photographed.
+
+    ``point`` : circle, corner or, where faces have either, point; ``board`` : whether a board of dots gives the scale
+    """
+
+    point: str
+    board: bool
+
+    @classmethod
+    def of(cls, report: dict) -> "Words":
+        """Returns the words for a run."""
+        printed = {face in report["summary"].get("printed_faces", []) for face in report["faces"]}
+        point = "point" if len(printed) > 1 else "corner" if True in printed else "circle"
+        return cls(point, "board" in report["summary"].get("scale_from", ["board"]))
+
+    @property
+    def points(self) -> str:
+        """Returns the plural of ``point``."""
+        return f"{self.point}s"
+
+
+SIZES = {
+    "board": "the given pitch of the board",
+    "faces": "the stated size of the printed faces",
+    "distances": "the stated distances",
+    "drawing": "the drawing as the unit of length",
+}
+"""What gives the scale, in words."""
+
+
+def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
+    """Returns for what σ hold, and the worst value of each kind."""
+    summary, options = report["summary"], report["options"]
+    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
+    pitch = "the pitch as a whole (100 ppm is 4 K on aluminium)"
+    others = {"faces", "distances"} & set(summary.get("scale_from", []))
+    stated = ". The σ stated of the size are in them" if others else ""
+    if options["solve"] != "joint":
+        scope = (
+            "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
+            "the given intrinsics: an error of the camera calibration goes into the faces"
+        )
+    elif judgement.verdict == "no":
+        scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
+    elif options.get("refine_camera", False):
+        scope = f"σ hold for {size}; the intrinsics were adjusted, and their σ are in them{stated}" + (
+            f". An error of {pitch} is not in them" if words.board else ""
+        )
+    else:
+        scope = (
+            f"σ hold for the given intrinsics and {size}{stated}. An error of the camera calibration"
+            + (f", or of {pitch}," if words.board else "")
+            + " is not in them"
+        )
+    factor = f"group by group, {factor_in_words(summary['sigma_factor'])}"
+    if summary["sigma0"] is not None:
+        factor += (
+            ". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = "
+            f"{summary['sigma0']:.2f}; near 1, all observations agree with one another. The σ of the faces include "
+            "that factor, and σ₀ too where it is above 1: small residuals make no σ smaller. `budget` states the "
+            f"latter as {max(1.0, summary['sigma0']):.3f}"
+        )
+    single = [face for face, chains in report["chains"].items() if len(chains) == 1]
+    one_way = "reached by only one chain, so that no second chain confirms them: face"
+    return [
+        f"{scope}, and residuals hardly show it" if scope.endswith("not in them") else scope,
+        factor,
+        Table(["<Check", "Value", "<Where", "<Remark"], _worst_values(report, words), css="text"),
+        f"{one_way} {join(single)}" if single else "",
+    ]
+
+
+def _size_mm(report: dict) -> float:
+    """Returns the diagonal of the box around the target's circles."""
+    circles = list(report["scene"]["circles"].values())
+    return math.dist(*[[pick(axis) for axis in zip(*circles, strict=True)] for pick in (min, max)]) if circles else 0.0
+
+
+def factor_in_words(factor: float) -> str:
+    if 0.95 <= factor <= 1.05:
+        return "residuals are as large as the centres' own σ"
+    return f"residuals are {factor:.1f} times the centres' own σ"
+
+
+def _worst(found) -> tuple[float, str] | None:
+    return max(found, key=lambda candidate: candidate[0], default=None)
+
+
+def _largest_sigma(report: dict, key: str) -> tuple[float, str] | None:
+    return _worst((max(face[key]), f"face {name}") for name, face in report["faces"].items() if face[key] is not None)
+
+
+def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
+    return _worst(
+        (chain[key], f"face {face} by {' → '.join(chain['groups'])}")
+        for face, chains in report["chains"].items()
+        if len(chains) > 1
+        for chain in chains
+    )
+
+
+def headline(report: dict, words: Words) -> list[tuple[str, str, str]]:
+    """Returns (value, unit, description) of the tiles."""
+    summary = report["summary"]
+    sigma = _largest_sigma(report, "translation_sigma_um")
+    ppm = max((abs(group["scale"]["difference_ppm"]) for group in report["groups"]), default=None)
+    return [
+        (number(summary["residual_rms_px"], 4), "px", "residual, RMS per axis"),
+        (number(summary["sigma0"], 2), "", "σ₀ of the joint adjustment"),
+        (number(summary["sigma_factor"], 2), "×", factor_in_words(summary["sigma_factor"])),
+        (number(sigma and sigma[0], 1), "µm", "largest σ of a face's position"),
+        *([(number(ppm, 1), "ppm", "largest difference of λ by rows")] if words.board else []),
+    ]
+
+
+def settings(report: dict, words: Words) -> list[list[str]]:
+    summary, options, camera = report["summary"], report["options"], report["camera"]
+    left_out, last_move = report["left_out"], summary["last_move_px"]
+    sizes = " × ".join(str(size) for size in camera["size_px"])
+    solve, frame = str(options["solve"]), str(options["frame"])
+    round_ = words.point != "corner"
+    single = sum(row.get("gate") == "views" for row in left_out["circles"])
+    return [
+        ["Solve", SOLVES.get(solve, solve)],
+        ["Face frames", FRAMES.get(frame, frame) if round_ else "those of their drawings"],
+        *(
+            [["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"]]
+            if round_
+            else []
+        ),
+        *([["Surface", f"luminous, behind rims of {rim:.3f} mm"]] if (rim := summary.get("rim_mm")) else []),
+        *([["Dots of the board", f"behind rims of {rim:.3f} mm"]] if (rim := summary.get("dot_rim_mm")) else []),
+        ["Reference face", report["reference_face"]],
+        ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
+        ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
+        ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
+        [
+            "Left out",
+            f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
+            f"{len(left_out['circles']) - single} {words.points}; {single} more that one image of a group alone shows",
+        ],
+        ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
+        [
+            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
+            f"{camera['model']}, {sizes} px",
+        ],
+        ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
+        ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
+        ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
+        ["Program", f"stcal {report['version']}"],
+    ]
+
+
+def _worst_values(report: dict, words: Words) -> list[list[str]]:
+    """Returns rows of check, worst value, its place, remark."""
+    board = _worst((g["scale"]["board_rms_um"], f"group {g['name']}") for g in report["groups"])
+    ppm = _worst((abs(g["scale"]["difference_ppm"]), f"group {g['name']}") for g in report["groups"])
+    flat = _worst((face["plane_rms_um"], f"face {name}") for name, face in report["faces"].items())
+    single = _worst((row["max_px"], f"{row['image']}, {row['worst']}") for row in report["residuals_by_image"])
+    over = f"{number(1e-3 * ppm[0] * _size_mm(report), 1)} µm over the target's diagonal" if ppm else ""
+    parts = "of the groups before they are adjusted together, so many σ of the result; the checks judge it"
+    return [
+        [name, number(worst and worst[0], digits), worst[1] if worst else NONE, remark if worst else "not computed"]
+        for name, worst, digits, remark in (
+            ("σ of a face's position (µm)", _largest_sigma(report, "translation_sigma_um"), 1, "largest of X, Y, Z"),
+            ("σ of a face's rotation (mdeg)", _largest_sigma(report, "rotation_sigma_mdeg"), 2, "largest of X, Y, Z"),
+            ("Disagreement of chains, position (µm)", _worst_chain(report, "translation_um"), 1, parts),
+            ("Disagreement of chains, rotation (mdeg)", _worst_chain(report, "rotation_mdeg"), 2, "likewise"),
+            (f"{words.points.capitalize()} off their plane, RMS (µm)", flat, 1, "a face that is not flat, or noise"),
+            (
+                "Board residual, RMS (µm)" if words.board else "Residual of what gives the scale, RMS (µm)",
+                board,
+                1,
+                "of the length in space: the group's model against the board's grid"
+                if words.board
+                else "the model against what was stated",
+            ),
+            *([("λ by rows against least squares (ppm)", ppm, 1, over)] if words.board else []),
+            ("Residual (px)", single, 4, "one centre in one image"),
+        )
+    ]
+
+
+LIMITS = (
+    ("mapped_sigma", "σ", "of faces and circles between the programs"),
+    ("sigma", "σ", "of these adjusted"),
+    ("face_um", "µm", "of faces"),
+    ("face_mdeg", "mdeg", "of faces"),
+    ("circle_um", "µm", "of circles"),
+    ("camera_um", "µm", "of cameras"),
+    ("camera_mdeg", "mdeg", "of cameras"),
+)
+COMPARISONS = ("mapping", "result", "plain")
+
+
+def crosscheck_section(check: dict) -> list[Block]:
+    """Returns the section on the cross-check with the native COLMAP."""
+    limits, mapping = check["tolerances"], check["mapping"]
+    allowed = [f"{limits[key]:g} {unit} {object_name}" for key, unit, object_name in LIMITS if limits[key] is not None]
+    faces: dict[str, list[tuple[float, str]]] = {}
+    for label, value in mapping["circles_um"].items():
+        faces.setdefault(parse_label(label).plane, []).append((value, label))
+    programs = {
+        "native": f"COLMAP {check['native']}",
+        "pycolmap": f"pycolmap {check['pycolmap']}",
+        "run": "this result",
+    }
+    models = [[name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs.items()]
+    circles = [
+        [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
+        for face, rows in sorted(faces.items())
+    ]
+    single = [
+        [label, number(value, 3), number(mapping["circles_sigmas"].get(label), 2)]
+        for label, value in mapping["circles_um"].items()
+    ]
+    largest = ""
+    if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
+        largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
+    over = [("", 1), ("Native – pycolmap", 3), ("Native, adjusted – result", 3), ("Native – result", 3)]
+    cameras = [cells(row, "image position_um:2 rotation_mdeg:3 sigmas:2") for row in mapping["cameras"]]
+    return [
+        f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (schema "
+        f"{check['schema']} for the native one), initial pairs and thresholds",
+        alarms([f"They differ: {'; '.join(check['differences'])}."]) if check["differences"] else "They agree",
+        Table(["<Model", "Images", "Residual RMS (px)"], models),
+        subheading("Faces"),
+        "Differences in the target frame: the two programs' models as COLMAP adjusts them; the native models against "
+        "this result, after our own adjustment and without it. σ is the difference in the run's own standard "
+        f"deviations. Allowed in the first two: {', '.join(allowed)}; the third shows what weights and the joint "
+        "adjustment are worth",
+        Table(
+            ["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3,
+            [_face_row(check, f) for f in mapping["faces"]],
+            over,
+        ),
+        subheading("Circles"),
+        "Native against pycolmap",
+        Table(["<Face", "Circles", "Mean (µm)", "Max (µm)", "<Worst"], circles),
+        fold("Circle by circle", Table(["<Circle", "Difference (µm)", "σ"], single)),
+        subheading("Cameras"),
+        "Native against pycolmap, against the target, and in σ of the camera in its group. They matter only if faces "
+        f"move with them, which the table of faces shows{largest}",
+        fold("Camera by camera", Table(["<Image", "Position (µm)", "Rotation (mdeg)", "σ"], cameras)),
+        *check["notes"],
+    ]
+
+
+def _face_row(check: dict, face: str) -> list[str]:
+    """Returns the row of a face: position, rotation and σ of each comparison."""
+    row = [face]
+    for key in COMPARISONS:
+        entry = check[key]["faces"].get(face)
+        row += [*cells(entry, "translation_um:3 rotation_mdeg:3"), number(entry["sigmas"], 2)] if entry else [NONE] * 3
+    return row
+
+
+ORDER = ("failed", "suspicious", "passed", "not possible")
+FIRST_NAMES = 6
+"""Number of names that a row has room for."""
+
+
+def count_verdicts(verdicts: list[str]) -> str:
+    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first."""
+    return ", ".join(f"{verdicts.count(v)} {v}" for v in ORDER if v in verdicts) or "none"
+
+
+def checks_section(checks: list[dict]) -> list[Block]:
+    """Returns the checks that did not pass; the others, and what all of them measured, folded."""
+    heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
+    ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
+    open_ = [_check_row(check) for check in ranked if check["verdict"] in ("failed", "suspicious")]
+    others = [_check_row(check) for check in ranked if check["verdict"] not in ("failed", "suspicious")]
+    measured = [
+        [check["title"], m["name"], *_number(m), NONE if m["probability"] is None else f"{m['probability']:.1g}"]
+        for check in ranked
+        for m in check["measured"]
+    ]
+    counts = count_verdicts([check["verdict"] for check in checks])
+    columns_measured = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
+    return [
+        f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds for one check, however "
+        f"many images or points it tested",
+        Table(heads, open_, css="text"),
+        fold(f"{len(others)} checks that passed or were not possible", Table(heads, others, css="text")),
+        fold("What was measured", Table(columns_measured, measured, css="text")),
+    ]
+
+
+def _check_row(check: dict) -> list:
+    return [
+        check["title"],
+        Verdict(check["verdict"]),
+        *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
+        _names(check),
+        check["reason"],
+        check["remedy"],
+    ]
+
+
+def _number(measured: dict) -> list[str]:
+    """Returns value and limit with their unit."""
+    unit = f" {measured['unit']}" if measured["unit"] else ""
+    return [_short(measured["value"]) + unit, NONE if measured["limit"] is None else _short(measured["limit"]) + unit]
+
+
+def _short(value: float) -> str:
+    """Returns the value with about three digits."""
+    return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
+
+
+def _names(check: dict) -> str:
+    names = check["names"]
+    surplus = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
+    return ", ".join(names[:FIRST_NAMES]) + surplus if names else NONE
+
+
+def published_section(comparison: dict) -> list[Block]:
+    """Returns the gain of each step from the published method to this result."""
+    heads, rows = comparison_cells(comparison)
+    return [
+        "The same photographs by the method of Zhang & Wei (2017) as published, and with one more step of this "
+        "package in each row. The last row is this result. All have three-point frames. Faces: distance of the origin "
+        "from that of the last row. Compared with σ of the last row, it shows what each step is worth here",
+        Table(heads, rows),
+        alarms([f"{row['method']}: {row['reason']}." for row in comparison["rows"] if row["reason"]]),
+    ]

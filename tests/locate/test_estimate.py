@@ -1,0 +1,162 @@
+"""Poses from simulated corners: their covariance, their branches, and tags that are wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.boards.tags import Tags
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.cameras.model import CameraPrior
+from stcal.locate.estimate import SeenTags, covering_both, locate, merge
+from stcal.locate.verdict import VerdictOptions, judge
+from tests.outcome import fails_with
+from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
+
+SIX = (0, 1, 2, 3, 4, 5)
+LAYOUT = example_layout()
+
+
+def error_of(pose, truth: Rigid) -> np.ndarray:
+    return Poses.of([pose.camera_from_obj]).difference(Poses.of([truth]))[0]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("shown", "layout", "shared"),
+    [
+        (((0, 1, 2, 5), (2, 3, 4), (4, 5)), LAYOUT, 0.5),
+        ((SIX,), replace(example_layout(0.03, 0.2), tag_sigma_px=0.4), 0.0),
+    ],
+)
+def test_the_covariance_is_true(shown, layout, shared):
+    """Mean of eᵀC⁻¹e/6 over 500 poses: 1, with σ 0.026; the band is four of them."""
+    rng = np.random.default_rng(5)
+    squares, fits = [], []
+    for _ in range(500):
+        truth = random_pose(rng)
+        seen = merge(simulated_exposures(layout, truth, rng, CornerNoise(shared=shared), shown), layout).seen
+        pose = locate(seen, layout, CAMERA)
+        error = error_of(pose, truth)
+        squares.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+        fits.append(pose.chi2_per_redundancy())
+    assert 0.9 < np.mean(squares) < 1.1
+    assert 0.9 < np.mean(fits) < 1.1
+
+
+@pytest.mark.full
+def test_intrinsics_with_sigma_make_the_pose_as_uncertain():
+    rng = np.random.default_rng(2)
+    sigma = np.array([3.0, 3.0, 2.0, 2.0])
+    plain = Camera(1600, 1200, [1350.0, 1350.0], [799.5, 599.5], np.zeros(8))
+    squares, held = [], []
+    for _ in range(100):
+        truth = random_pose(rng)
+        real = plain.with_parameters(
+            np.concatenate([plain.parameters()[:4] + sigma * rng.standard_normal(4), np.zeros(8)])
+        )
+        seen = merge(simulated_exposures(LAYOUT, truth, rng, camera=real), LAYOUT).seen
+        for prior, into in ((CameraPrior("PINHOLE", np.diag(sigma**2)), squares), (None, held)):
+            pose = locate(seen, LAYOUT, plain, prior)
+            error = error_of(pose, truth)
+            into.append(error @ np.linalg.solve(pose.covariance, error) / 6)
+    assert 0.8 < np.mean(squares) < 1.2  # σ of the mean 0.058
+    assert np.mean(held) > 3
+
+
+@pytest.mark.slow
+def test_no_flipped_pose_is_accepted():
+    """A single tag far away, and noisy: hundreds of poses cannot be told from their mirror image, and are not."""
+    rng = np.random.default_rng(3)
+    layout = example_layout(0.03, 0.2)
+    accepted = flipped = ambiguous = turned = 0
+    for _ in range(300):
+        truth = random_pose(rng, 1500.0, (15, 50))
+        seen = merge(simulated_exposures(layout, truth, rng, shown=((0,),)), layout).seen
+        pose, verdict = judge(locate(seen, layout, CAMERA), VerdictOptions(max_sigma_deg=10))
+        off = np.linalg.norm(error_of(pose, truth)[:3]) > np.radians(15)
+        turned += off
+        accepted += verdict.decision == "accept"
+        ambiguous += verdict.decision == "ambiguous"
+        flipped += off and verdict.decision == "accept"
+    assert flipped == 0
+    assert turned > 10  # or the test would say nothing
+    assert ambiguous > 50
+
+
+def test_both_minima_are_refined():
+    truth = Rigid.exp([0.4, 0, 0, 0, 0, 1500.0])
+    layout = example_layout(0.03, 0.2)
+    seen = merge(simulated_exposures(layout, truth, np.random.default_rng(0), shown=((0,),)), layout).seen
+    pose = locate(seen, layout, CAMERA)
+    tilts = sorted(p.rotation[1, 2] for p in (pose.camera_from_obj, pose.second))
+    assert tilts[0] < -0.2
+    assert tilts[1] > 0.2
+    assert 0 <= pose.delta_chi2 < 60
+
+
+def test_two_poses_that_are_one_are_covered_by_one_covariance():
+    truth = Rigid.exp([0.4, 0, 0, 0, 0, 1500.0])
+    layout = example_layout(0.03, 0.2)
+    seen = merge(simulated_exposures(layout, truth, np.random.default_rng(0), shown=((0,),)), layout).seen
+    pose = locate(seen, layout, CAMERA)
+    assert judge(pose, VerdictOptions(max_sigma_deg=90.0))[1].decision == "ambiguous"
+    away = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
+    wide = covering_both(pose)
+    gain = wide.covariance - pose.covariance
+    odds = np.exp(-pose.delta_chi2 / 2)
+    assert np.allclose(gain, odds / (1 + odds) * np.outer(away, away))
+    equal, verdict = judge(pose, VerdictOptions(equal_deg=90.0, max_sigma_deg=90.0))
+    assert verdict.decision == "accept"
+    assert np.allclose(equal.covariance, wide.covariance)
+
+
+def with_wrong_tag(rows: list[int], row: int) -> SeenTags:
+    """One tag of the scene is shown where it is not."""
+    truth = Rigid.exp([0.3, 0.1, 0, 0, 0, 700.0])
+    tags = simulated_exposures(LAYOUT, truth, np.random.default_rng(0), shown=(rows,))[0]
+    corners = np.array(tags.corners_px)
+    corners[rows.index(row)] += [40.0, -25.0]
+    return merge([Tags(tags.tags, corners, tags.covariance_px2)], LAYOUT).seen
+
+
+def test_a_wrong_tag_is_left_out():
+    pose = locate(with_wrong_tag(list(SIX), 2), LAYOUT, CAMERA)
+    assert pose.outliers == (2,)
+    assert np.linalg.norm(error_of(pose, Rigid.exp([0.3, 0.1, 0, 0, 0, 700.0]))[:3]) < np.radians(0.3)
+
+
+def test_two_tags_that_contradict_are_rejected():
+    """Neither is the outlier, but no pose fits both."""
+    _, verdict = judge(locate(with_wrong_tag([0, 3], 3), LAYOUT, CAMERA))
+    assert verdict.decision == "reject"
+    assert verdict.reasons[0].startswith("chi2 per dof")
+
+
+def test_no_tag_is_refused():
+    empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0))
+    with fails_with("E-LOCATE-NO-TAG"):
+        locate(empty, LAYOUT, CAMERA)
+
+
+def test_the_order_of_tags_does_not_matter():
+    truth = Rigid.exp([0.3, 0.1, 0.5, 10, 20, 700.0])
+    seen = merge(simulated_exposures(LAYOUT, truth, np.random.default_rng(0)), LAYOUT).seen
+    one, other = locate(seen, LAYOUT, CAMERA), locate(seen.select([3, 1, 5, 0, 2, 4]), LAYOUT, CAMERA)
+    assert np.abs(one.camera_from_obj.matrix() - other.camera_from_obj.matrix()).max() < 1e-6
+    assert np.allclose(one.covariance, other.covariance, rtol=1e-5, atol=1e-12)
+
+
+def test_shared_errors_do_not_average_out():
+    """Nine exposures: with independent noise σ falls to a third, with common noise not at all."""
+    truth = Rigid.exp([0.3, 0.1, 0, 0, 0, 700.0])
+    exact = example_layout(1e-6)
+    sigma = {}
+    for shared in (0.0, 1.0):
+        for count in (1, 9):
+            rng = np.random.default_rng(4)
+            seen = merge(simulated_exposures(exact, truth, rng, CornerNoise(0.3, shared), (SIX,) * count), exact).seen
+            sigma[shared, count] = np.sqrt(np.trace(seen.covariance_px2, axis1=1, axis2=2).mean() / 8)
+    assert sigma[0.0, 9] / sigma[0.0, 1] == pytest.approx(1 / 3, rel=0.1)
+    assert sigma[1.0, 9] / sigma[1.0, 1] == pytest.approx(1, rel=0.1)

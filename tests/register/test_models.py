@@ -1,0 +1,178 @@
+"""The three models: fits against a general optimiser, covariances against numeric derivatives."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from stcal.geometry.rigid import Affine, Rigid, Similarity
+from stcal.register.models import (
+    MODELS,
+    fit,
+    hypotheses,
+    jacobian,
+    leverages,
+    parts,
+    squares,
+    unit_covariance,
+    whitened,
+)
+from tests.outcome import fails_with
+from tests.support.point_pairs import make_scene, parameter_error
+
+NOISE = ("equal", "weights", "matrices")
+
+
+def precision_of(kind: str, rng: np.random.Generator, n: int) -> np.ndarray | None:
+    if kind == "equal":
+        return None
+    if kind == "weights":
+        return rng.uniform(0.2, 5, n)
+    root = Rotation.random(n, random_state=1).as_matrix() * rng.uniform(0.3, 3, (n, 1, 3))
+    return root @ np.swapaxes(root, 1, 2)
+
+
+def perturbed(transform, step: np.ndarray):
+    """By the parameters that the covariance is stated in."""
+    if isinstance(transform, Affine):
+        rows = step.reshape(3, 4)
+        return Affine(transform.linear + rows[:, :3], transform.translation + rows[:, 3])
+    rigid = transform if isinstance(transform, Rigid) else transform.rigid
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    moved = Rigid(turn @ rigid.rotation, rigid.translation + step[3:6])
+    return moved if isinstance(transform, Rigid) else Similarity(transform.scale * (1 + step[6]), moved)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
+@pytest.mark.parametrize("kind", NOISE)
+def test_the_fit_is_the_minimum_that_a_general_optimiser_finds(model, kind):
+    rng = np.random.default_rng(1)
+    s = make_scene(rng, 12, sigma_mm=3)
+    precision = precision_of(kind, rng, 12)
+    found = fit(model, s.xyz_a, s.xyz_b, precision)
+
+    def cost(step):
+        return whitened(s.xyz_b - perturbed(found, step) @ s.xyz_a, precision).ravel()
+
+    # from elsewhere, so that it does not merely stay
+    step = np.array([0.01, -0.01, 0.02] if model.name != "affine" else [1e-3, -1e-3, 2e-3, 1] * 3)
+    start = np.resize(step, model.parameters) if model.name == "affine" else np.zeros(model.parameters)
+    start[:3] = step[:3]
+    best = least_squares(cost, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=2000)
+    mine = (cost(np.zeros(model.parameters)) ** 2).sum()
+    assert mine == pytest.approx(2 * best.cost, rel=1e-8)
+    assert mine == pytest.approx(squares(s.xyz_b - found @ s.xyz_a, precision).sum())
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
+@pytest.mark.parametrize("kind", NOISE)
+def test_the_covariance_is_that_of_numeric_derivatives(model, kind):
+    rng = np.random.default_rng(2)
+    s = make_scene(rng, 9)
+    precision = precision_of(kind, rng, 9)
+    transform = fit(model, s.xyz_a, s.xyz_b, precision)
+    h = 1e-5
+    columns = [
+        whitened((perturbed(transform, h * e) @ s.xyz_a) - (perturbed(transform, -h * e) @ s.xyz_a), precision).ravel()
+        / (2 * h)
+        for e in np.eye(model.parameters)
+    ]
+    slope = np.column_stack(columns)
+    # The origin of a is 1 m from the points, so that the parameters are correlated to 0.99: compare N⁻¹ N with 1.
+    product = unit_covariance(model, transform, s.xyz_a, precision) @ (slope.T @ slope)
+    scale = np.sqrt(np.diag(slope.T @ slope))
+    np.testing.assert_allclose(product * scale[:, None] / scale, np.eye(model.parameters), atol=2e-4)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
+@pytest.mark.parametrize("kind", NOISE)
+def test_leverages_sum_to_the_parameters(model, kind):
+    rng = np.random.default_rng(3)
+    s = make_scene(rng, 15)
+    precision = precision_of(kind, rng, 15)
+    used = np.arange(15) < 12
+    transform = fit(model, s.xyz_a[used], s.xyz_b[used], None if precision is None else precision[used])
+    found = leverages(model, transform, s.xyz_a, used, precision)
+    assert np.trace(found, axis1=1, axis2=2)[used].sum() == pytest.approx(model.parameters, rel=1e-9)
+    # inside, a point's own share is less than all of it; outside, extrapolation has no bound
+    assert np.linalg.eigvalsh(found[used]).max() < 1
+
+
+def test_leverage_foretells_the_residual_without_the_point():
+    """Of a linear model exactly: r without i = (1 − H)⁻¹ r."""
+    rng = np.random.default_rng(4)
+    s, model = make_scene(rng, 9, sigma_mm=2), MODELS["affine"]
+    precision = precision_of("matrices", rng, 9)
+    transform = fit(model, s.xyz_a, s.xyz_b, precision)
+    spread = leverages(model, transform, s.xyz_a, np.ones(9, bool), precision)
+    own = whitened(s.xyz_b - transform @ s.xyz_a, precision)
+    rest = np.arange(9) != 4
+    without = whitened(s.xyz_b - fit(model, s.xyz_a[rest], s.xyz_b[rest], precision[rest]) @ s.xyz_a, precision)
+    np.testing.assert_allclose(np.linalg.solve(np.eye(3) - spread[4], own[4]), without[4], rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
+def test_many_samples_at_once_are_single_fits(model):
+    s = make_scene(np.random.default_rng(5), 30)
+    samples = np.random.default_rng(6).permutation(30)[: 6 * model.sample].reshape(6, model.sample)
+    linear, translation = hypotheses(model, s.xyz_a[samples], s.xyz_b[samples])
+    for sample, matrix, shift in zip(samples, linear, translation, strict=True):
+        one, at = parts(fit(model, s.xyz_a[sample], s.xyz_b[sample]))
+        np.testing.assert_allclose(matrix, one, atol=1e-9)
+        np.testing.assert_allclose(shift, at, atol=1e-6)
+
+
+@given(st.integers(0, 9999), st.sampled_from(sorted(MODELS)))
+def test_frames_may_be_moved(seed, name):
+    """Moving b moves the transform; moving a takes the motion off again; residuals keep their length."""
+    rng = np.random.default_rng(seed)
+    s, model = make_scene(rng, 8), MODELS[name]
+    weights = rng.uniform(0.5, 2, 8)
+    moved = make_scene(rng, 3).b_from_a
+    found = fit(model, s.xyz_a, s.xyz_b, weights)
+    np.testing.assert_allclose(
+        fit(model, s.xyz_a, moved @ s.xyz_b, weights) @ s.xyz_a, moved @ (found @ s.xyz_a), atol=1e-7
+    )
+    np.testing.assert_allclose(
+        fit(model, moved @ s.xyz_a, s.xyz_b, weights) @ (moved @ s.xyz_a), found @ s.xyz_a, atol=1e-7
+    )
+
+
+def test_jacobian_of_one_point_by_hand():
+    quarter = Rigid(Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix())
+    slope = jacobian(MODELS["rigid"], quarter, np.array([[1.0, 0, 0]]))[0]  # goes to (0, 1, 0)
+    expected = np.array([[0, 0, -1, 1, 0, 0], [0, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 1.0]])
+    np.testing.assert_allclose(slope, expected, atol=1e-15)
+
+
+def test_parameter_error_is_the_step():
+    step = np.array([1e-3, -2e-3, 1e-3, 0.5, 0.2, -0.1, 1e-3])
+    truth = Similarity(1.2, Rigid.exp([0.4, 1, 0, 100, 200, 300]))
+    np.testing.assert_allclose(parameter_error(perturbed(truth, step), truth), step, atol=1e-12)
+    np.testing.assert_allclose(parameter_error(perturbed(truth.rigid, step), truth.rigid), step[:6], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "points", "message"),
+    [
+        ("affine", np.random.default_rng(0).uniform(-1, 1, (6, 3)) * [1, 1, 0], "E-POINTS-COPLANAR"),
+        ("affine", np.eye(3), "E-POINTS-FEW … 3 … 3 … 4"),
+        ("rigid", np.arange(4.0)[:, None] * [1, 2, 3], "E-POINTS-COLLINEAR"),
+    ],
+)
+def test_degenerate(name, points, message):
+    with fails_with(message):
+        fit(MODELS[name], points, points)
+
+
+def test_affine_transforms_compose_and_invert():
+    one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
+    two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    np.testing.assert_allclose((one @ two) @ points, one @ (two @ points))
+    np.testing.assert_allclose(one.inverse() @ (one @ points), points, atol=1e-12)
+    np.testing.assert_allclose((one @ two).matrix(), one.matrix() @ two.matrix())
+    with fails_with("E-AFFINE-SINGULAR"):
+        Affine(np.ones((3, 3)), np.zeros(3)).inverse()

@@ -1,0 +1,187 @@
+"""Text, page and JSON of a registration."""
+
+import json
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.io.files import json_text
+from stcal.parallel import _limited
+from stcal.register import page, register, workspace
+from stcal.register.file import GRID, RegistrationFile
+from stcal.register.page import FEW_ROWS, MOST_LABELS, registration_report, space_figure
+from stcal.register.workspace import findings
+from stcal.report.document import Section
+
+B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
+WILD = (3, 17)
+
+
+@cache
+def found_of(n=40, model="rigid", wild=WILD, where="pairs <a&b>.csv", bend=0.0, method="robust", **options):
+    rng = np.random.default_rng(0)
+    a = rng.uniform(-200, 200, (n, 3)) + np.array([800, 200, 700])
+    b = B_FROM_A @ (a + bend * np.sin(a[:, [1, 2, 0]] / 70)) + rng.normal(0, 0.1, a.shape)
+    for i in wild:
+        b[i] += [5.0 + i, 0, 0]
+    result = register(a, b, model=model, method=method, **options)
+    return findings(where, range(2, n + 2), a, b, result)
+
+
+def test_text_tells_transform_outliers_and_reach():
+    text = registration_report(found_of()).text()
+    assert "40 point pairs, rigid, robust" in text
+    assert "38 inliers, 2 outliers" in text
+    rows = [line.split() for line in text.splitlines() if "OUTLIER" in line]
+    assert sorted(row[:3] for row in rows) == [["line", "19", "OUTLIER"], ["line", "5", "OUTLIER"]]
+    np.testing.assert_allclose(sorted(float(row[-1]) for row in rows), [8, 22], atol=0.5)
+    lines = text[text.index("b_from_a") :].splitlines()[1:5]
+    matrix = [re.findall(r"-?\d+\.\d+", line) for line in lines]
+    np.testing.assert_allclose(np.array(matrix, float), B_FROM_A.matrix(), atol=1.0)
+    assert "no systematic residuals seen" in text
+    assert re.search(r"held out \(6 folds\), inliers +38 ", text)
+    assert max(map(len, text.splitlines())) < 320
+
+
+def test_every_row_of_a_few_is_listed():
+    text = registration_report(found_of(n=FEW_ROWS - 4)).text()
+    assert len(re.findall(r"line \d+ +(?:inlier|OUTLIER)", text)) == FEW_ROWS - 4
+
+
+def test_rows_that_do_not_correspond_are_no_noise():
+    rng = np.random.default_rng(1)
+    a = rng.uniform(-1000, 1000, (40, 3))
+    b = 0.5 * a + rng.normal(0, 200, a.shape)
+    text = registration_report(
+        findings("x", range(40), a, b, register(a, b, model="rigid", method="least-squares"))
+    ).text()
+    assert "no systematic residuals" not in text
+    assert "do not use this transform" in text
+
+
+def test_a_bent_frame_is_said():
+    text = registration_report(found_of(n=90, bend=0.6, allow_ambiguous=True)).text()
+    assert "residuals are systematic" in text
+    assert re.search(r"fitted in the cube of \d+ mm it holds within [\d.]+ mm there, [\d.]+ mm to \d+ mm", text)
+
+
+@pytest.mark.parametrize("model", ["rigid", "similarity", "affine"])
+def test_json_is_the_result(model):
+    found = found_of(model=model)
+    result = found.registration
+    content = json.loads(json_text(RegistrationFile.of(found)))
+    assert content["format"] == "stcal registration 1"
+    matrix = np.array(content["b_from_a"])
+    a = found.xyz_a
+    np.testing.assert_allclose(a @ matrix[:3, :3].T + matrix[:3, 3], result.b_from_a @ a, atol=1e-9)
+    p = {"rigid": 6, "similarity": 7, "affine": 12}[model]
+    assert np.shape(content["covariance"]) == (p, p)
+    assert len(content["covariance_of"]) == len(content["units"]["covariance"]) == p
+    assert content["inliers"] == result.inliers.tolist()
+    np.testing.assert_allclose(content["residuals"], result.residuals)
+    assert content["lines"] == list(range(2, 42))
+    assert [o["line"] for o in content["outliers"]] == [19, 5]
+    assert content["held_out"]["inliers"]["mean_mm"] == result.held_out.of_inliers.mean_mm
+    assert len(content["field"]["grid"]["xyz_a_mm"]) == GRID**3
+    assert np.shape(content["field"]["grid"]["error_mm"]) == (GRID**3, 3)
+    sides = content["cubes"]["sides_mm"]
+    assert [row["side_mm"] for row in content["cubes"]["fitted_in"]] == sides
+    if model == "similarity":
+        assert isinstance(result.b_from_a, Similarity)
+        assert content["scale"] == pytest.approx(1, abs=1e-3)
+    if model == "affine":
+        np.testing.assert_allclose(content["scales"], 1, atol=2e-3)
+
+
+def test_units_of_the_affine_covariance():
+    """σ of the entry m14 (mm) is far above that of m11 (no unit): the origin is 1 m away."""
+    content = RegistrationFile.of(found_of(model="affine"))
+    sigma = np.sqrt(np.diag(content.covariance))
+    units = dict(zip(content.covariance_of, content.units.covariance, strict=True))
+    assert units["m14"] == "mm"
+    assert units["m11"] == "1"
+    assert sigma[3] > 300 * sigma[0]
+
+
+@pytest.mark.slow
+def test_page_shows_outliers_and_escapes_names():
+    page = registration_report(found_of(), [Section("One <more>", ["section"])]).page()
+    assert "pairs &lt;a&amp;b&gt;.csv" in page
+    assert "<a&b>" not in page
+    assert page.count("data:image/svg+xml;base64,") == 3
+    order = [
+        page.index(f'id="{key}"') for key in ("result", "residuals-in-space", "where-it-holds", "one-more", "rows")
+    ]
+    assert order == sorted(order)
+    assert "OUTLIER</td>" in page[page.index('id="rows"') :]
+
+
+def test_page_of_three_points():
+    page = registration_report(found_of(n=3, wild=())).page()
+    assert "Too few points to tell" in page
+    assert page.count("data:image/svg+xml;base64,") == 1
+    assert 'class="alarm"' in page  # what three points do not tell is said
+
+
+@pytest.mark.slow
+def test_page_of_a_plane():
+    rng = np.random.default_rng(0)
+    a = rng.uniform(-200, 200, (30, 3)) * [1, 1, 0]
+    b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
+    page = registration_report(findings("plane.csv", range(2, 32), a, b, register(a, b))).page()
+    assert page.count("data:image/svg+xml;base64,") == 2  # no planes through a body that there is not
+
+
+@pytest.mark.slow
+def test_the_same_page_twice():
+    assert registration_report(found_of()).page() == registration_report(found_of.__wrapped__()).page()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "tolerance"), [(40, 0.35), pytest.param(100, 0.25, marks=pytest.mark.slow)])
+def test_sigma_of_the_transform_by_place(count, tolerance):
+    """By Monte Carlo: the spread of the fitted transform at a point far from the others."""
+    rng = np.random.default_rng(1)
+    a = rng.uniform(-100, 100, (20, 3))
+    place = np.array([500.0, 0.0, 0.0])
+    seen, stated = [], []
+    for trial in range(count):
+        b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
+        result = register(a, b, method="least-squares", folds=0)
+        seen.append(result.b_from_a @ place)
+        if trial < 5:
+            stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
+    # 100 trials know a σ to 7 %, 40 to 11 %; the own σ of five are good to 9 % / √5
+    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=tolerance)
+
+
+@pytest.mark.slow
+def test_thousands_of_outliers_are_told_in_few_lines_and_labels(monkeypatch):
+    """The farthest by line, the others by their number; the lengths of all residuals are computed once a page, not once
+    a row."""
+    found = found_of(n=3000, wild=range(1000))
+    assert "… and 945 more rows; result files have all" in registration_report(found).text()
+    figure = space_figure(found)
+    assert [len(axes.texts) for axes in figure.axes] == [MOST_LABELS] * 3
+    asked = []
+    whole = type(found).length_mm.fget
+    monkeypatch.setattr(type(found), "length_mm", property(lambda self: asked.append(1) or whole(self)))
+    registration_report(found).page()
+    assert len(asked) < 5
+
+
+@pytest.mark.slow
+def test_the_field_and_the_page_keep_blas_to_one_thread(monkeypatch):
+    """As `register` does: small matrices, on which threads wait for each other."""
+    held = []
+    for module, name in ((workspace, "cubes"), (page, "space_figure")):
+        inner = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *given, inner=inner: held.append(_limited.locked()) or inner(*given))
+    before = found_of(n=30)
+    b = before.registration.residuals + before.registration.b_from_a @ before.xyz_a
+    registration_report(findings("pairs", before.lines, before.xyz_a, b, before.registration)).page()
+    assert len(held) > 1
+    assert all(held)

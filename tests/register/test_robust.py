@@ -1,0 +1,383 @@
+"""The robust method: the optimum of the clean points is found, or the answer is refused."""
+
+import numpy as np
+import pytest
+from scipy.stats import beta
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import align_rigid
+from stcal.register import register
+from stcal.register.mistakes import lies_together, sphericity, two_groups, wilks_bound
+from stcal.register.models import MODELS, fit
+from stcal.register.pairs import PointNoise, Problem
+from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
+from tests.outcome import fails_with
+from tests.support.point_pairs import SIGMA_MM, directions, make_scene
+
+RIGID = MODELS["rigid"]
+
+
+def scene(seed, *args, **options):
+    return make_scene(np.random.default_rng(seed), *args, **options)
+
+
+def cost_ratio(s, found) -> float:
+    """Square sum of the clean points over their optimum."""
+    a, b = s.xyz_a[s.clean], s.xyz_b[s.clean]
+    return ((b - found.b_from_a @ a) ** 2).sum() / ((b - align_rigid(b, a) @ a) ** 2).sum()
+
+
+@pytest.mark.parametrize(
+    ("share", "sets"),
+    [(0, 2), (0.4, 2), *(pytest.param(x, 6, marks=pytest.mark.slow) for x in (0, 0.1, 0.2, 0.3, 0.4))],
+)
+@pytest.mark.parametrize("n", [20, 100])
+def test_within_one_per_cent_of_the_optimum_of_the_clean_points(n, share, sets):
+    for trial in range(sets):
+        s = scene([trial, n], n, share)
+        found = register(s.xyz_a, s.xyz_b, folds=0)
+        assert cost_ratio(s, found) > 1 - 1e-12
+        assert cost_ratio(s, found) < 1.01
+        assert not (found.inliers & ~s.clean).any()  # 2 mm is 13 σ
+        assert (found.inliers[s.clean]).mean() > 0.9
+
+
+@pytest.mark.slow
+def test_clean_points_are_kept():
+    """One set in a thousand may lose a point: of 80 more than 2 would with a chance of 1e-4."""
+    lost = sum(not register(s.xyz_a, s.xyz_b, folds=0).inliers.all() for s in (scene([i, 7], 12) for i in range(80)))
+    assert CLEAN_SETS_WITH_OUTLIER == 0.001
+    assert lost <= 2
+
+
+def test_outliers_just_beyond_noise_are_found():
+    """9 σ, of a point whose limit is about 5 σ: seen unless noise takes half of it back."""
+    s = scene(3, 60, 0.25, off_mm=(9 * SIGMA_MM, 9 * SIGMA_MM))
+    found = register(s.xyz_a, s.xyz_b, folds=0)
+    assert (found.inliers == s.clean).all()
+    assert 4 * SIGMA_MM < found.threshold_mm < 6 * SIGMA_MM
+    assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.2)  # 129 degrees of freedom: ± 6 %
+
+
+@pytest.mark.parametrize("size", [1e4, 1e6, 1e15])
+def test_outliers_of_two_sizes(size):
+    s = scene(4, 80)
+    b = s.xyz_b.copy()
+    b[:20] += np.random.default_rng(1).uniform(-size, size, (20, 3))
+    b[20:40] += 3 * directions(np.random.default_rng(0), 20)
+    found = register(s.xyz_a, b, folds=0)
+    np.testing.assert_array_equal(np.flatnonzero(~found.inliers), np.arange(40))
+
+
+def test_more_wrong_than_right_is_said():
+    s = scene(5, 50, 0.6)
+    found = register(s.xyz_a, s.xyz_b, folds=0)
+    assert (found.inliers == s.clean).all()
+    assert any("only 20 of 50 point pairs agree" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("kind", ["one shift", "other motion"])
+@pytest.mark.parametrize(
+    ("share", "sets"), [(0.5, 2), *(pytest.param(x, 4, marks=pytest.mark.slow) for x in (0.4, 0.5, 0.6))]
+)
+def test_two_transforms_are_refused_or_told(kind, share, sets):
+    for trial in range(sets):
+        s = scene([trial, 11], 40, share, kind)
+        with fails_with("E-REGISTER-TWO-TRANSFORMS"):
+            register(s.xyz_a, s.xyz_b, folds=0)
+        found = register(s.xyz_a, s.xyz_b, folds=0, allow_ambiguous=True)
+        assert found.ambiguous
+        assert found.notes[0].startswith("AMBIGUOUS") or found.notes[1].startswith("AMBIGUOUS")
+        assert len(found.alternative.rows) + found.inliers.sum() >= 38
+        # one of the two is the truth
+        a, b = s.xyz_a[s.clean], s.xyz_b[s.clean]
+        rms = [np.sqrt(((b - t @ a) ** 2).sum(1).mean()) for t in (found.b_from_a, found.alternative.b_from_a)]
+        assert min(rms) < 4 * SIGMA_MM
+
+
+@pytest.mark.parametrize("sets", [4, pytest.param(10, marks=pytest.mark.slow)])
+def test_half_of_the_points_shifted_by_little(sets):
+    """One transform between two groups 2 mm apart looks like noise of 0.6 mm; it is none."""
+    refused = 0
+    for trial in range(sets):
+        s = scene([trial, 2], 30, 0.5, "one shift", (2, 2))
+        with fails_with("E-REGISTER-TWO-TRANSFORMS"):
+            register(s.xyz_a, s.xyz_b, folds=0)
+        refused += 1
+    assert refused == sets
+
+
+@pytest.mark.parametrize("sets", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_groups_that_no_consensus_tells_apart(sets):
+    """At 1 mm, 7 σ, between them: trimming sees one set of larger σ, two transforms are seen."""
+    for trial in range(sets):
+        s = scene([trial, 9], 80, 0.5, "one shift", (1, 1))
+        found = register(s.xyz_a, s.xyz_b, folds=0, allow_ambiguous=True)
+        assert found.ambiguous
+        assert abs((found.inliers == s.clean).mean() - 0.5) > 0.45
+        assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.3)
+
+
+def test_noise_along_one_axis_is_not_two_groups():
+    """Half of it is on either side, but what two transforms take off it, one covariance explains as well."""
+    for trial, n, along in ((0, 12, 3), (1, 30, 5), (2, 100, 3), (3, 200, 10), (4, 100, 30)):
+        rng = np.random.default_rng([trial, 6])
+        s = scene([trial, 6], n, sigma_mm=0.02)
+        b = s.xyz_b + rng.normal(0, along * 0.02, (n, 1)) * [0.6, 0, 0.8]
+        assert register(s.xyz_a, b, folds=0).inliers.mean() > 0.9
+
+
+@pytest.mark.slow
+def test_noise_along_one_axis_that_the_fit_carries_into_the_others():
+    """30 : 1 of 100 points: what the fit errs along the one exceeds the noise along the others."""
+    for trial in range(20):
+        rng = np.random.default_rng([trial, 12])
+        s = scene([trial, 12], 100, sigma_mm=0.01)
+        b = s.xyz_b + rng.normal(0, 0.3, (100, 1)) * [0, 0.8, 0.6]
+        assert two_groups(Problem(RIGID, s.xyz_a, b, PointNoise()), rng) is None
+
+
+def test_wilks_bound_is_above_the_distribution():
+    """Λ as drawn from the scatter of Gaussian residuals of two linear fits, one within the other."""
+    rng = np.random.default_rng(3)
+    design = rng.normal(size=(20, 6))
+    ratios = []
+    for _ in range(2000):
+        y = rng.normal(size=(20, 3)) * [1, 5, 0.2]
+        less, more = (y - design[:, :k] @ np.linalg.lstsq(design[:, :k], y, rcond=None)[0] for k in (4, 6))
+        ratios.append(np.linalg.slogdet(more.T @ more)[1] - np.linalg.slogdet(less.T @ less)[1])
+    for level in (0.5, 0.1, 0.01):
+        at = np.quantile(ratios, level)
+        assert np.log(level) - 0.3 < wilks_bound(at, 14, 2) < np.log(level) + 3
+
+
+def test_sphericity_is_a_p_value():
+    rng = np.random.default_rng(4)
+    p = [sphericity(y.T @ y, 15) for y in rng.normal(size=(1000, 15, 3))]
+    assert np.mean(np.array(p) < 0.1) == pytest.approx(0.1, abs=0.035)  # 3.5 of its standard deviations
+    y = rng.normal(size=(15, 3)) * [1, 1, 6]
+    assert sphericity(y.T @ y, 15) < 1e-4
+
+
+def test_deletion_residuals_are_those_of_the_fit_without_the_point():
+    """Exactly so of the affine model, which is linear, with σ of every point its own."""
+    s, model = scene(24, 12), MODELS["affine"]
+    noise = PointNoise(np.random.default_rng(0).uniform(0.5, 2, 12))
+    whole = np.ones(12, bool)
+    found = fit(model, s.xyz_a, s.xyz_b, noise.precision)
+    problem = Problem(model, s.xyz_a, s.xyz_b, noise)
+    with_it = deletion_squares(problem, found, whole)
+    for i in range(12):
+        rest = np.arange(12) != i
+        less = fit(model, s.xyz_a[rest], s.xyz_b[rest], noise[rest].precision)
+        without = deletion_squares(problem, less, rest)
+        assert with_it[i] == pytest.approx(without[i], rel=1e-6)
+
+
+@pytest.mark.parametrize("sets", [4, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_far_point_may_be_off_by_what_the_fit_cannot_know(sets):
+    """Points of 20 mm tell the place of one 3 m away to 150 times their noise: none of that is an outlier."""
+    rng = np.random.default_rng(25)
+    a = np.vstack([rng.uniform(-10, 10, (20, 3)), [[3000, 0, 0]]])
+    for trial in range(sets):
+        b = a + np.random.default_rng(trial).normal(0, SIGMA_MM, a.shape)
+        assert register(a, b, folds=0).inliers.all()
+
+
+def test_a_minority_that_moved_is_left_out_and_told():
+    s = scene(6, 60, 0.25, "one shift", (3, 3))
+    found = register(s.xyz_a, s.xyz_b, folds=0)
+    assert (found.inliers == s.clean).all()
+    assert not found.ambiguous
+    np.testing.assert_array_equal(found.alternative.rows, np.flatnonzero(~s.clean))
+    assert found.alternative.apart_mm == pytest.approx(3, abs=0.5)
+    assert found.alternative.turn_rad < 0.01
+    assert any("15 of the other points agree on another transform" in note for note in found.notes)
+
+
+def test_a_bent_frame_is_not_two_motions():
+    rng = np.random.default_rng(8)
+    a = rng.uniform(-100, 100, (150, 3))
+    bend = np.abs(a[:, :1] - 10) * [0, 0.01, 0.005]  # as of a beam with a joint: up to 1 mm, each half straight
+    b = a + bend + rng.normal(0, 0.05, a.shape)
+    found = register(a, b, folds=0)
+    plain = register(a, b, folds=0, method="least-squares")
+    assert found.inliers.mean() > 0.9
+    assert any("bent" in note for note in found.notes)
+    away = np.sqrt((((found.b_from_a @ a) - plain.b_from_a @ a) ** 2).sum(1).mean())
+    assert away < 0.1 * plain.inlier_errors.rms_mm
+
+
+@pytest.mark.slow
+def test_noise_is_not_called_bent():
+    """One case in ten thousand is."""
+    for trial in range(15):
+        s = scene([trial, 8], 100)
+        assert register(s.xyz_a, s.xyz_b, folds=0).notes == ()
+
+
+def test_rows_in_any_order_give_the_same_points():
+    s = scene(9, 40, 0.3)
+    found = register(s.xyz_a, s.xyz_b, folds=0)
+    order = np.random.default_rng(1).permutation(40)
+    shuffled = register(s.xyz_a[order], s.xyz_b[order], folds=0, seed=5)
+    np.testing.assert_array_equal(found.inliers[order], shuffled.inliers)
+    np.testing.assert_allclose(found.b_from_a.matrix(), shuffled.b_from_a.matrix(), atol=1e-9)
+
+
+def test_the_same_seed_gives_the_same_answer():
+    s = scene(10, 120, 0.5)
+    one, two = (register(s.xyz_a, s.xyz_b, seed=3) for _ in range(2))
+    assert (one.b_from_a.matrix() == two.b_from_a.matrix()).all()
+    assert one.samples == two.samples > 0
+    assert (one.held_out.error_mm == two.held_out.error_mm).all()
+
+
+def test_many_points():
+    """The samples see 500 of them, the fit all."""
+    s = scene(11, 60_000, 0.4)
+    found = register(s.xyz_a, s.xyz_b, folds=2)
+    assert cost_ratio(s, found) < 1 + 1e-6
+    assert (found.inliers != s.clean).sum() <= 3
+    assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.01)  # 108 000 degrees of freedom: ± 0.2 %
+    assert found.held_out.of_inliers.rms_mm == pytest.approx(np.sqrt(3) * SIGMA_MM, rel=0.02)
+    assert len(found.held_out.rows) == 20_000
+
+
+def test_exact_points():
+    s = scene(12, 30, 0.3, sigma_mm=0)
+    found = register(s.xyz_a, s.xyz_b, folds=0)
+    assert (found.inliers == s.clean).all()
+    assert found.inlier_errors.max_mm < 1e-8
+    clean = register(s.xyz_a[s.clean], s.xyz_b[s.clean], folds=0)
+    assert clean.inliers.all()
+
+
+@pytest.mark.parametrize("model", ["similarity", "affine"])
+def test_other_models(model):
+    s = scene(13, 60, 0.4)
+    b = 1.01 * s.xyz_b
+    found = register(s.xyz_a, b, model=model, folds=0)
+    assert (found.inliers == s.clean).all()
+    if model == "similarity":
+        assert found.b_from_a.scale == pytest.approx(1.01, abs=5 * np.sqrt(found.covariance[6, 6]))
+
+
+def test_weights_decide_who_is_far():
+    s = scene(14, 40)
+    b, weights = s.xyz_b.copy(), np.ones(40)
+    b[:10] += np.random.default_rng(2).normal(0, 3, (10, 3))
+    weights[:10] = (SIGMA_MM / 3) ** 2
+    assert register(s.xyz_a, b, weights=weights, folds=0).inliers.all()
+    assert not register(s.xyz_a, b, folds=0).inliers[:10].all()
+
+
+class TestThreshold:
+    def test_inliers_are_those_within(self):
+        s = scene(15, 80, 0.3)
+        found = register(s.xyz_a, s.xyz_b, threshold_mm=0.4, folds=0)
+        np.testing.assert_array_equal(found.inliers, np.linalg.norm(found.residuals, axis=1) <= 0.4)
+        assert found.threshold_mm == 0.4
+        assert not (found.inliers & ~s.clean).any()
+        # 0.4 mm is 2.7 σ and cuts off 7 %: without a correction σ would come out 5 % too small
+        assert found.sigma_mm == pytest.approx(SIGMA_MM, rel=0.15)
+
+    def test_a_tight_one_is_told(self):
+        s = scene(16, 200)
+        found = register(s.xyz_a, s.xyz_b, threshold_mm=1.7 * SIGMA_MM, folds=0)
+        assert any("cuts off good points" in note for note in found.notes)
+        # of 1 σ: a fifth of the points is left, which say little about σ, and nothing beyond the threshold
+        tighter = register(s.xyz_a, s.xyz_b, threshold_mm=SIGMA_MM, folds=0)
+        assert SIGMA_MM / 3 < tighter.sigma_mm <= SIGMA_MM
+        assert any("cuts off good points" in note for note in tighter.notes)
+
+    def test_nobody_within(self):
+        rng = np.random.default_rng(0)
+        with fails_with("E-REGISTER-DISAGREE … rigid … within 1e-06 mm"):
+            register(rng.uniform(-1, 1, (30, 3)), rng.uniform(-1, 1, (30, 3)), threshold_mm=1e-6)
+
+
+class TestFewPoints:
+    def test_three_have_nobody_to_judge_by(self):
+        s = scene(17, 3)
+        found = register(s.xyz_a, s.xyz_b)
+        assert found.inliers.all()
+        assert found.redundancy == 3
+        assert found.held_out is None
+        assert any("3 degrees of freedom" in note for note in found.notes)
+
+    def test_one_wrong_of_four_is_refused(self):
+        s = scene(18, 4)
+        b = s.xyz_b.copy()
+        b[1] += [0, 60, 0]
+        with fails_with("E-REGISTER-DISAGREE … 3 … 4 … rigid … 4"):
+            register(s.xyz_a, b)
+
+    def test_one_wrong_of_five_is_found(self):
+        s = scene(19, 5)
+        b = s.xyz_b.copy()
+        b[1] += [0, 20, 0]
+        found = register(s.xyz_a, b)
+        assert found.outliers.tolist() == [1]
+
+    @pytest.mark.parametrize(("model", "n"), [("rigid", 2), ("similarity", 2), ("affine", 4)])
+    def test_too_few(self, model, n):
+        s = scene(20, n)
+        with pytest.raises(
+            DegenerateError, match=rf"{n} point pairs, {3 if n == 2 else 5} needed for the {model} model"
+        ):
+            register(s.xyz_a, s.xyz_b, model=model)
+
+
+def test_points_without_correspondence_are_refused():
+    rng = np.random.default_rng(21)
+    for n in (8, 40, 200):
+        with fails_with("E-REGISTER-CHANCE"):
+            register(rng.uniform(-100, 100, (n, 3)), rng.uniform(-100, 100, (n, 3)))
+
+
+def test_few_points_without_correspondence_are_not_called_a_line():
+    """Least squares of 30 random pairs: σ is as large as the cloud, along all of its axes."""
+    a, b = np.random.default_rng(21).uniform(-100, 100, (2, 30, 3))
+    for model in ("rigid", "affine"):
+        with fails_with("E-REGISTER-CHANCE … 30"):
+            register(a, b, model=model, method="least-squares")
+
+
+def test_the_bound_is_above_the_distribution():
+    for a, b in ((3, 1.5), (10.5, 40), (300, 200)):
+        x = np.linspace(0.3, 1, 50) * a / (a + b)
+        assert (chernoff(x, np.float64(a), np.float64(b)) >= beta.logcdf(x, a, b) - 1e-12).all()
+        # and not far above: within the usual factor of a few √n
+        assert (chernoff(x, np.float64(a), np.float64(b)) - beta.logcdf(x, a, b)).max() < 6
+
+
+def test_the_score_has_its_minimum_where_outliers_begin():
+    square = np.sort(np.random.default_rng(0).chisquare(3, 100))
+    square[70:] = 4000
+    value, cut = by_scale(RIGID, 100, square.sum())(square[None])
+    assert cut[0] == square[69]
+    assert value[0] < -100
+
+
+@pytest.mark.parametrize("sets", [10, pytest.param(30, marks=pytest.mark.slow)])
+def test_false_alarms_of_the_search_are_rare(sets):
+    """The bound on all sets together is generous: none of the sets without outliers may come near."""
+    for trial in range(sets):
+        s = scene([trial, 5], 15)
+        total = ((s.xyz_b - align_rigid(s.xyz_b, s.xyz_a) @ s.xyz_a) ** 2).sum()
+        problem = Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise())
+        found = search(problem, by_scale(RIGID, 15, total), np.random.default_rng(0))
+        assert found.value > np.log(1e-3)
+
+
+def test_groups():
+    s = scene(22, 60, 0.4, "one shift", (1.5, 1.5))
+    groups = two_groups(Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise()), np.random.default_rng(0))
+    near = [((s.xyz_b - t @ s.xyz_a) ** 2).sum(1) for t in groups.transforms]
+    assert ((near[0] < near[1]) == s.clean).mean() > 0.97
+    assert not groups.in_space
+    none = scene(23, 60)
+    assert two_groups(Problem(RIGID, none.xyz_a, none.xyz_b, PointNoise()), np.random.default_rng(0)) is None
+    assert lies_together(s.xyz_a, s.xyz_a[:, 0] > 800)
+    assert not lies_together(s.xyz_a, s.clean)

@@ -1,0 +1,56 @@
+"""Cross-validation: errors of points that had no part in the fit."""
+
+import numpy as np
+import pytest
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import align_rigid
+from stcal.register import register
+from stcal.register.result import held_out
+from tests.support.point_pairs import SIGMA_MM, make_scene
+
+
+def scene(seed, *args, **options):
+    return make_scene(np.random.default_rng(seed), *args, **options)
+
+
+def test_leave_one_out_is_what_it_says():
+    s = scene(0, 7)
+    found = held_out(lambda rows: align_rigid(s.xyz_b[rows], s.xyz_a[rows]), s.xyz_a, s.xyz_b, s.clean, 7, 4, 0)
+    for i, error in zip(found.rows, found.error_mm, strict=True):
+        rest = np.arange(7) != i
+        expected = np.linalg.norm(s.xyz_b[i] - align_rigid(s.xyz_b[rest], s.xyz_a[rest]) @ s.xyz_a[i])
+        assert error == pytest.approx(expected)
+    assert found.rows.tolist() == list(range(7))
+    figures = (found.of_all.mean_mm, found.of_all.rms_mm, found.of_all.max_mm)
+    assert figures == pytest.approx((found.error_mm.mean(), np.sqrt((found.error_mm**2).mean()), max(found.error_mm)))
+
+
+def test_of_inliers_and_of_all():
+    s = scene(1, 60, 0.3)
+    found = register(s.xyz_a, s.xyz_b, folds=5)
+    # Σ over noise and the fit's own variance: 3σ²(1 + 6/(3·33)); 42 points: ± 8 %
+    assert found.held_out.of_inliers.rms_mm == pytest.approx(SIGMA_MM * np.sqrt(3 * 1.06), rel=0.3)
+    assert found.held_out.of_all.rms_mm > 10 * found.held_out.of_inliers.rms_mm
+    assert found.held_out.of_all.max_mm == pytest.approx(np.linalg.norm(found.residuals, axis=1).max(), rel=0.05)
+
+
+def test_no_folds_and_too_few_points():
+    s = scene(2, 12)
+    assert register(s.xyz_a, s.xyz_b, folds=0).held_out is None
+    assert register(s.xyz_a[:4], s.xyz_b[:4], folds=4).held_out is None
+    assert register(s.xyz_a, s.xyz_b, folds=50).held_out.folds == 12
+
+
+def test_a_fold_that_cannot_be_fitted_is_left_out():
+    s = scene(3, 12)
+
+    def sometimes(rows):
+        if 0 not in rows:
+            raise DegenerateError("E-TEST", "without the first")
+        return align_rigid(s.xyz_b[rows], s.xyz_a[rows])
+
+    found = held_out(sometimes, s.xyz_a, s.xyz_b, s.clean, 4, 4, 0)
+    assert found.folds == 3
+    assert len(found.rows) == 9
+    assert 0 not in found.rows
