@@ -291,7 +291,7 @@ def main() -> None:
             case "covariance":
                 covariance()
             case "edges":
-                edges(arguments.most or 40)
+                edges(arguments.most or 160)
             case "time":
                 timing(arguments.folder, images)
 

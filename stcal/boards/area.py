@@ -1,20 +1,27 @@
 """Lines between the cells of tags, by the areas in each pixel: their scatter shows how far sampling displaces edges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.optimize import nnls
 from scipy.special import ndtr
 
 from stcal.geometry.plane import apply_homography, fit_homographies
 
 PIXEL_VARIANCE = 1 / 12
 """Variance of a square pixel about its centre, px²."""
-PRIOR_PX, PRIOR_LINES = 0.005, 1
-"""σ of the displacement of edges by the pixels' sampling before an image is seen, px, and the number of lines that it
-counts as."""
+PRIOR_PX = 0.005
+"""σ of the displacement of edges by the pixels' sampling before an image is seen, px."""
+LEAST_PX = 0.0005
+"""Least σ of a displacement that is told apart from another, px."""
+ROUNDS = 5
+"""Number of times that estimates are weighted by the variances found before."""
 BY_CHANCE = 3.0
-"""Number of σ up to which a displacement of points is taken for chance."""
+"""Number of σ up to which scatter of lines is taken for chance."""
+POINTS_PX = 0.01
+"""The same of images that were resampled in points, as far as nothing shows that they were not, px."""
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -137,29 +144,39 @@ class SamplingVariance:
         return self.of_area * passed**2 + self.of_points
 
 
-def displacement_variance(*parts: Displacement) -> SamplingVariance:
-    """Return the means of the estimates, weighted by their certainty; at least 0.
+def displacement_variance(by_phase: Sequence[Displacement], otherwise: Sequence[Displacement] = ()) -> SamplingVariance:
+    """Return the variances that explain the estimates best, weighted by their certainty; at least 0.
 
-    That of areas has a prior. That of points is 0 unless it is beyond chance.
+    Both have a prior: lines whose spacing is a whole number of pixels move together, and tell nothing. ``otherwise`` is
+    the scatter of lines that does not follow the phase; it counts if it is beyond chance.
     """
+    square, noise, lines, passed = _known(by_phase)
+    design = np.stack([passed**2, np.ones_like(passed)], axis=-1)
+    before = np.array([PRIOR_PX, POINTS_PX]) ** 2
+    variance = before
+    for _ in range(ROUNDS):
+        root = np.sqrt(lines) / (noise + design @ variance + LEAST_PX**2)  # of weights: squares vary as themselves
+        rows = np.concatenate([root[:, None] * design, np.diag(1 / before)])
+        variance = nnls(rows, np.concatenate([root * square, np.ones(2)]))[0]
+    square, noise, lines, _ = _known(otherwise)
+    certainty = lines * (noise + PRIOR_PX**2) ** -2
+    scatter, chance = (certainty * square).sum(), np.sqrt((certainty**2 * 2 * noise**2 / lines).sum())
+    further = scatter / certainty.sum() if scatter > BY_CHANCE * chance else 0.0
+    return SamplingVariance(float(variance[0]), float(variance[1] + further))
+
+
+def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
+    names = ("square", "noise", "lines", "passed")
     square, noise, lines, passed = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("square", "noise", "lines", "passed")
+        np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0)]) for name in names
     )
     known = np.isfinite(square) & (lines > 0)
-    square, noise, lines, share = square[known], noise[known], lines[known], passed[known] ** 2
-    weight = lines * share * (noise + share * PRIOR_PX**2) ** -2  # a wide blur passes nothing: 0, not 0 over 0
-    prior = PRIOR_LINES * PRIOR_PX**-4
-    of_area = (float((weight * square).sum()) + prior * PRIOR_PX**2) / (float((weight * share).sum()) + prior)
-    of_area = max(of_area, 0.0)
-    certainty = lines * (1 - share) ** 2 * (noise + PRIOR_PX**2) ** -2
-    of_points = float((certainty * (square - of_area * share)).sum())
-    chance = float(np.sqrt((certainty**2 * 2 * noise**2 / lines).sum()))
-    return SamplingVariance(of_area, of_points / float(certainty.sum()) if of_points > BY_CHANCE * chance else 0.0)
+    return [values[known] for values in (square, noise, lines, passed)]
 
 
 CLEAR_BLURS = 2.5
 """Distance from other lines, in σ of blur and pixel, from which on pixels are used."""
-END_BLURS = 1.5
+END_BLURS = 2.0
 """Distance from the ends of a cell's side, in the same, from which on pixels are used. Past its end the contrast of the
 side changes, but not its place."""
 LEAST_BLURS, MOST_BLURS = 1.5, 4.0
@@ -172,8 +189,6 @@ MOST_PX = 0.04
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 """Corners of the unit square in cyclic order."""
 STEPS = 2
-UNKNOWNS = 4
-"""Number of unknowns of the lines in one direction: middle, spacing, its change, and the spread of black."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,11 +209,11 @@ class OuterLines:
     by_sampling: np.ndarray
 
 
-def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> Displacement:
-    """Return the displacement of edges by sampling, estimated from the lines between cells.
+def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
+    """Return the displacement of edges by sampling, estimated from the lines between cells, and that by other errors.
 
-    Apart from perspective and lens, the lines of a tag are evenly spaced. Their scatter about this, beyond noise, is
-    the independent displacement of each line.
+    Apart from perspective and lens, the lines of a tag are evenly spaced. What is left of them follows the phase of the
+    pixels if sampling displaces them; the rest of their scatter, beyond noise, has other reasons, such as the print.
     """
     square = np.broadcast_to(cells * SQUARE, outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
@@ -219,16 +234,19 @@ def _bright(grey: np.ndarray, image_from_grid: np.ndarray, outer: OuterLines, ce
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pieces:
     """Sides of cells between dark and bright: ``tag``, ``axis`` (0 : lines of one x), ``line`` and ``sign`` (s,), +1
-    where the next cell is bright; ``start``, ``end`` (s, 2), px; ``normal`` (s, 2) towards the next cell; ``cell`` (s,)
-    the distance to the next line, px."""
+    where the next cell is bright; ``along`` (s,) place on the line, -1 to 1; ``start``, ``end`` (s, 2), px; ``normal``
+    (s, 2) towards the next cell; ``lean`` (s,) how far the cell's other sides run along the line for each px across it;
+    ``cell`` (s,) the distance to the next line, px."""
 
     tag: np.ndarray
     axis: np.ndarray
     line: np.ndarray
     sign: np.ndarray
+    along: np.ndarray
     start: np.ndarray
     end: np.ndarray
     normal: np.ndarray
+    lean: np.ndarray
     cell: np.ndarray
 
 
@@ -250,19 +268,23 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
         normal *= np.sign(((after - before) * normal).sum(1))[:, None]
         widths = [np.abs(((there - start) * normal).sum(1)) for there in (before, after)]
+        lean = ((after - before) * direction).sum(1) / ((after - before) * normal).sum(1)
         sign = change[change != 0].astype(float)
-        found.append((tag, np.full(len(tag), axis), line, sign, start, end, normal, np.minimum(*widths)))
+        place = (2 * along + 1) / cells - 1
+        found.append((tag, np.full(len(tag), axis), line, sign, place, start, end, normal, lean, np.minimum(*widths)))
     return _Pieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Offsets:
     """Offsets of lines from the grid, px: ``offset``, ``variance`` (n, 2, lines, 2), of both signs apart, and
-    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen. ``passed`` : (n, 2), by direction."""
+    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen. ``along`` : (n, 2, lines, 2) mean place on the
+    line of the sides used; ``passed`` : (n, 2), by direction."""
 
     offset: np.ndarray
     variance: np.ndarray
     by_sampling: np.ndarray
+    along: np.ndarray
     passed: np.ndarray
 
 
@@ -297,10 +319,12 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
     for edge, axis, line, sign in ((0, 1, 0, 0), (1, 0, -1, 1), (2, 1, -1, 1), (3, 0, 0, 0)):
         offset[:, axis, line, sign] = 0.0
         variance[:, axis, line, sign] = outer.variance[:, edge]
-        by_sampling[:, axis, line, sign] = outer.by_sampling[:, edge]
+        by_sampling[:, axis, line, sign] = outer.by_sampling[:, edge] * (-1 if line == 0 else 1)  # outwards there
+    pixels = used.sum((1, 2))
+    along = np.bincount(group, pixels * pieces.along, len(value)) / np.bincount(group, pixels, len(value)).clip(1)
     direction = 2 * pieces.tag + pieces.axis
     passed = np.bincount(direction, passed_by_blur(rise, blur), 2 * n) / np.bincount(direction, minlength=2 * n).clip(1)
-    return _Offsets(offset, variance, by_sampling, passed.reshape(n, 2))
+    return _Offsets(offset, variance, by_sampling, along.reshape(shape), passed.reshape(n, 2))
 
 
 def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -326,22 +350,24 @@ def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.nd
     level = grey[y.clip(0, height - 1).astype(int), x.clip(0, width - 1).astype(int)].astype(float)
     off = np.stack([x, y], axis=-1) - pieces.start[:, None, None]
     place, distance = (np.einsum("spai,si->spa", off, axis) for axis in (direction, pieces.normal))
+    place = place - pieces.lean[:, None, None] * distance
     used = (np.abs(distance) <= reach[:, None, None]) & (column <= last[:, None])[..., None]
     used &= np.abs(place - length[:, None, None] / 2) <= (length / 2 - END_BLURS * sigma)[:, None, None]
     used &= (reach > LEAST_BLURS * sigma)[:, None, None] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     return level, distance, used.astype(float), pieces.normal[each, 1 - major]
 
 
-def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> Displacement:
-    """Return what the scatter of evenly spaced lines says, for each tag and direction."""
+def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
+    """Return what evenly spaced lines say, for each tag and direction: whether they move with the phase, and scatter
+    otherwise."""
     n = len(outer.blur)
     place = 2 * np.arange(cells + 1) / cells - 1
-    design = np.stack([np.ones_like(place), place, place**2], axis=-1)
-    design = np.repeat(design[:, None], 2, axis=1)
-    design = np.concatenate([design, np.broadcast_to([[[-1.0], [1.0]]], (cells + 1, 2, 1))], axis=2).reshape(
-        -1, UNKNOWNS
-    )
-    k = len(design)
+    sign, place = np.tile([-1.0, 1.0], cells + 1), np.repeat(place, 2)
+    k = len(place)
+    along = lines.along.reshape(2 * n, k)
+    fixed = np.stack([np.ones(k), place, place**2, sign], axis=-1)  # middle, spacing and its change, spread of black
+    turned = np.stack([along, along * place], axis=-1)  # of the grid, whose corners have errors
+    design = np.concatenate([np.broadcast_to(fixed, (2 * n, *fixed.shape)), turned], axis=-1)
     offset, variance = lines.offset.reshape(2 * n, k), lines.variance.reshape(2 * n, k)
     pull = np.nan_to_num(lines.by_sampling.reshape(2 * n, k, 2))
     there = np.isfinite(offset) & np.isfinite(variance) & (variance > 0)
@@ -353,13 +379,25 @@ def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> Displacement:
     made = np.eye(k) - basis @ np.linalg.pinv(basis, rcond=1e-6)
     made = made * there[:, None, :] * there[:, :, None]
     left = np.einsum("gij,gj->gi", made, root * offset)
+    freedom = np.einsum("gii->g", made)
+    # An edge that sampling displaces in one direction is displaced as far in the other, seen from there: a sine. What
+    # follows a sine that is even in all lines could also be their spacing, and says nothing.
+    wave = np.sqrt(2) * np.einsum("gij,gj->gi", made, root * pull[..., 1])
+    known = np.maximum((wave**2).sum(1), 1e-12)
+    amplitude = (wave * left).sum(1) / known
+    by_phase = np.where(freedom > 0.5, amplitude**2 - 1 / known, np.nan)
     same = np.equal.outer(np.arange(k) // 2, np.arange(k) // 2)
     shared = (pull @ np.swapaxes(pull, 1, 2)) * same * root[:, :, None] * root[:, None]
-    freedom = np.einsum("gii->g", made)
     by_displacement = np.einsum("gij,gjk,gik->g", made, shared, made)
-    good = (freedom > 0.5) & (by_displacement > 1e-9)
+    rest = ((left - amplitude[:, None] * wave) ** 2).sum(1)
+    good = (freedom > 1.5) & (by_displacement > 1e-9)
     by_displacement = np.where(good, by_displacement, 1.0)
-    square = ((left**2).sum(1) - freedom) / by_displacement
+    square = (rest - (freedom - 1)) / by_displacement
     good &= square < MOST_PX**2 + 3 * np.sqrt(2 * freedom.clip(1)) / by_displacement
     square[~good] = np.nan
-    return Displacement(square, freedom / by_displacement, np.maximum(freedom, 0.0), lines.passed.ravel())
+    passed, others = lines.passed.ravel(), np.maximum(freedom - 1, 0.0)
+    by_phase[~good] = np.nan
+    return (
+        Displacement(by_phase, 1 / known, np.ones(2 * n), passed),
+        Displacement(square, others / by_displacement, others, passed),
+    )

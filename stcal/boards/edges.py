@@ -102,14 +102,17 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
         rough = _fit(frame.place, offset, good)
         area = _by_area(grey, frame, rough)
         meeting = _meet(frame, area.lines(rough, SamplingVariance(0.0, 0.0)))[0]
-        variance = displacement_variance(area.told, *_told_by_lines(grey, meeting, np.reshape(cells, -1), area))
+        by_lines = _told_by_lines(grey, meeting, np.reshape(cells, -1), area)
+        variance = displacement_variance([area.told, *(each for each, _ in by_lines)], [each for _, each in by_lines])
         covariance = _meet(frame, area.lines(rough, variance))[1]
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
     return EdgeCorners(meeting, covariance, seen.all(1))
 
 
-def _told_by_lines(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area") -> list[Displacement]:
+def _told_by_lines(
+    grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area"
+) -> list[tuple[Displacement, Displacement]]:
     """Return what the lines between the cells of tags say about sampling, for each number of cells."""
     told, n = [], len(corners)
     dark, rise = np.moveaxis(area.levels.reshape(n, 4, 2), 2, 0)
@@ -333,15 +336,17 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
             value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
             value = np.where(np.isfinite(value), value, 0.0)
     shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
-    noise = _noise_of(residual, distance, weight)
-    factor = noise * _growth_of_tags(residual, design[..., 0], weight, noise, good, shape)
     sampling = of_sampling(distance, pixels.rise, design[..., 0])
+    harmonic = _free_of(design, weight, sampling)
+    scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
+    noise = _noise_of(scatter, distance, weight)
+    factor = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
     passed = passed_by_blur(pixels.rise, value[:, 2])
     pull = products(design, weight, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
     by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
     value[:, :2] -= shift
-    told = _told_along(residual, design, sampling, passed, weight, factor, good)
+    told = _told_along(residual, harmonic, passed, weight, factor, good)
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
@@ -378,15 +383,14 @@ BIN_PX = 0.25
 """Width of a class of distances from an edge of a crossing: pixels in one class see the same part of its profile."""
 
 
-def _told_along(residual, design, by_sampling, passed, weight, noise, good) -> Displacement:
+def _free_of(design: np.ndarray, weight: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the columns (m, p, s, k) without what the design (m, p, s, q) explains of them."""
+    explained = [solved(design, weight, column)[0] for column in np.moveaxis(columns, -1, 0)]
+    return columns - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
+
+
+def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement:
     """Return what turned edges say: whether their profiles move with the phase."""
-    harmonic = np.stack(
-        [
-            part - (design @ solved(design, weight, part)[0][:, None, :, None])[..., 0]
-            for part in np.moveaxis(by_sampling, -1, 0)
-        ],
-        axis=-1,
-    )
     pulled = products(harmonic, weight, residual[..., None])[..., 0]
     gram = products(harmonic, weight, harmonic)
     by_noise, by_displacement = noise * np.trace(gram, axis1=1, axis2=2), np.maximum((gram**2).sum((1, 2)), 1e-12)

@@ -2,7 +2,7 @@
 which robot poses to take next."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,14 +15,15 @@ from stcal.errors import InputError
 from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
-    from stcal.geometry.rigid import Order
     from stcal.handeye import EvolutionOptions
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.pairs import Setup
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export import CameraFrame
     from stcal.handeye.report.outcome import Outcome
-    from stcal.workflows.handeye.inputs import Source
+    from stcal.parallel import Progress
+    from stcal.robot import Robot
+    from stcal.workflows.handeye.inputs import HandEyeInput, Source
     from stcal.workflows.handeye.robot_at_images import Timing
 
 
@@ -73,35 +74,146 @@ TimeTolerance = Annotated[
 ]
 
 
-def source_of(
-    source: Path | None,
-    first: Path | None,
-    second: Path | None,
-    key: str,
-    statements: "Said",
-    quaternions: "Order",
-    timing: "Timing | None" = None,
-    columns: Path | None = None,
-    columns_a: Path | None = None,
-) -> "Source":
-    """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
-    from stcal.workflows.handeye.inputs import one_source
-    from stcal.workflows.handeye.robot_at_images import Timing
+@dataclass(frozen=True, slots=True)
+class PoseFiles:
+    """Options of the files with the poses, or photographs, and of what these do not state."""
 
-    maps = columns_a, columns
-    if source is None and first is not None and second is not None:
-        told, notes = one_source(first, second, key, statements, quaternions, timing or Timing(), maps)
-        print_each("note", notes)
-        return told
-    if source is not None and columns is not None and source.is_file():
-        return one_source(source, None, key, statements, quaternions, timing or Timing(), maps)[0]
-    if source is not None and source.is_dir():
-        columns = None  # of the robot's poses
-    return shared.one_table(source, first, second, key, "POSES|IMAGES", columns=columns, columns_a=columns_a)
+    source: SourceFile = None
+    poses: PosesFile = None
+    camera: OwnCamera = None
+    board: OwnBoard = None
+    setup: SetupOption = None
+    rotation: RotationOption = None
+    length_unit: LengthUnit = None
+    poses_are: PosesAre = None
+    first: shared.FirstTable = None
+    second: shared.SecondTable = None
+    key: shared.Key = "image"
+    columns: shared.ColumnsFile = None
+    columns_a: shared.FirstColumns = None
+    quaternions: shared.Quaternions = "wxyz"
+    workers: shared.Workers = None
+
+    def statements(self) -> "Said":
+        """Returns the user's statements about what the files do not state."""
+        from stcal.handeye.data.formats.record import Said
+
+        said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
+        return replace(said, columns=self.columns) if self.is_folder() else said
+
+    def is_folder(self) -> bool:
+        """Returns whether the poses are found in photographs of a folder."""
+        return self.source is not None and self.source.is_dir()
+
+    def pairs(self, timing: "Timing") -> "Source":
+        """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
+        from stcal.workflows.handeye.inputs import one_source
+
+        also, maps = (self.key, self.statements(), self.quaternions, timing), (self.columns_a, self.columns)
+        if self.source is None and self.first is not None and self.second is not None:
+            told, notes = one_source(self.first, self.second, *also, maps)
+            print_each("note", notes)
+            return told
+        if self.source is not None and self.columns is not None and self.source.is_file():
+            return one_source(self.source, None, *also, maps)[0]
+        columns = None if self.is_folder() else self.columns  # those of a folder are of the robot's poses
+        joined = shared.Joined(self.first, self.second, self.key, columns, self.columns_a)
+        return joined.table(self.source, "POSES|IMAGES")
+
+    def understood(self, pairs: "Source", timing: "Timing", robot: "Robot | None") -> list[str]:
+        """Returns in lines how the files are understood, without solving anything."""
+        from stcal.workflows.handeye.inputs import dry_run
+
+        images = self.poses, self.camera, self.board
+        return dry_run(pairs, *images, self.quaternions, self.statements(), timing, robot)
+
+    def read(
+        self, pairs: "Source", timing: "Timing", robot: "Robot | None", progress: "Progress | None"
+    ) -> "HandEyeInput":
+        """Returns the poses, from :meth:`pairs`."""
+        from stcal.workflows.handeye.inputs import read_handeye
+
+        return read_handeye(
+            pairs,
+            self.poses,
+            self.camera,
+            self.board,
+            setup=self.setup,
+            rotation=self.rotation or (),
+            length_unit=self.length_unit or (),
+            poses_are=self.poses_are or (),
+            quaternions=self.quaternions,
+            columns=self.columns if self.is_folder() else None,
+            tolerance_s=timing.tolerance_s,
+            image_times=timing.image_times,
+            times_columns=timing.times_columns,
+            time_offset=timing.offset,
+            robot=robot,
+            workers=self.workers,
+            progress=progress,
+        )
 
 
+POSE_FILES = PoseFiles()
 EVOLVED = ("de", "de-polished")
 """Methods that take the options ``--de-…``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evolution:
+    """Options of differential evolution."""
+
+    de_bounds_deg: Annotated[
+        str | None,
+        "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
+        "about the closed form; ±180 if not given.",
+    ] = None
+    de_bounds_mm: Annotated[
+        str | None,
+        "Begin --method de within this translation: ± about zero, X,Y,Z,± or closed-form,±; if not given, up to the "
+        "distance of the farthest pose.",
+    ] = None
+    de_population: Annotated[
+        int | None, "Use this many candidates M; if not given 30, the paper's.", Opt(min=4, max=100_000)
+    ] = None
+    de_f: Annotated[
+        float | None, "Use this mutation factor F; if not given 0.5, the paper's.", Opt(min=1e-6, max=2)
+    ] = None
+    de_cr: Annotated[
+        float | None, "Use this crossover factor CR; if not given 0.9, the paper's.", Opt(min=0, max=1)
+    ] = None
+    de_lambda: Annotated[
+        float | None,
+        "Multiply squared translations in m² by this λ; if not given 1, the paper's.",
+        Opt(min=1e-12, max=1e12),
+    ] = None
+    de_generations: Annotated[
+        int | None, "End after this many generations; if not given 100, the paper's.", Opt(min=0, max=100_000)
+    ] = None
+    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=shared.MOST_SEED)] = None
+
+    def options(self, method: str | None) -> "EvolutionOptions":
+        """Returns the options of differential evolution, with defaults for those that were not given."""
+        from stcal.handeye import EvolutionOptions
+        from stcal.workflows.handeye.calibrate import ALL
+
+        values = {
+            "bounds_rad": _bounds("--de-bounds-deg", self.de_bounds_deg, math.radians(1)),
+            "bounds_mm": _bounds("--de-bounds-mm", self.de_bounds_mm, 1.0),
+            "population": self.de_population,
+            "factor": self.de_f,
+            "crossover": self.de_cr,
+            "weight": self.de_lambda,
+            "generations": self.de_generations,
+            "seed": self.de_seed,
+        }
+        given = {name: value for name, value in values.items() if value is not None}
+        if given and method not in (ALL, *EVOLVED):
+            raise InputError("E-OPTION-NEEDS", f"--de-…: only with --method {', '.join(EVOLVED)} or {ALL}")
+        return EvolutionOptions(**given)
+
+
+EVOLUTION = Evolution()
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
@@ -111,14 +223,7 @@ CameraFrameName = Literal["optical", "link"]
 
 
 def handeye(
-    source: SourceFile = None,
-    poses: PosesFile = None,
-    camera: OwnCamera = None,
-    board: OwnBoard = None,
-    setup: SetupOption = None,
-    rotation: RotationOption = None,
-    length_unit: LengthUnit = None,
-    poses_are: PosesAre = None,
+    files: PoseFiles = POSE_FILES,
     dry_run: Annotated[bool, "Print how the files were understood; solve and write nothing."] = False,
     method: Annotated[
         str | None,
@@ -200,48 +305,13 @@ def handeye(
     camera_out: Annotated[
         Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
     ] = None,
-    de_bounds_deg: Annotated[
-        str | None,
-        "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
-        "about the closed form; ±180 if not given.",
-    ] = None,
-    de_bounds_mm: Annotated[
-        str | None,
-        "Begin --method de within this translation: ± about zero, X,Y,Z,± or closed-form,±; if not given, up to the "
-        "distance of the farthest pose.",
-    ] = None,
-    de_population: Annotated[
-        int | None, "Use this many candidates M; if not given 30, the paper's.", Opt(min=4, max=100_000)
-    ] = None,
-    de_f: Annotated[
-        float | None, "Use this mutation factor F; if not given 0.5, the paper's.", Opt(min=1e-6, max=2)
-    ] = None,
-    de_cr: Annotated[
-        float | None, "Use this crossover factor CR; if not given 0.9, the paper's.", Opt(min=0, max=1)
-    ] = None,
-    de_lambda: Annotated[
-        float | None,
-        "Multiply squared translations in m² by this λ; if not given 1, the paper's.",
-        Opt(min=1e-12, max=1e12),
-    ] = None,
-    de_generations: Annotated[
-        int | None, "End after this many generations; if not given 100, the paper's.", Opt(min=0, max=100_000)
-    ] = None,
-    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=shared.MOST_SEED)] = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "image",
-    columns: shared.ColumnsFile = None,
-    columns_a: shared.FirstColumns = None,
-    quaternions: shared.Quaternions = "wxyz",
-    workers: shared.Workers = None,
+    evolution: Evolution = EVOLUTION,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
 ) -> None:
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.handeye import HandEyeOptions, Noise
-    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.export import (
         FORMS,
         exported,
@@ -256,27 +326,23 @@ def handeye(
     from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import calibrate_handeye
-    from stcal.workflows.handeye.inputs import dry_run as understood
-    from stcal.workflows.handeye.inputs import read_handeye, without_flips
+    from stcal.workflows.handeye.inputs import without_flips
     from stcal.workflows.handeye.robot_at_images import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     if times_columns is not None and image_times is None:
         raise InputError(
             "E-OPTION-NEEDS",
             f"--times-columns {times_columns}: it describes a table of image times; give --image-times",
         )
     timing = Timing(time_tolerance, image_times, time_offset, times_columns)
-    pairs = source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
-    folder = isinstance(pairs, Path) and pairs.is_dir()
-    statements = replace(statements, columns=columns) if folder else statements
+    pairs, folder = files.pairs(timing), files.is_folder()
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
     exports = shared.exports_of(export or [], FORMS)
-    _require_frames(ros or urdf, exports, setup or "eye-in-hand", parent, child, camera_frame)
+    _require_frames(ros or urdf, exports, files.setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "E-OPTION-NEEDS",
@@ -286,45 +352,22 @@ def handeye(
         raise InputError(
             "E-OPTION-NEEDS", "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px"
         )
-    evolution = _evolution(
-        method,
-        bounds_rad=_bounds("--de-bounds-deg", de_bounds_deg, math.radians(1)),
-        bounds_mm=_bounds("--de-bounds-mm", de_bounds_mm, 1.0),
-        population=de_population,
-        factor=de_f,
-        crossover=de_cr,
-        weight=de_lambda,
-        generations=de_generations,
-        seed=de_seed,
-    )
+    evolved = evolution.options(method)
     if dry_run:
-        say("\n".join(understood(pairs, poses, camera, board, quaternions, statements, timing, robot_model)))
+        say("\n".join(files.understood(pairs, timing, robot_model)))
         return
     with StageProgress() as progress:
-        inputs = read_handeye(
-            pairs,
-            poses,
-            camera,
-            board,
-            setup=setup,
-            rotation=rotation or (),
-            length_unit=length_unit or (),
-            poses_are=poses_are or (),
-            quaternions=quaternions,
-            columns=statements.columns,
-            tolerance_s=time_tolerance,
-            image_times=image_times,
-            times_columns=times_columns,
-            time_offset=time_offset,
-            robot=robot_model,
-            workers=workers,
-            progress=progress,
-        )
+        inputs = files.read(pairs, timing, robot_model, progress)
         for line in inputs.understood:
             say(line)
         with_scale = with_scale or inputs.unit_mm is not None
         options = HandEyeOptions(
-            noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolution
+            noise,
+            inputs.prior if refine_camera else None,
+            with_scale,
+            inputs.symmetries,
+            four_dof,
+            evolved,
         )
         if undo_flips:
             inputs, undone = without_flips(inputs, options)
@@ -339,7 +382,7 @@ def handeye(
             held_out=held_out,
             seed=seed,
             motions=motions_held_out,
-            workers=workers,
+            workers=files.workers,
             progress=progress,
         )
     result = outcome.result
@@ -451,17 +494,6 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
         raise InputError("E-OPTION-VALUE", f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
 
 
-def _evolution(method: str | None, **given) -> "EvolutionOptions":
-    """Returns the options of differential evolution, with defaults for those that were not given."""
-    from stcal.handeye import EvolutionOptions
-    from stcal.workflows.handeye.calibrate import ALL
-
-    given = {name: value for name, value in given.items() if value is not None}
-    if given and method not in (ALL, *EVOLVED):
-        raise InputError("E-OPTION-NEEDS", f"--de-…: only with --method {', '.join(EVOLVED)} or {ALL}")
-    return EvolutionOptions(**given)
-
-
 def _save_camera(path: Path, outcome: "Outcome") -> None:
     from stcal.geometry.camera import Camera
     from stcal.io.cameras.write import save_camera
@@ -481,14 +513,7 @@ def _radians(degrees: float | None) -> float | None:
 
 
 def plan(
-    source: SourceFile = None,
-    poses: PosesFile = None,
-    camera: OwnCamera = None,
-    board: OwnBoard = None,
-    setup: SetupOption = None,
-    rotation: RotationOption = None,
-    length_unit: LengthUnit = None,
-    poses_are: PosesAre = None,
+    files: PoseFiles = POSE_FILES,
     robot_file: Annotated[
         Path | None,
         "Plan only poses that this robot reaches within its joint limits (TOML), and give their joint values.",
@@ -497,42 +522,19 @@ def plan(
     count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3,
     seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "image",
-    columns: shared.ColumnsFile = None,
-    columns_a: shared.FirstColumns = None,
-    quaternions: shared.Quaternions = "wxyz",
-    workers: shared.Workers = None,
     json_file: shared.JsonFile = None,
 ) -> None:
     """Name further robot poses that would lower the worst σ of a hand-eye calibration, at the board, most."""
-    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.plan import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
     from stcal.workflows.handeye.calibrate import plan_handeye
-    from stcal.workflows.handeye.inputs import read_handeye
+    from stcal.workflows.handeye.robot_at_images import Timing
 
-    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
-    pairs = source_of(source, first, second, key, statements, quaternions, None, columns, columns_a)
-    statements = replace(statements, columns=columns) if isinstance(pairs, Path) and pairs.is_dir() else statements
-    robot = load_robot(robot_file) if robot_file else None
+    robot, timing = load_robot(robot_file) if robot_file else None, Timing()
+    pairs = files.pairs(timing)
     with StageProgress() as progress:
-        inputs = read_handeye(
-            pairs,
-            poses,
-            camera,
-            board,
-            setup=setup,
-            rotation=rotation or (),
-            length_unit=length_unit or (),
-            poses_are=poses_are or (),
-            quaternions=quaternions,
-            columns=statements.columns,
-            workers=workers,
-            progress=progress,
-        )
+        inputs = files.read(pairs, timing, None, progress)
     for line in inputs.understood:
         say(line)
     planned = plan_handeye(inputs, count, robot, seed)

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -218,22 +218,29 @@ ColumnsFile = Annotated[
 FirstColumns = Annotated[Path | None, "Read the file of --a with the columns, delimiter … of this file (TOML)."]
 
 
-def one_table(
-    given: Path | None,
-    first: Path | None,
-    second: Path | None,
-    key: str,
-    what: str,
-    prefixes: tuple[str, str] = ("", ""),
-    quaternions: "Order" = "wxyz",
-    columns: Path | None = None,
-    columns_a: Path | None = None,
-) -> "Path | Table":
-    """Returns the file given as argument, or the table of --a and --b joined. Notes on rows left out are printed."""
-    tables = several_tables(
-        given, first, [second] if second else [], key, what, prefixes, quaternions, columns, columns_a
-    )
-    return tables[0] if isinstance(tables, list) else tables
+@dataclass(frozen=True, slots=True)
+class Joined:
+    """Options of a table in place of a command's file: two tables joined, and columns of other programs."""
+
+    first: FirstTable = None
+    second: SecondTable = None
+    key: Key = "image"
+    columns: ColumnsFile = None
+    columns_a: FirstColumns = None
+
+    def table(
+        self, given: Path | None, what: str, prefixes: tuple[str, str] = ("", ""), quaternions: "Order" = "wxyz"
+    ) -> "Path | Table":
+        """Returns the file given as argument, or the table of --a and --b joined. Notes on rows left out are
+        printed."""
+        seconds = [self.second] if self.second else []
+        tables = several_tables(
+            given, self.first, seconds, self.key, what, prefixes, quaternions, self.columns, self.columns_a
+        )
+        return tables[0] if isinstance(tables, list) else tables
+
+
+JOINED, JOINED_BY_POSE, JOINED_BY_NAME = Joined(), Joined(key="pose"), Joined(key="name")
 
 
 def several_tables(
@@ -287,7 +294,7 @@ def _exports(words: Sequence[str]) -> list[tuple[str, Path]]:
 
 
 def name_of(source: "Path | Table") -> str:
-    """Returns the name, without folder, of a file or table from :func:`one_table`."""
+    """Returns the name, without folder, of a file or table from :meth:`Joined.table`."""
     return source.name if isinstance(source, Path) else source.where
 
 
@@ -374,9 +381,38 @@ def protect_outputs(application: typer.Typer) -> None:
             protect_outputs(group.typer_instance)
 
 
+def _grouped(command: Callable) -> Callable:
+    """Returns the command with the options of each group, a dataclass, as parameters of its own in the group's place.
+
+    A group's default may be an instance, whose values are the defaults; otherwise its fields have defaults.
+    """
+    signature = inspect.signature(command, eval_str=True)
+    groups = {name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)}
+    if not groups:
+        return command
+    every: list[inspect.Parameter] = []
+    for name, each in signature.parameters.items():
+        if name not in groups:
+            every.append(each)
+            continue
+        options = inspect.signature(groups[name], eval_str=True).parameters.values()
+        every += [option.replace(default=getattr(each.default, option.name, option.default)) for option in options]
+
+    @wraps(command)
+    def together(**given):
+        made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
+        return command(**given, **made)
+
+    together.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in every]
+    )
+    return together
+
+
 def _protected(command: Callable) -> Callable:
     if hasattr(command, "outputs"):  # reached through two applications
         return command
+    command = _grouped(command)
     signature = inspect.signature(command, eval_str=True)
     parameters = {name: declared(name, each.annotation) for name, each in signature.parameters.items()}
     words = {name: each.word for name, each in parameters.items()}

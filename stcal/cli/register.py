@@ -55,11 +55,7 @@ def register(
         Opt("--robot"),
     ] = None,
     identified: Annotated[Path | None, "Write the robot identified with --robot to this file (TOML).", WRITES] = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "name",
-    columns: shared.ColumnsFile = None,
-    columns_a: shared.FirstColumns = None,
+    joined: shared.Joined = shared.JOINED_BY_NAME,
     out: Annotated[Path | None, "Write all results to this file (JSON).", WRITES] = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -78,7 +74,7 @@ def register(
     if published and method != "liu2017":
         raise InputError("E-OPTION-NEEDS", "--sample, --share, --tries, --orthogonality: only with --method liu2017")
     liu2017 = replace(Liu2017Options(), **published) if method == "liu2017" else None
-    source = shared.one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"), columns=columns, columns_a=columns_a)
+    source = joined.table(pairs_file, "PAIRS", ("a", "b"))
     pairs = read_pairs(source)
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")

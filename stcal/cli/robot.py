@@ -140,11 +140,7 @@ def axes(
         "them by their stated σ, if there are any, and off ignores them.",
     ] = "auto",
     rotation: shared.Rotation = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "image",
-    columns_a: shared.FirstColumns = None,
-    columns: shared.ColumnsFile = None,
+    joined: shared.Joined = shared.JOINED,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -156,7 +152,7 @@ def axes(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = shared.one_table(sweeps, first, second, key, "SWEEPS", columns=columns, columns_a=columns_a)
+    source = joined.table(sweeps, "SWEEPS")
     data = read_measurements(source, nominal, rotation=rotation)
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
@@ -233,11 +229,7 @@ def identify(
     quaternions: shared.Quaternions = "wxyz",
     rotation: shared.Rotation = None,
     payload_kg: shared.PayloadKg = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "image",
-    columns_a: shared.FirstColumns = None,
-    columns: shared.ColumnsFile = None,
+    joined: shared.Joined = shared.JOINED,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -250,9 +242,7 @@ def identify(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = shared.one_table(
-        data_file, first, second, key, "DATA", quaternions=quaternions, columns=columns, columns_a=columns_a
-    )
+    source = joined.table(data_file, "DATA", quaternions=quaternions)
     data = read_measurements(source, nominal, quaternions, rotation, payload_kg)
     options = IdentifyOptions(
         observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
@@ -292,11 +282,7 @@ def evaluate(
     out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
     quaternions: shared.Quaternions = "wxyz",
     payload_kg: shared.PayloadKg = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "image",
-    columns: shared.ColumnsFile = None,
-    columns_a: shared.FirstColumns = None,
+    joined: shared.Joined = shared.JOINED,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -307,9 +293,7 @@ def evaluate(
     from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
-    source = shared.one_table(
-        data_file, first, second, key, "DATA", quaternions=quaternions, columns=columns, columns_a=columns_a
-    )
+    source = joined.table(data_file, "DATA", quaternions=quaternions)
     data = [  # within reach of each
         read_measurements(source, robot, quaternions, payload_kg=payload_kg) for robot in robots.values()
     ]
@@ -394,11 +378,7 @@ def compensate(
     quaternions: shared.Quaternions = "wxyz",
     rotation: shared.Rotation = None,
     payload_kg: shared.PayloadKg = None,
-    first: shared.FirstTable = None,
-    second: shared.SecondTable = None,
-    key: shared.Key = "pose",
-    columns: shared.ColumnsFile = None,
-    columns_a: shared.FirstColumns = None,
+    joined: shared.Joined = shared.JOINED_BY_POSE,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -412,9 +392,7 @@ def compensate(
 
     exports, pulses = shared.exports_of(export or [], FORMS), _pulses(pulses_per_deg)
     identified = load_robot(robot_file)
-    source = shared.one_table(
-        targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a
-    )
+    source = joined.table(targets, "TARGETS", quaternions=quaternions)
     wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
     result = compensation.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     document = compensation_report(result, identified)
