@@ -28,6 +28,10 @@ class Printed(Protocol):
         ...
 
 
+DOTS_SIGMA_MM = 0.005
+"""σ of the places of a board's dots where its file states none, mm per axis."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FaceDesign(Brief):
     """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
@@ -611,4 +615,4 @@ def reference_board() -> BoardDesign:
     BoardDesign
         9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm.
     """
-    return BoardDesign(7, 9, 30.0, 7.5, "bright", 0.005)
+    return BoardDesign(7, 9, 30.0, 7.5, "bright", DOTS_SIGMA_MM)

@@ -109,13 +109,13 @@ class PoseFiles:
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
         from stcal.workflows.handeye.inputs import one_source
 
-        also, maps = (self.key, self.statements(), self.quaternions, timing), (self.columns_a, self.columns)
+        said, maps = self.statements(), (self.columns_a, self.columns)
         if self.source is None and self.first is not None and self.second is not None:
-            told, notes = one_source(self.first, self.second, *also, maps)
+            told, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing, maps)
             print_each("note", notes)
             return told
         if self.source is not None and self.columns is not None and self.source.is_file():
-            return one_source(self.source, None, *also, maps)[0]
+            return one_source(self.source, None, self.key, said, self.quaternions, timing, maps)[0]
         columns = None if self.is_folder() else self.columns  # those of a folder are of the robot's poses
         joined = shared.Joined(self.first, self.second, self.key, columns, self.columns_a)
         return joined.table(self.source, "POSES|IMAGES")

@@ -387,7 +387,11 @@ def _grouped(command: Callable) -> Callable:
     A group's default may be an instance, whose values are the defaults; otherwise its fields have defaults.
     """
     signature = inspect.signature(command, eval_str=True)
-    groups = {name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)}
+    groups: dict[str, type] = {
+        name: each.annotation
+        for name, each in signature.parameters.items()
+        if isinstance(each.annotation, type) and is_dataclass(each.annotation)
+    }
     if not groups:
         return command
     every: list[inspect.Parameter] = []
@@ -400,7 +404,9 @@ def _grouped(command: Callable) -> Callable:
 
     @wraps(command)
     def together(**given):
-        made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in groups.items()}
+        made = {
+            name: kind(**{field.name: given.pop(field.name) for field in fields(kind)}) for name, kind in groups.items()
+        }
         return command(**given, **made)
 
     together.__signature__ = signature.replace(  # type: ignore[attr-defined]

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from stcal.design import (
+    DOTS_SIGMA_MM,
     BoardDesign,
     FaceDesign,
     KnownDistance,
@@ -216,7 +217,7 @@ class BoardEntry(BoardSizeEntry):
     pitch_mm: Positive
     radius_mm: Positive
     polarity: Polarity
-    sigma_mm: Positive = 0.005
+    sigma_mm: Positive = DOTS_SIGMA_MM
     corner: _CornerFile | None = None
     rim_mm: RimHeight = 0.0
     unusual_size: bool = False

@@ -112,24 +112,31 @@ def find_rims(
     """
     by_name = {image.name: image for image in images}
     parts: dict[str, list[tuple[np.ndarray, ...]]] = {"circles": [], "dots": []}
+    before = 0
     for model in models:
         views = radius_views(model, by_name, design_mm, camera)
         is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[views.point_index]
         short = (views.ratio - 1) * views.design_mm
+        image = before + np.concatenate([np.full(len(own), k) for k, own in enumerate(model.rows_by_image())])
+        before += len(model.images)
         near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)  # not of corners, whose ratio is not a number
         for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
-            parts[kind].append((short[own], views.tan_tilt[own], views.design_mm[own], views.blur_mm[own]))
+            parts[kind].append((short[own], views.tan_tilt[own], views.design_mm[own], views.blur_mm[own], image[own]))
     rims = {}
     for kind, found in parts.items():
-        short, tangent, radius, blur = (np.concatenate(values) for values in zip(*found, strict=True))
+        short, tangent, radius, blur, image = (np.concatenate(values) for values in zip(*found, strict=True))
         if len(short) >= MIN_VIEWS and tangent.std() >= MIN_SPREAD:
-            rims[kind] = _rim(short, tangent, radius, blur)
+            rims[kind] = _rim(short, tangent, radius, blur, image)
     return rims
 
 
-def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.ndarray) -> Rim:
+def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.ndarray, image: np.ndarray) -> Rim:
     """Returns the rim from the radii's excess ``short`` (mm) over the design, with an offset of each radius, and the
-    share of the blur's effect that its correction left in all of them."""
+    share of the blur's effect that its correction left in all of them.
+
+    The circles of one ``image`` share its exposure, focus and tilt, so that their errors are not independent: σ is at
+    least that by whole images (Liang & Zeger 1986, Biometrika 73).
+    """
     _, kind = np.unique(radius, return_inverse=True)
     rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -tangent / np.pi])
     height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)
@@ -144,5 +151,8 @@ def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.nd
         sigma = float(robust_sigma(length, redundancy=max(1 - rows.shape[1] / len(rows), 0.1)))
         weight = huber_weights(length / max(sigma, 1e-9), HUBER)
     by_tilt = BLUR_SHARE_BY_TILT * float((inverse @ ((rows.T * weight) @ (blur * tangent)))[-1])
-    spread = sigma * float(np.sqrt(inverse[-1, -1]))
+    pull = (rows @ inverse[:, -1]) * weight * (right - rows @ solution)
+    of_image = np.bincount(np.unique(image, return_inverse=True)[1], pull)
+    by_image = float((of_image**2).sum()) * len(of_image) / max(len(of_image) - 1, 1)
+    spread = float(np.sqrt(max(sigma**2 * inverse[-1, -1], by_image)))
     return Rim(height, float(np.sqrt(spread**2 + by_tilt**2 + LEAST_SIGMA_MM**2)), len(short))

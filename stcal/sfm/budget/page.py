@@ -72,6 +72,8 @@ EXACT_UM = 1e-6
 """σ below which a value is exact by definition, as that of the frame's own origin is up to rounding, µm or mdeg."""
 NEGLIGIBLE = 1e-4
 """Share of u below which a contribution has no sensitivity in the tables."""
+IN_OTHERS = 0.05
+"""Share of u up to which intrinsics that the photographs determine are told as part of the other rows."""
 
 
 def budget_report(file: BudgetFile) -> Document:
@@ -341,7 +343,7 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         value = _slope(first, source) if source.key in first.sensitivities else 0.0
         slope = f"{value:.3g} {unit}/{source.unit}" if value else "–"
         parts = [number(u.contributions[source.key], 2) for u in columns.values()]
-        none = all(u.contributions[source.key] <= NEGLIGIBLE * u.standard for u in columns.values())
+        none = all(u.contributions[source.key] <= IN_OTHERS * u.standard for u in columns.values())
         if (
             source.key == "intrinsics" and source.origin == "estimated" and none
         ):  # what they do is in the rows of the centres, with which they were adjusted

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from stcal.design import BoardDesign, StatedSize, faces_of_known_shape, known_distances
+from stcal.boards.design import TAG_SIGMA_MM
+from stcal.design import DOTS_SIGMA_MM, BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
@@ -31,6 +32,8 @@ from stcal.sfm.adjust.uncertainty import (
 FIELDS = ("number", "laboratory", "instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, after those that are given, and empty if they are not."""
 LONGEST = 500
+DEFAULT = "; the default, which `design` writes too: measure it and state it"
+"""Said of a σ that a file has as it was written for it."""
 
 
 def _written(value: object) -> object:
@@ -169,7 +172,9 @@ def sources_of(
     if board.rows:
         sigma_um = 1e3 * board.sigma_mm * contributions.joint.sigma_scale
         covariance = contributions.covariance_mm2[BOARD]
-        rows.append(Source("board_dots", "places of dots", "B", "stated", by_dots, sigma_um, "µm", covariance))
+        origin: Origin = "assumed" if board.sigma_mm == DOTS_SIGMA_MM else "stated"
+        by_dots += DEFAULT * (origin == "assumed")
+        rows.append(Source("board_dots", "places of dots", "B", origin, by_dots, sigma_um, "µm", covariance))
     rows += _own_size(contributions, board)
     if not corners or contributions.covariance_mm2[FLATNESS].any():
         rows.append(_flatness(contributions, flatness_mm))
@@ -191,10 +196,13 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
     factor = contributions.joint.sigma_scale
     if faces := faces_of_known_shape(board):
         print_factor = contributions.joint.print_factor
-        within = max(face.sigma_mm or 0.0 for face in faces) * print_factor * factor
+        within_stated = max(face.sigma_mm or 0.0 for face in faces)
+        within = within_stated * print_factor * factor
         words = f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness"
+        origin: Origin = "assumed" if within_stated == TAG_SIGMA_MM else "stated"
+        words += DEFAULT * (origin == "assumed")
         yield Source(
-            "print", "print of faces", "B", "stated", words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
+            "print", "print of faces", "B", origin, words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
         )
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
