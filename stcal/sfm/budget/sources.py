@@ -33,7 +33,7 @@ FIELDS = ("number", "laboratory", "instrument", "operator", "date", "traceabilit
 """Fields in the head of every budget, after those that are given, and empty if they are not."""
 LONGEST = 500
 DEFAULT = "; the default, which `design` writes too: measure it and state it"
-"""Said of a σ that a file has as it was written for it."""
+"""Words for a σ that nobody has changed."""
 
 
 def _written(value: object) -> object:
