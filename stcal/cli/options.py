@@ -202,7 +202,7 @@ MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8
 
 
 FirstTable = Annotated[
-    Path | None, "Read rows from this file (CSV), in place of PAIRS, and join those of --b.", Opt("--a")
+    Path | None, "Read rows from this file (CSV), in place of the argument, and join those of --b.", Opt("--a")
 ]
 SecondTable = Annotated[Path | None, "Read the values that belong to the rows of --a from this file (CSV).", Opt("--b")]
 Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]

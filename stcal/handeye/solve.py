@@ -431,6 +431,11 @@ def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, 
     estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
     if not _contradicted((rad, mm), estimated, solution.sigma, free.sigma, len(loop)):
         return solution, ()
+    if isinstance(solution, PoseSolution) and isinstance(free, PoseSolution):
+        # σ of a robot that is far better than the camera hardly show: what is estimated then is no evidence by itself.
+        used = ~free.outliers
+        if solution.misfit(used) - free.misfit(used) < chi2.ppf(1 - BY_CHANCE, len(ROBOT)):
+            return solution, ()
     return free, (
         f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
         f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses",

@@ -144,17 +144,20 @@ class _CornerFile(Strict):
 
 Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
 LEAST_PPM = 1e-3
-"""Smallest expansion in ppm/K that anyone can state: less is one in 1/K, which is 3e-4 at most."""
+"""Smallest expansion in ppm/K, or σ of a pitch in ppm, that anyone can state: less is one in 1/K, or a fraction."""
 
 
-def _in_ppm(value: float) -> float:
+def _in_ppm(value: float, per: str = "/K", fraction: str = " 1/K") -> float:
     if 0 < abs(value) < LEAST_PPM:
-        raise ValueError(f"in ppm/K, so that {value:g} 1/K is {1e6 * value:g}; 0 or at least {LEAST_PPM:g} needed")
+        raise ValueError(
+            f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}; 0 or at least {LEAST_PPM:g} needed"
+        )
     return value
 
 
 Expansion = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True), AfterValidator(_in_ppm)]
 ExpansionSigma = Annotated[Ppm, AfterValidator(_in_ppm)]
+PitchSigma = Annotated[Ppm, AfterValidator(lambda value: _in_ppm(value, "", " as a fraction"))]
 Celsius = Annotated[float, Field(ge=-100, le=200, allow_inf_nan=False, strict=True)]
 Kelvin = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)]
 
@@ -205,7 +208,7 @@ def rings_of(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: 
 class BoardSizeEntry(SizeEntry):
     """All keys of :class:`StatedSize`."""
 
-    pitch_sigma_ppm: Ppm | None = None
+    pitch_sigma_ppm: PitchSigma | None = None
 
 
 class BoardEntry(BoardSizeEntry):

@@ -56,6 +56,11 @@ class PoseSolution:
     scale_hint: tuple[float, float]
     settled: bool
 
+    def misfit(self, used: np.ndarray) -> float:
+        """Returns minus twice the log-likelihood of the residuals of the poses ``used``, up to a constant."""
+        covariance = self.covariance[used]
+        return float(_squared(self.residuals[used], covariance).sum() + np.linalg.slogdet(covariance)[1].sum())
+
     def without(self, loop: Loop, out: np.ndarray) -> LoopState:
         """Returns the solution of the same ``loop`` without the poses ``out``, with the σ of the solution of all."""
         used = ~self.outliers & ~np.isin(np.arange(len(loop)), out)

@@ -259,7 +259,7 @@ def title_of(file: BudgetFile) -> str:
     if not certifies(file):
         return f"Uncertainty budget: {file.run.target}"
     number_of_it = file.fields["number"].strip()  # it stands on every page, which has the title at its foot
-    return f"Certificate of calibration and uncertainty budget: {file.run.target}, no. {number_of_it}"
+    return f"Certificate of calibration no. {number_of_it}, with uncertainty budget: {file.run.target}"
 
 
 def _what_u_is(file: BudgetFile) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from datetime import date, datetime, time
+from datetime import date, datetime, time, timedelta
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -96,7 +96,18 @@ def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, 
             )
     named = file.fields | dict(given or {})
     named |= {name: "" for name in FIELDS if name not in named}
+    _require_past(named["date"], "--field" if path is None or "date" in (given or {}) else str(path))
     return Statement(sizes["board"], sizes["target"], origin, named, file.one_thermometer)
+
+
+def _require_past(text: str, where: str) -> None:
+    """Checks that the date of a calibration, if it is written as ISO 8601 has it, is not in the future."""
+    try:
+        day = datetime.fromisoformat(text.strip()).date()
+    except ValueError:
+        return
+    if day > date.today() + timedelta(days=1):  # in some time zone it is tomorrow
+        raise InputError("E-OPTION-VALUE", f"{where}: date {text}: in the future; give the date of the calibration")
 
 
 def fields_of(given: Sequence[str]) -> dict[str, str]:

@@ -119,8 +119,8 @@ def radius_checks(radii: Radii) -> list[Check]:
         "correct target.toml"
     )
     class_remedy = (
-        "all circles of a kind are larger or smaller than target.toml or board.toml says, or over-exposed: measure "
-        "one, correct the file; a wrong radius makes a wrong eccentricity"
+        "all circles of a kind are larger or smaller than target.toml or board.toml says, or over-exposed: check that "
+        "both files are of this body, measure a circle, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
         judge("radius", "Radius of each circle against others of its design radius", single, "circles", single_remedy),

@@ -464,8 +464,8 @@ def _contradiction(views: Readings) -> str:
         return _open(views)
     name = f"a board of {len(view.rows)} dots" if view.plane == BOARD else f"a pattern like face {view.plane}"
     return (
-        f"{name}: not where the group's other images see it; left out, it is a reflection or another object, or check "
-        "that nothing was moved"
+        f"{name}: not where the group's other images see it; left out, it is a reflection or another object, or the "
+        "photograph is of another group or of a body that was moved"
     )
 
 

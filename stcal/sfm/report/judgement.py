@@ -541,7 +541,8 @@ def _more(report: dict, verdict: Use) -> list[str]:
         unseen = [face for face in missing if face not in read]
         if unseen:
             seen = "in no image that was used" if report["left_out"]["images"] else "not seen in any image"
-            advice.append(f"Photograph {_faces(unseen)} together with one of the others: {seen}.")
+            body = "" if verdict == "yes" else "; if they are in the images, check that target.toml is of this body"
+            advice.append(f"Photograph {_faces(unseen)} together with one of the others: {seen}{body}.")
         if read:
             was, it = ("was", "it") if len(read) == 1 else ("were", "them")
             advice.append(f"Read why {_faces(read)} {was} left out, and photograph {it} again from other places.")

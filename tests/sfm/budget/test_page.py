@@ -90,7 +90,7 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
     care = full.model_copy(update={"use": "With care: 1 of 19 checks is suspicious."})
     assert "not a certificate: the run says that it is to be used with care" in budget_report(care).page()
     page = budget_report(full).page()
-    assert re.search("<h1>Certificate of calibration and uncertainty budget: .*, no. rule 7</h1>", page)
+    assert re.search("<h1>Certificate of calibration no. rule 7, with uncertainty budget: .*</h1>", page)
     assert "not a certificate" not in page
     assert page.index("May the run be used?") < page.index("<h2>")
     assert "origin at circle" in page
