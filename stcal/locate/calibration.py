@@ -513,7 +513,7 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
 
 
 def _by_board_corners(corners: np.ndarray, origin: int, turn: np.ndarray) -> np.ndarray:
-    """Returns the derivative (8n, 8n) of all coordinates in {obj} by those on the board.
+    """Returns the derivative (8n, 8n) of all corners' coordinates in {obj} by their coordinates on the board.
 
     The derivative is of first order. The rotation of {obj} changes by the mean of the small rotations of the origin
     tag's corners about its middle.

@@ -511,7 +511,7 @@ class _Parted:
 
 
 def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
-    """Returns a division of residuals (n, 3) of unit scatter into two groups that is not due to chance, or None.
+    """Divides residuals (n, 3) of unit scatter into two groups. Returns None if the division may be due to chance.
 
     ``axes`` : principal axes before the residuals were scaled, as columns, the longest last.
     """

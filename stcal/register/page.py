@@ -365,7 +365,7 @@ def field_figure(findings: Findings, field: Field):
 
 
 def errors_figure(findings: Findings, reach: Cubes):
-    """Returns a figure of the residuals' lengths against the side of the cube about the middle that a point lies on."""
+    """Returns a figure of each residual against the side of the centred cube on whose surface its point lies."""
     result = findings.registration
     rows = _shown(findings)
     side = 2 * np.abs(findings.xyz_a[rows] - reach.middle).max(1)

@@ -547,7 +547,7 @@ def _along_axes(points: np.ndarray) -> np.ndarray:
 
 
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """Returns the transform on which the outliers agree within the same threshold.
+    """Returns the transform on which the outliers agree within the fit's threshold, enlarged for the uncertainty of σ.
 
     Parameters
     ----------

@@ -203,8 +203,8 @@ class _AxisFitting:
     def start(self, moved: np.ndarray) -> None:
         """Sets the axis from all points; if some points stand out, from the subset with the least median residual.
 
-        A subset leaves out one point (of many points a few), or the points of one of the joint's values ``moved`` (k,).
-        The weights say which points were used.
+        A subset leaves out one point (of many points a few), or all points taken at one value of the joint; ``moved``
+        (k,) has each point's value. The weights say which points were used.
         """
         count = len(self.rows)
         value = np.unique(moved, return_inverse=True)[1]

@@ -242,7 +242,7 @@ def _over_ranges(robot: Robot, count: int) -> np.ndarray:
 
 
 def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
-    """Returns the prediction with the effects found in the residuals added to the σ over the ranges, and notes on it.
+    """Returns the prediction, its σ over the ranges enlarged by the effects found in the residuals, and notes on it.
 
     These effects show how much the model is wrong. The covariance takes the model as true and does not include them,
     so that values identified from other rows differ by more than it says.

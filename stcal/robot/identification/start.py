@@ -394,8 +394,8 @@ def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
 
 
 def _pairs_of_mistakes(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields two mistakes of different kinds among convention, zero, sign and coupling; zeros of two joints that are
-    off, and signs of several joints."""
+    """Yields the data with two mistakes undone: of different kinds among convention, zero, sign and coupling, or wrong
+    zeros of two joints, or reversed signs of several."""
     n, inner = len(robot.rows), _inner(robot)
     if n > MOST_JOINTS:
         return

@@ -391,7 +391,7 @@ def _base_mm(robot: Robot) -> float:
 
 
 def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str, ...]:
-    """Returns a note if many poses are out of reach, and all of them would be within in another convention."""
+    """Returns a note if many poses are out of reach, and a sample of them is within reach in another convention."""
     lost = np.flatnonzero(~inverse.usable)
     if targets.poses is None or len(lost) < max(LEAST, DOUBTED * len(inverse)):
         return ()

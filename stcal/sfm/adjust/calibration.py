@@ -142,7 +142,7 @@ def calibrate(
     prior: CameraPrior | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Calibrate the target from the groups' models (worlds without unit, corrections settled).
+    """Calibrate the target from the groups' models (lengths not yet in mm, eccentricity corrections settled).
 
     ``prior`` : intrinsics of the camera as observations, for options that refine them; ``progress`` : called with
     (``faces``, done, total) after the chain, each joint adjustment, and the covariances.

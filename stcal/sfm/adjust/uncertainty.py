@@ -408,7 +408,7 @@ class _Answer:
                 yield kind, rows, lens
 
     def board(self, block: Block, shared: Shared) -> np.ndarray:
-        """Returns the whitened rows (3d, k) of the positions of the dots."""
+        """Returns the board's share of the equations: rows (3d, k) of the positions of d dots, divided by their σ."""
         if not len(block.dots):
             return np.zeros((0, self.points.shape[2]))
         rotation = block.model_from_board.rotation

@@ -239,10 +239,10 @@ def pose_from_circles(
 ) -> TargetPose:
     """Returns the pose of a calibrated target from the ellipse centres of its circles in one image.
 
-    The first step minimises the residuals of the single centres with Huber's loss, from the homography of the face with
-    the most circles and from its mirror image at the line of sight. The second weighs them by their whole covariance
-    (generalised least squares), which is the sum of image noise and the uncertainties of target and intrinsics. So the
-    covariance of the pose contains all three.
+    The first step minimises the residuals of the single centres with Huber's loss. It starts from two poses: that of
+    the homography of the face with the most circles, and its reflection about the line of sight. The second weighs them
+    by their whole covariance (generalised least squares), which is the sum of image noise and the uncertainties of
+    target and intrinsics. So the covariance of the pose contains all three.
 
     Parameters
     ----------
