@@ -14,14 +14,14 @@ PIXEL_VARIANCE = 1 / 12
 """Variance of a square pixel about its centre, px²."""
 PRIOR_PX = 0.005
 """σ of the displacement of edges by the pixels' sampling before an image is seen, px."""
+POINTS_PX = 0.01
+"""The same of images that were resampled in points, as far as nothing shows that they were not, px."""
 LEAST_PX = 0.0005
 """Least σ of a displacement that is told apart from another, px."""
 ROUNDS = 5
 """Number of times that estimates are weighted by the variances found before."""
 BY_CHANCE = 3.0
 """Number of σ up to which scatter of lines is taken for chance."""
-POINTS_PX = 0.01
-"""The same of images that were resampled in points, as far as nothing shows that they were not, px."""
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -166,6 +166,7 @@ def displacement_variance(by_phase: Sequence[Displacement], otherwise: Sequence[
 
 
 def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
+    """Return square, noise, lines and passed of the estimates that are known."""
     names = ("square", "noise", "lines", "passed")
     square, noise, lines, passed = (
         np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0)]) for name in names
@@ -380,12 +381,12 @@ def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> tuple[Displaceme
     made = made * there[:, None, :] * there[:, :, None]
     left = np.einsum("gij,gj->gi", made, root * offset)
     freedom = np.einsum("gii->g", made)
-    # An edge that sampling displaces in one direction is displaced as far in the other, seen from there: a sine. What
-    # follows a sine that is even in all lines could also be their spacing, and says nothing.
+    # Seen from its other side, an edge has the opposite phase and the opposite displacement: a sine of the phase.
+    # If all lines have about one phase, they move together, as another spacing would move them: ``known`` is small.
     wave = np.sqrt(2) * np.einsum("gij,gj->gi", made, root * pull[..., 1])
     known = np.maximum((wave**2).sum(1), 1e-12)
     amplitude = (wave * left).sum(1) / known
-    by_phase = np.where(freedom > 0.5, amplitude**2 - 1 / known, np.nan)
+    by_phase = amplitude**2 - 1 / known
     same = np.equal.outer(np.arange(k) // 2, np.arange(k) // 2)
     shared = (pull @ np.swapaxes(pull, 1, 2)) * same * root[:, :, None] * root[:, None]
     by_displacement = np.einsum("gij,gjk,gik->g", made, shared, made)

@@ -1,7 +1,12 @@
 """Detection of the inner corners of chessboards, and of ChArUco boards.
 
-Corners of a chessboard are found by both detectors of OpenCV, in images of several sizes. A ChArUco board is read by
-its tags (through ``cv2.aruco``); its corners are measured where edges meet.
+Corners of a chessboard are found by both detectors of OpenCV. ``cv2.findChessboardCornersSB`` (after Duda & Frese 2018)
+tolerates noise, shade and small squares; the older detector, which joins dark squares, tolerates steep views and blur.
+Images are searched at the smallest size that shows the squares, which is fastest, and then at others: a board that
+neither detector finds in one size may be found in another. Corners are measured in the original image.
+
+A ChArUco board is read by its tags (through ``cv2.aruco``); its corners are measured where edges meet. No camera is
+needed. OpenCV would place corners by the camera that it is given, and several px off if that is a guess.
 """
 
 from collections.abc import Callable, Iterator

@@ -31,28 +31,6 @@ SetupName = Literal["eye-in-hand", "eye-to-hand"]
 """Name of the setup, by the carrier of the camera."""
 
 
-SourceFile = Annotated[
-    Path | None,
-    "Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), or "
-    "samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
-    Arg("POSES|IMAGES"),
-]
-PosesFile = Annotated[
-    Path | None,
-    "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS …; or "
-    "from this folder, with a file for each image.",
-]
-OwnCamera = Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."]
-OwnBoard = Annotated[
-    Path | None,
-    "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
-    "circles, tags, or several boards.",
-]
-SetupOption = Annotated[
-    SetupName | None,
-    "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file decides; "
-    "if it does not say, eye-in-hand.",
-]
 RotationOption = Annotated[
     list[str] | None,
     "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
@@ -78,11 +56,28 @@ TimeTolerance = Annotated[
 class PoseFiles:
     """Options of the files with the poses, or photographs, and of what these do not state."""
 
-    source: SourceFile = None
-    poses: PosesFile = None
-    camera: OwnCamera = None
-    board: OwnBoard = None
-    setup: SetupOption = None
+    source: Annotated[
+        Path | None,
+        "Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), or "
+        "samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
+        Arg("POSES|IMAGES"),
+    ] = None
+    poses: Annotated[
+        Path | None,
+        "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS …; or "
+        "from this folder, with a file for each image.",
+    ] = None
+    camera: Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."] = None
+    board: Annotated[
+        Path | None,
+        "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
+        "circles, tags, or several boards.",
+    ] = None
+    setup: Annotated[
+        SetupName | None,
+        "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file "
+        "decides; if it does not say, eye-in-hand.",
+    ] = None
     rotation: RotationOption = None
     length_unit: LengthUnit = None
     poses_are: PosesAre = None
@@ -312,14 +307,7 @@ def handeye(
 ) -> None:
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.handeye import HandEyeOptions, Noise
-    from stcal.handeye.report.export import (
-        FORMS,
-        exported,
-        opencv_yaml,
-        require_export_written,
-        ros_yaml,
-        urdf_joint,
-    )
+    from stcal.handeye.report.export import FORMS, exported, opencv_yaml, require_export_written, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_report
@@ -362,12 +350,7 @@ def handeye(
             say(line)
         with_scale = with_scale or inputs.unit_mm is not None
         options = HandEyeOptions(
-            noise,
-            inputs.prior if refine_camera else None,
-            with_scale,
-            inputs.symmetries,
-            four_dof,
-            evolved,
+            noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolved
         )
         if undo_flips:
             inputs, undone = without_flips(inputs, options)

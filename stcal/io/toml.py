@@ -1,6 +1,7 @@
 """TOML files, validated by a pydantic model, and YAML as other programs write it.
 
-Messages name file and place of a mistake, and lengths that are not mm.
+Messages name file and place of a mistake, and lengths that are not mm. In YAML, aliases are refused: with them, ten
+lines can expand to more than any memory holds. A repeated key is refused too, since the last one would silently count.
 """
 
 import json

@@ -362,3 +362,12 @@ def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
     faces = json.loads((copy / "faces.json").read_text())
     (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
     assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")
+
+
+def test_a_sigma_as_files_are_written_with_counts_as_assumed(small_run, stcal_sfm, tmp_path):
+    """The board of the run has the default of 0.005 mm; nobody has measured it."""
+    out = tmp_path / "b.json"
+    stcal_sfm("budget", small_run, "--json", out)
+    rows = {row["key"]: row for row in json.loads(out.read_text())["sources"]}
+    assert rows["board_dots"]["origin"] == "assumed"
+    assert "the default" in rows["board_dots"]["words"]
