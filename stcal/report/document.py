@@ -159,7 +159,7 @@ TONES = {
     "passed": ("passed", "good", "accept", "yes"),
     "care": ("suspicious", "use with care", "ambiguous", "with care"),
     "failed": ("failed", "do not use", "reject", "no"),
-    "open": ("not possible",),
+    "open": ("not possible", "not applicable"),
 }
 """Words of verdicts that look alike on a page."""
 

@@ -76,6 +76,12 @@ class TruthFile(ResultFile):
     )
     optics: TrueOptics | None = Field(default=None, description="of simulated sets with a thin lens or rims")
 
+    def poses(self) -> dict[str, Pose]:
+        """Returns camera_from_target of the images, by name below ``images``."""
+        of_groups = (group.images for group in (self.groups or {}).values())
+        stated = {name: image.camera_from_target for images in of_groups for name, image in images.items()}
+        return {name: pose for name, pose in stated.items() if pose is not None} | (self.camera_from_target or {})
+
     @classmethod
     def of(cls, scene: Scene, image_format: str = "jpg", options: RenderOptions | None = None) -> "TruthFile":
         """Returns the truth of a scene, with images named by :func:`image_name`."""

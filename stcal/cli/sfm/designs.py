@@ -279,14 +279,20 @@ def _scene(
 
 @app.command()
 def compare(
-    run: Annotated[Path, "Read this finished run, or its faces.json.", Arg("RUN")],
+    run: Annotated[Path, "Read this finished run, its faces.json, or poses.csv of measure.", Arg("RUN")],
     truth: Annotated[Path, "Read the truth from this truth.json.", Arg()],
     out: JsonFile = None,
 ) -> None:
-    """Compare a run with the known truth, as a table and as JSON."""
+    """Compare a run, or measured poses, with the known truth, as a table and as JSON."""
     from stcal.sfm.report.compare import compare as against
-    from stcal.sfm.report.compare import comparison_table
+    from stcal.sfm.report.compare import compare_poses, comparison_table, poses_table
     from stcal.sfm.runs.transaction import COMPARISON, added_results
+
+    if run.suffix.lower() == ".csv":
+        of_poses = compare_poses(run, truth)
+        say(poses_table(of_poses))
+        write_if(out, lambda: of_poses, "as JSON")
+        return
 
     into_run = run / COMPARISON
     if (run / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run)):

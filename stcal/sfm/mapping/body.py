@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from stcal.design import FaceDesign
@@ -30,6 +32,12 @@ MOST_VOTES = 250
 """Most images that vote on how two faces lie; time and memory grow with their square."""
 LEAST_SIGMA_PX = 0.05
 """σ that print, lens and detector leave to any corner."""
+LEAST_PAIRS, ROBUST_SIZES = 2, 10
+"""Smallest number of images of two faces that tell the ratio of their sizes, and number of robust rounds."""
+MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
+"""Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
+LEAST_SIGMA_OFF = 0.02
+"""σ of such a logarithm that the reflections of views and a rough camera leave to any."""
 BETTER = 0.2
 """Share by which another pose of a face must fit its corners better."""
 BY_CHANCE = 0.01
@@ -134,7 +142,7 @@ def place_body(corners: Corners, camera: Camera) -> Body:
     Raises MappingError: no two faces are ever seen together.
     """
     views = _Views.of(corners, camera)
-    edges = _edges(views, len(corners.faces))
+    edges = [_edge(a, b, pairs, views) for (a, b), pairs in _pairs(views).items()]
     if not edges:
         raise MappingError(
             "E-BODY-UNLINKED",
@@ -212,7 +220,8 @@ class _Edge:
     images: int
 
 
-def _edges(views: _Views, faces: int) -> list[_Edge]:
+def _pairs(views: _Views) -> dict[tuple[int, int], list[tuple[int, int]]]:
+    """Returns the two views of each image that shows two faces, by these faces, in order."""
     by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for image in np.unique(views.image):
         own = np.flatnonzero(views.image == image).tolist()
@@ -220,34 +229,128 @@ def _edges(views: _Views, faces: int) -> list[_Edge]:
             for w in own[x + 1 :]:
                 pair = (v, w) if views.face[v] < views.face[w] else (w, v)
                 by_pair.setdefault((int(views.face[pair[0]]), int(views.face[pair[1]])), []).append(pair)
-    return [_edge(a, b, pairs, views) for (a, b), pairs in sorted(by_pair.items())]
+    return dict(sorted(by_pair.items()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Relative:
+    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views: ``rotation`` : (4p, 3, 3);
+    ``a_place``, ``b_place`` : (4p, 3) of the origins of both faces, from the camera, in the axes of a; ``of_pair`` :
+    (4p,); ``excess`` : (4p,) cost over that of the best pose of the image."""
+
+    rotation: np.ndarray
+    a_place: np.ndarray
+    b_place: np.ndarray
+    of_pair: np.ndarray
+    excess: np.ndarray
+
+    @classmethod
+    def of(cls, pairs: list[tuple[int, int]], views: _Views) -> "_Relative":
+        """Returns the poses of the pairs of views, of which at most ``MOST_VOTES`` are used, evenly drawn."""
+        pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
+        both = np.array([(2 * v + i, 2 * w + j) for v, w in pairs for i in range(2) for j in range(2)])
+        a, b = both.T
+        back = np.swapaxes(views.poses.rotation[a], 1, 2)
+        cost = (views.cost.ravel()[a] + views.cost.ravel()[b]).reshape(-1, 4)
+        return cls(
+            back @ views.poses.rotation[b],
+            (back @ views.poses.translation[a, :, None])[..., 0],
+            (back @ views.poses.translation[b, :, None])[..., 0],
+            np.repeat(np.arange(len(pairs)), 4),
+            (cost - cost.min(1, keepdims=True)).ravel(),
+        )
+
+    def turned_alike(self) -> np.ndarray:
+        """Returns whether two poses have the same rotation, (4p, 4p)."""
+        turned = np.arccos(np.clip((np.einsum("xij,yij->xy", self.rotation, self.rotation) - 1) / 2, -1, 1))
+        return turned < SAME_TURN_RAD
+
+    def best(self, agrees: np.ndarray) -> tuple[int, int]:
+        """Returns the pose with which most images agree, and their number; ``agrees`` : (4p, 4p)."""
+        votes = np.zeros(len(self.rotation))
+        for p in range(len(self.rotation) // 4):
+            votes += agrees[:, self.of_pair == p].any(1)
+        # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
+        best = int(np.lexsort((self.excess, -votes))[0])
+        return best, int(votes[best])
 
 
 def _edge(a: int, b: int, pairs: list[tuple[int, int]], views: _Views) -> _Edge:
-    pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
-    rotation, translation, cost, of_pair = [], [], [], []
-    for p, (v, w) in enumerate(pairs):
-        for i in range(2):
-            for j in range(2):
-                turn = views.poses.rotation[2 * v + i].T
-                rotation.append(turn @ views.poses.rotation[2 * w + j])
-                translation.append(turn @ (views.poses.translation[2 * w + j] - views.poses.translation[2 * v + i]))
-                cost.append(views.cost[v, i] + views.cost[w, j])
-                of_pair.append(p)
-    rotation, translation, of_pair = np.array(rotation), np.array(translation), np.array(of_pair)
-    cost = np.array(cost).reshape(-1, 4)
-    turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
+    poses = _Relative.of(pairs, views)
+    translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
-    agrees = (turned < SAME_TURN_RAD) & (apart < SAME_PLACE)
-    votes = np.zeros(len(rotation))
-    for p in range(len(pairs)):
-        votes += agrees[:, of_pair == p].any(1)
-    # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
-    excess = (cost - cost.min(1, keepdims=True)).ravel()
-    best = int(np.lexsort((excess, -votes))[0])
+    agrees = poses.turned_alike() & (apart < SAME_PLACE)
+    best, votes = poses.best(agrees)
     near = np.flatnonzero(agrees[best])
-    mean = Rotation.from_matrix(rotation[near]).mean().as_matrix()
-    return _Edge(a, b, Rigid(mean, np.median(translation[near], axis=0)), int(votes[best]))
+    mean = Rotation.from_matrix(poses.rotation[near]).mean().as_matrix()
+    return _Edge(a, b, Rigid(mean, np.median(translation[near], axis=0)), votes)
+
+
+@dataclass(frozen=True, slots=True)
+class WrongSizes:
+    """Faces that are drawn at another size than the rest: ``factors`` by index of the face, true over stated size;
+    ``alike`` : number of the others whose sizes were compared."""
+
+    factors: dict[int, float]
+    alike: int
+
+
+def wrong_sizes(corners: Corners, camera: Camera) -> WrongSizes:
+    """Returns the faces whose stated size contradicts those of most others, from the views alone.
+
+    A face drawn too large by a factor seems farther away by it. Face b is at the same place d in the frame of a in all
+    images: q R_aᵀ t_b − R_aᵀ t_a = d with the sizes' ratio q, linear in q and d.
+    """
+    views = _Views.of(corners, camera)
+    ratios: list[tuple[int, int, float, float]] = []
+    for (a, b), pairs in _pairs(views).items():
+        if len(pairs) < LEAST_PAIRS:
+            continue
+        poses = _Relative.of(pairs, views)
+        agrees = poses.turned_alike()
+        near = np.flatnonzero(agrees[poses.best(agrees)[0]])
+        near = near[np.unique(poses.of_pair[near], return_index=True)[1]]
+        if len(near) < LEAST_PAIRS:
+            continue
+        a_place, b_place, weight = poses.a_place[near], poses.b_place[near], np.ones(len(near))
+        for _ in range(ROBUST_SIZES):
+            total = weight.sum()
+            u, v = (place - weight @ place / total for place in (b_place, a_place))
+            square = float(weight @ (u**2).sum(1))
+            ratio = float(weight @ (u * v).sum(1)) / square
+            length = np.linalg.norm(ratio * u - v, axis=1)
+            weight = huber_weights(length, HUBER * max(robust_sigma(length, 3), 1e-12))
+        freedom = max(3 * total - 4, 1.0)
+        variance = float(weight @ length**2) / freedom
+        if ratio > 0:
+            ratios.append((a, b, np.log(ratio), np.sqrt(variance / square) / ratio))
+    off = _off(ratios, len(corners.faces)) if ratios else {}
+    return WrongSizes(off, len({face for a, b, *_ in ratios for face in (a, b)}) - len(off))
+
+
+def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, float]:
+    """Returns the faces of another size than the median of those linked to them, with their factors, from logarithms b
+    over a with their σ."""
+    a, b = (np.array([ratio[k] for ratio in ratios], int) for k in range(2))
+    value, sigma = (np.array([ratio[k] for ratio in ratios], float) for k in (2, 3))
+    rows = np.eye(faces)[b] - np.eye(faces)[a]
+    sigma = np.hypot(sigma, LEAST_SIGMA_OFF)
+    weight, logs, spread = sigma**-2, np.zeros(faces), 1.0
+    for _ in range(ROBUST_SIZES):
+        away = np.linalg.pinv((rows.T * weight) @ rows)
+        logs = away @ ((rows.T * weight) @ value)
+        length = np.abs(rows @ logs - value) / sigma
+        spread = max(robust_sigma(length, 1), 1.0)
+        weight = huber_weights(length, HUBER * spread) / sigma**2
+    off: dict[int, float] = {}
+    linked = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(faces, faces)), directed=False)[1]
+    for component in np.unique(linked[np.concatenate([a, b])]):
+        own = np.flatnonzero(linked == component)
+        away_of = logs[own] - np.median(logs[own])
+        sure = SURE_SIGMAS * spread * np.sqrt(np.diag(away)[own])
+        far = np.flatnonzero(np.abs(away_of) > np.maximum(MOST_OFF, sure))
+        off |= {int(own[k]): float(np.exp(away_of[k])) for k in far}
+    return off
 
 
 def _tree(views: _Views, edges: list[_Edge], faces: int) -> tuple[PoseStack, np.ndarray]:

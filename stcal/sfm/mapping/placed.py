@@ -21,6 +21,7 @@ from stcal.sfm.mapping.body import (
     contradictions,
     place_body,
     settled_body,
+    wrong_sizes,
 )
 from stcal.sfm.mapping.incremental import MAX_REPROJECTION_PX, MIN_RAY_ANGLE_RAD, assemble, complete
 from stcal.sfm.mapping.pairs import PairScore
@@ -79,9 +80,10 @@ def place_with_camera(
 
     Faces of circles may be among them: their design is near enough to begin with, and moves afterwards.
 
-    Raises MappingError: no two faces are ever seen together.
+    Raises MappingError: no two faces are ever seen together, or sizes of faces contradict one another.
     """
     corners = Corners.of(observations, faces)
+    _require_sizes(corners, camera)
     none = np.zeros((16, 0))
     body = settled_body(place_body(corners, camera), corners, none, np.zeros((0, 0)), camera)
     return _named(body, corners, camera)
@@ -94,11 +96,13 @@ def place_and_find_camera(
 
     The search begins at each of ``starts``, and at several focal lengths about the first; the least cost decides.
 
-    Raises MappingError: no two faces are ever seen together, or no focal length explains the images.
+    Raises MappingError: no two faces are ever seen together, sizes of faces contradict one another, or no focal length
+    explains the images.
     """
     corners = Corners.of(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
+    _require_sizes(corners, first)
     best: Body | None = None
     for camera in cameras:
         found = _with_focal_length(corners, camera)
@@ -116,6 +120,28 @@ def place_and_find_camera(
     with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
         best = settled_body(best, corners, basis, prior, lens)
     return _named(best, corners, unknown_lens(best.camera))
+
+
+def _require_sizes(corners: Corners, camera: Camera) -> None:
+    """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
+    wrong = wrong_sizes(corners, camera)
+    if not wrong.factors:
+        return
+    names = [corners.faces[face].id for face in wrong.factors]
+    if wrong.alike < len(names):
+        factors = list(wrong.factors.values())
+        told = f"face {names[-1]} is {factors[-1] / factors[0]:.3g} times as large against face {names[0]}"
+        raise MappingError(
+            "E-BODY-SIZES",
+            f"target: sizes of faces {' and '.join(names)} contradict one another: by the photographs, {told} as "
+            "target.toml states; measure the side of each print, and correct it",
+        )
+    told = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, wrong.factors.values(), strict=True))
+    raise MappingError(
+        "E-BODY-SIZES",
+        f"target: the photographs show {told} times as large as target.toml states, and the sizes of {wrong.alike} "
+        "other faces agree with one another; measure the side of its print, and correct it",
+    )
 
 
 def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:

@@ -14,8 +14,8 @@ from stcal.errors import DegenerateError, InputError, InputNote
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.files import TABLE_BYTES, read_bytes, require_unchanged
-from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
-from stcal.io.table import FARTHEST, LENGTHS
+from stcal.io.json import ByFace, ByImage, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
+from stcal.io.table import FARTHEST, LENGTHS, read_table
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
 from stcal.report.text import NONE, number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
@@ -29,6 +29,8 @@ right. Eccentricity makes 0.2."""
 OF_A_UNIT = 0.1
 """Largest relative deviation of a ratio of distances from the factor of another unit. Runs are off by a few per cent at
 worst."""
+MOST_LISTED = 20
+"""Largest number of images that the table of poses has a row for."""
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
 
 
@@ -66,6 +68,23 @@ class LabelCounts(Part):
     visible: int
     images: int
     images_of_truth: int
+
+
+class PoseErrors(Part):
+    translation_um: float
+    rotation_mdeg: float
+    normalised_error: float | None = None
+
+
+class ComparePosesFile(ResultFile):
+    """Result of ``compare`` of measured poses."""
+
+    images: dict[ByImage, PoseErrors] = Field(
+        description="`translation_um`, `rotation_mdeg` of camera_from_target against the truth, camera frame; with "
+        "covariances also `normalised_error` √(eᵀC⁻¹e/6), about 1 when σ is true, in all poses alike where their errors "
+        "are common"
+    )
+    not_in_truth: list[str] = Field(description="measured images whose pose the truth does not state")
 
 
 class CompareFile(ResultFile):
@@ -146,6 +165,71 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
     )
 
 
+@require_arguments
+def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
+    """Returns the errors of measured poses against the truth of a simulated data set.
+
+    Parameters
+    ----------
+    poses : str or Path
+        ``poses.csv`` of ``measure``.
+    truth : str or Path
+        ``truth.json`` of the data set. Images are found in it by their name below ``images``, or by the name of the
+        file where only one image has it.
+
+    Returns
+    -------
+    ComparePosesFile
+        Errors of each pose, µm and millidegrees, also over its σ.
+
+    Raises
+    ------
+    InputError
+        A file is missing or has another form, the truth states no pose of any image, or the lengths are in another
+        unit.
+    """
+    known = read_result(truth, TruthFile, "truth", REMEDY)
+    true = {name: Rigid.from_matrix(pose) for name, pose in known.poses().items()}
+    by_file: dict[str, list[str]] = {}
+    for name in true:
+        by_file.setdefault(Path(name).name, []).append(name)
+    table = read_table(poses, "pose file")
+    measured, covariance = table.poses(), table.pose_covariances()
+    images: dict[str, PoseErrors] = {}
+    unknown: list[str] = []
+    distances: list[tuple[float, float]] = []
+    for i, name in enumerate(table.text("image")):
+        same = [name] if name in true else by_file.get(Path(name).name, [])
+        if len(same) != 1:
+            unknown.append(name)
+            continue
+        pose = true[same[0]]
+        images[name] = _pose_errors(measured[i], pose, None if covariance is None else covariance[i])
+        distances.append(tuple(float(np.linalg.norm(p.translation)) for p in (pose, measured[i])))
+    if not images:
+        raise InputError(
+            "E-COMPARE-IMAGES",
+            f"{poses}, truth {truth}: no image in common that the truth states one pose of; give the truth of the same "
+            f"photographs{f', with names like {next(iter(true))}' if true else ''}",
+        )
+    _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", *np.median(distances, axis=0), "poses")
+    return ComparePosesFile(images=images, not_in_truth=unknown)
+
+
+def _pose_errors(found: Rigid, true: Rigid, covariance: np.ndarray | None) -> PoseErrors:
+    """Returns the errors of a pose, also over its (6, 6) covariance, rad and mm, if it is positive definite."""
+    shift, turn = found.translation - true.translation, Rigid(found.rotation @ true.rotation.T)
+    normalised = None
+    if covariance is not None and np.linalg.eigvalsh(covariance)[0] > 0:
+        error = np.concatenate([turn.log()[:3], shift])
+        normalised = float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6))
+    return PoseErrors(
+        translation_um=1e3 * float(np.linalg.norm(shift)),
+        rotation_mdeg=1e3 * float(np.degrees(turn.angle_rad())),
+        normalised_error=normalised,
+    )
+
+
 def _require_near(where: str, circles: Mapping[str, Vector3]) -> None:
     """Refuses places so far away that their squares would overflow."""
     for label, place in circles.items():
@@ -166,14 +250,19 @@ def _require_one_unit(where: str, found: Answer, known: TruthFile) -> None:
         ("faces", [np.array([side.target_from_face[face_id][:3, 3] for face_id in faces]) for side in sides]),
     ):
         true, measured = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
-        for unit, factor in LENGTHS.items():
-            for name, small, large in (("truth", true, measured), ("run", measured, true)):
-                if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
-                    raise InputError(
-                        "E-COMPARE-UNITS",
-                        f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
-                        f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
-                    )
+        _require_same_unit(where, kind, true, measured, "run")
+
+
+def _require_same_unit(where: str, kind: str, true: float, measured: float, side: str) -> None:
+    """Refuses lengths whose ratio is the factor of another unit than mm."""
+    for unit, factor in LENGTHS.items():
+        for name, small, large in (("truth", true, measured), (side, measured, true)):
+            if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
+                raise InputError(
+                    "E-COMPARE-UNITS",
+                    f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
+                    f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
+                )
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
@@ -238,11 +327,9 @@ def _face(face_id: str, found: Answer, known: TruthFile) -> FaceErrors:
     estimate, true = (Rigid.from_matrix(source.target_from_face[face_id]) for source in (found, known))
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
     a, b = (np.array([source.circles[label] for label in labels]).reshape(-1, 3) for source in (known, found))
-    shift = estimate.translation - true.translation
-    turn = Rigid(estimate.rotation @ true.rotation.T)
+    c = found.target_from_face_covariance.get(face_id)
     row: dict[str, Any] = {
-        "translation_um": 1e3 * float(np.linalg.norm(shift)),
-        "rotation_mdeg": 1e3 * float(np.degrees(turn.angle_rad())),
+        **_pose_errors(estimate, true, None if face_id == known.reference_face else c).model_dump(exclude_none=True),
         "circles": len(labels),
         "circles_mean_um": None,
         "circles_max_um": None,
@@ -252,17 +339,34 @@ def _face(face_id: str, found: Answer, known: TruthFile) -> FaceErrors:
         row |= {"circles_mean_um": float(error.mean()), "circles_max_um": float(error.max())}
     except DegenerateError:
         pass  # fewer than three circles in common: there is no rigid fit, and the row says how many there were
-    c = found.target_from_face_covariance.get(face_id)
     if c is not None:
         sigma = np.sqrt(np.maximum(np.diag(c), 0))
         row |= {
             "translation_sigma_um": 1e3 * sigma[3:],
             "rotation_sigma_mdeg": 1e3 * np.degrees(sigma[:3]),
         }
-        if np.linalg.eigvalsh(c)[0] > 0 and face_id != known.reference_face:
-            e = np.concatenate([turn.log()[:3], shift])
-            row["normalised_error"] = float(np.sqrt(e @ np.linalg.solve(c, e) / 6))
     return FaceErrors.model_validate(row)
+
+
+def poses_table(comparison: ComparePosesFile) -> str:
+    """Returns the comparison of poses as a text table, the RMS of all first; of many the worst only."""
+    errors = list(comparison.images.values())
+    values = np.array([[e.translation_um, e.rotation_mdeg, e.normalised_error or np.nan] for e in errors])
+    rows = [["<image", "position", "rotation", "error / σ"], ["", "µm", "mdeg", ""]]
+    rms = np.sqrt((values**2).mean(axis=0))
+    worst = np.argsort(-values[:, 0])[:MOST_LISTED]
+    lines = [
+        (f"RMS of {len(errors)} poses", rms),
+        *((list(comparison.images)[i], values[i]) for i in sorted(worst.tolist())),
+    ]
+    for name, (position, rotation, over) in lines:
+        rows.append([name, number(position, 1), number(rotation, 2), NONE if np.isnan(over) else number(over, 2)])
+    text = text_table(rows)
+    if more := len(errors) - len(worst):
+        text.append(f"{more} poses with smaller errors of position: --json writes all")
+    if unknown := comparison.not_in_truth:
+        text.append(f"not in the truth: {', '.join(unknown[:3])}{' …' if len(unknown) > 3 else ''}")
+    return "\n".join(text)
 
 
 def comparison_table(comparison: CompareFile) -> str:

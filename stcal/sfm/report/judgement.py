@@ -216,6 +216,7 @@ def _by_result(report: dict) -> tuple[Use, str]:
     if _control(report):
         return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
     made = len(checks) - counts["not possible"]
+    missing = sum(c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"]) for c in checks)
     n = counts["failed"]
     if cause := [check for check in report.get("checks", []) if check["key"] == CAUSE]:
         name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
@@ -237,13 +238,17 @@ def _by_result(report: dict) -> tuple[Use, str]:
             "with care",
             "With care: groups were solved one by one; there are no σ, and there are fewer checks.",
         )
-    n = counts["not possible"]
     testing = [check["verdict"] for check in checks if check["key"] in TESTED_BY]
     if testing and set(testing) == {"not possible"}:
-        return "with care", f"With care: the photographs are too few to test one another, {n} checks were not possible."
+        return "with care", f"With care: the photographs are too few to test one another, {missing} checks were not possible."
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
-    open_ = f", {n} {'was' if n == 1 else 'were'} not possible" if n else ""
+    open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
     return "yes", f"Yes: {passed}{open_}."
+
+
+def applies(verdict: str, remedy: str) -> bool:
+    """Returns whether a check could be made or made possible: not one of circles or a board where there are none."""
+    return verdict != "not possible" or bool(remedy)
 
 
 def _faces(names: list[str]) -> str:
@@ -546,7 +551,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
         if read:
             was, it = ("was", "it") if len(read) == 1 else ("were", "them")
             advice.append(f"Read why {_faces(read)} {was} left out, and photograph {it} again from other places.")
-    open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and c["remedy"]]
+    open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"])]
     if verdict == "yes" and open_:
         remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")
         same = sum(check["remedy"] == open_[0]["remedy"] for check in open_)

@@ -7,7 +7,7 @@ from stcal.labels import parse_label
 from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import CHANCE, Judgement
+from stcal.sfm.report.judgement import CHANCE, Judgement, applies
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
@@ -279,13 +279,19 @@ def _face_row(check: dict, face: str) -> list[str]:
 
 
 ORDER = ("failed", "suspicious", "passed", "not possible")
+NOT_APPLICABLE = "not applicable"
+"""What is told of checks that what was photographed has nothing for, such as those of circles where it shows tags."""
 FIRST_NAMES = 6
 """Number of names that a row has room for."""
 
 
-def count_verdicts(verdicts: list[str]) -> str:
-    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first."""
-    return ", ".join(f"{verdicts.count(v)} {v}" for v in ORDER if v in verdicts) or "none"
+def count_verdicts(verdicts: list[tuple[str, str]]) -> str:
+    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first.
+
+    ``verdicts`` : verdict and remedy of each check; one of circles or a board where there are none does not apply.
+    """
+    told = [verdict if applies(verdict, remedy) else NOT_APPLICABLE for verdict, remedy in verdicts]
+    return ", ".join(f"{told.count(v)} {v}" for v in (*ORDER, NOT_APPLICABLE) if v in told) or "none"
 
 
 def checks_section(checks: list[dict]) -> list[Block]:
@@ -299,13 +305,13 @@ def checks_section(checks: list[dict]) -> list[Block]:
         for check in ranked
         for m in check["measured"]
     ]
-    counts = count_verdicts([check["verdict"] for check in checks])
+    counts = count_verdicts([(check["verdict"], check["remedy"]) for check in checks])
     columns_measured = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
     return [
         f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds for one check, however "
         f"many images or points it tested",
         Table(heads, open_, css="text"),
-        fold(f"{len(others)} checks that passed or were not possible", Table(heads, others, css="text")),
+        fold(f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")),
         fold("What was measured", Table(columns_measured, measured, css="text")),
     ]
 
@@ -313,7 +319,7 @@ def checks_section(checks: list[dict]) -> list[Block]:
 def _check_row(check: dict) -> list:
     return [
         check["title"],
-        Verdict(check["verdict"]),
+        Verdict(check["verdict"] if applies(check["verdict"], check["remedy"]) else NOT_APPLICABLE),
         *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
         _names(check),
         check["reason"],

@@ -16,8 +16,8 @@ from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import images_left_out
-from stcal.sfm.report.sections import count_verdicts
+from stcal.sfm.report.judgement import applies, images_left_out
+from stcal.sfm.report.sections import NOT_APPLICABLE, count_verdicts
 from stcal.sfm.runs.result import Comparison, RunResult
 from stcal.sfm.runs.solve import GroupSolution
 
@@ -181,7 +181,7 @@ def so_far_text(result: RunResult) -> str:
         worst = max(sigma, key=lambda face: sigma[face])
         faces += f", worst is face {worst}: σ {1e3 * sigma[worst][0]:.1f} µm, {1e3 * sigma[worst][1]:.1f} mdeg"
     mapped = sum(len(solution.model.images) for solution in result.solutions)
-    checks = count_verdicts([check.verdict for check in result.checks])
+    checks = count_verdicts([(check.verdict, check.remedy) for check in result.checks])
     return f"{mapped} images mapped, {faces}; checks: {checks}"
 
 
@@ -273,18 +273,18 @@ def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
 
     Those that nobody can make possible, such as tests of circles where corners alone are seen, are in one line.
     """
-    yield f"checks: {count_verdicts([check.verdict for check in checks])}"
+    yield f"checks: {count_verdicts([(check.verdict, check.remedy) for check in checks])}"
     if any(check.verdict in ("failed", "suspicious") for check in checks):
         yield f"  ({BY_CHANCE})"
-    no_matter = [check for check in checks if check.verdict == "not possible" and not check.remedy]
+    no_matter = [check for check in checks if not applies(check.verdict, check.remedy)]
     for check in ranked(checks, images):
         if check.verdict != "passed" and check not in no_matter:
             remedy = f"; {check.remedy}" if check.remedy else ""
             yield f"  {check.verdict}: {check.title}: {check.reason}{remedy}"
     if len(no_matter) == 1:
-        yield f"  not possible: {no_matter[0].title}: {no_matter[0].reason}"
+        yield f"  {NOT_APPLICABLE}: {no_matter[0].title}: {no_matter[0].reason}"
     elif no_matter:
-        yield f"  not possible with what was photographed: {'; '.join(check.title for check in no_matter)}"
+        yield f"  {NOT_APPLICABLE} to what was photographed: {'; '.join(check.title for check in no_matter)}"
 
 
 def _compared(comparison: Comparison) -> Iterator[str]:

@@ -20,6 +20,7 @@ from stcal.sfm.report.judgement import (
     judgement_of,
 )
 from stcal.sfm.report.page import report_html
+from stcal.sfm.report.sections import count_verdicts
 from tests.sfm.report.test_report import make
 
 KEYS = re.compile(r'(?:judge|impossible)\(\s*"([a-z-]+)"|key(?:, title)? = "([a-z-]+)"')
@@ -230,10 +231,19 @@ def test_what_is_missing_is_said_too():
     assert told.next.endswith("For 2 more checks: add a group.")
 
 
+def test_checks_that_nobody_can_make_possible_are_not_missed():
+    """A body of tags has no circles and no board: what tests these is not applicable."""
+    own = report(check("labels", "passed"), check("rim", "not possible"), check("halves", "not possible", remedy="add"))
+    assert judgement_of(own).use == "Yes: 1 checks passed, 1 was not possible."
+    assert count_verdicts([(c["verdict"], c["remedy"]) for c in own["checks"]]) == (
+        "1 passed, 1 not possible, 1 not applicable"
+    )
+
+
 def test_photographs_that_do_not_test_one_another_are_no_yes():
     """Two of five checks passed, but none that residuals decide."""
     keys = {"centres": "not possible", "labels": "not possible", "agreement": "not possible"}
-    own = report(check("pitch", "passed"), check("radius", "passed"), *(check(k, v) for k, v in keys.items()))
+    own = report(check("pitch", "passed"), check("radius", "passed"), *(check(k, v, remedy="add images") for k, v in keys.items()))
     told = judgement_of(own)
     assert told.verdict == "with care"
     assert told.use == "With care: the photographs are too few to test one another, 3 checks were not possible."
