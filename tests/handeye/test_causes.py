@@ -98,12 +98,12 @@ def test_half_of_the_flange_hardly_read_anew_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("which", "flange", "board"), [("next", np.r_[:19], np.r_[1:20]), ("last", np.r_[1:20], np.r_[:19])]
+    ("which", "flange", "board"), [("below", np.r_[:19], np.r_[1:20]), ("above", np.r_[1:20], np.r_[:19])]
 )
 def test_a_side_that_is_stored_a_pose_late_is_named(which, flange, board):
     pairs = drawn(20)
     late = HandEyePoses(pairs.base_from_flange[flange], pairs.camera_from_board[board])
-    with fails_with(f"E-HANDEYE-CONVENTION … beside the {which} one of the flange"):
+    with fails_with(f"E-HANDEYE-CONVENTION … beside that of the flange one row {which}"):
         handeye(late)
 
 

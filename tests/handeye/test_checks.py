@@ -306,7 +306,7 @@ def test_units_of_one_side_are_named(factor, unit):
     pairs = simulated(np.random.default_rng(18), 12, **NOISE).pairs
     board = Poses(pairs.camera_from_board.rotation, factor * pairs.camera_from_board.translation)
     pairs = HandEyePoses(pairs.base_from_flange, board)
-    assert any(f"as if {unit}: check" in note for note in handeye(pairs).notes)
+    assert any(f"as if {unit}: name the columns so" in note for note in handeye(pairs).notes)
     with fails_with("E-HANDEYE-BOARD-SCALE"):
         handeye(pairs, options=HandEyeOptions(with_scale=True))
 
@@ -565,3 +565,48 @@ def test_a_board_of_another_size_is_said_of_few_poses_too():
     assert "the board is 0.952" in note
     assert of_size(loop, (0.9523, 0.03), Noise()) == ()
     assert of_size(Loop.of(truth.pairs, "eye-in-hand"), (0.9523, 0.0132), Noise()) == ()
+
+
+def with_flange(pairs: HandEyePoses, rotation=None, translation=None) -> HandEyePoses:
+    flange = pairs.base_from_flange
+    rotation = flange.rotation if rotation is None else rotation
+    translation = flange.translation if translation is None else translation
+    return HandEyePoses(Poses(rotation, translation), pairs.camera_from_board)
+
+
+@pytest.mark.parametrize(
+    ("places", "said"), [(lambda t: t * [1, -1, 1], "taken as x, −y, z"), (lambda t: t[:, [1, 0, 2]], "as y, x, z")]
+)
+def test_positions_with_other_signs_or_order_are_named(places, said):
+    """Rotations agree: what is wrong is not the pairing of the rows."""
+    pairs = simulated(np.random.default_rng(51), 12, **NOISE).pairs
+    with fails_with(f"E-HANDEYE-CONVENTION … x, y, z of the robot … {said}"):
+        handeye(with_flange(pairs, translation=places(pairs.base_from_flange.translation)))
+    wild = np.random.default_rng(0).normal(0, 300, (12, 3))
+    with fails_with("E-HANDEYE-CONVENTION … positions … rotations agree … columns of positions"):
+        handeye(with_flange(pairs, translation=wild))
+
+
+@pytest.mark.parametrize(("read", "meant"), [("xyz", "ZYX"), ("xyz", "XYZ"), ("XYZ", "zyx")])
+def test_angles_in_another_convention_are_named(read, meant):
+    pairs = simulated(np.random.default_rng(52), 12, **NOISE).pairs
+    angles = Rotation.from_matrix(pairs.base_from_flange.rotation).as_euler(meant)
+    wrong = with_flange(pairs, rotation=Rotation.from_euler(read, angles).as_matrix())
+    with fails_with(f"E-HANDEYE-CONVENTION … read as {read}, taken as {meant}: give --rotation robot={meant}-deg"):
+        handeye(wrong)
+
+
+def test_a_mistake_in_poses_of_the_other_setup_is_named():
+    pairs = simulated(np.random.default_rng(53), 16, setup="eye-to-hand", **NOISE).pairs
+    metres = with_flange(pairs, translation=pairs.base_from_flange.translation / 1000)
+    with fails_with("E-HANDEYE-CONVENTION … with --setup eye-to-hand and with the robot's lengths times 1000"):
+        handeye(metres)
+
+
+@pytest.mark.parametrize(("order", "name"), [([1, 2, 3, 0], "xyzw"), ([3, 0, 1, 2], "wxyz")])
+def test_the_option_for_quaternions_is_that_of_what_the_columns_hold(order, name):
+    pairs = simulated(np.random.default_rng(54), 12, **NOISE).pairs
+    flange = pairs.base_from_flange
+    filed = Poses.from_quaternions(flange.quaternions()[:, order], flange.translation)
+    with fails_with(f"E-HANDEYE-CONVENTION … the robot's quaternions … --rotation robot={name}"):
+        handeye(HandEyePoses(filed, pairs.camera_from_board))

@@ -1,21 +1,26 @@
 """Faces that are not where the design draws them, and groups that show others than they are named after."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stcal.boards.target import body_toml
-from stcal.design import reference_target
+from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.data.as_drawn import misnamed_groups, not_as_drawn
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.mapping.body import Corners, wrong_sizes
+from stcal.sfm.mapping.placed import place_with_camera
+from stcal.sfm.planning.bodies import corners_seen
 from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import tag_cube
+from tests.outcome import fails_with
 
 CUBE = tag_cube(60.0)
 
@@ -101,3 +106,26 @@ def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):
     assert "; faces are 0.1 times as far" in judged.use
     assert judged.limit == "The drawing: faces are 0.1 times as far."
     assert judged.next.startswith("Check the sizes.")
+
+
+@pytest.mark.parametrize(("faces", "factor"), [((2,), 10.0), ((0,), 0.1), ((3,), 1.25), ((0, 1), 10.0)])
+def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(faces, factor):
+    """Even by a rough camera. A run of such a drawing ended in no minimum, or in a lens that folds its image."""
+    scene = make_body_scene(CUBE, body_camera(640), BodyOptions(images=16, distance_mm=300, seed=5))
+    images, _ = corners_seen(scene, 0.02)
+    rng = np.random.default_rng(0)
+    noisy = [replace(each, centre_px=each.centre_px + rng.normal(0, 0.02, each.centre_px.shape)) for each in images]
+    rough = replace(scene.camera, focal=1.1 * scene.camera.focal)
+
+    def named(design: TargetDesign) -> dict[int, float]:
+        return wrong_sizes(Corners.of(noisy, design.faces), rough).factors
+
+    assert named(CUBE) == {}
+    drawn = list(CUBE.faces)
+    for face in faces:
+        drawn[face] = replace(drawn[face], xy_mm=drawn[face].xy_mm / factor)
+    found = named(replace(CUBE, faces=tuple(drawn)))
+    assert sorted(found) == sorted(faces)
+    assert list(found.values()) == pytest.approx([factor] * len(faces), rel=0.05)
+    with fails_with(f"E-BODY-SIZES … face {CUBE.faces[faces[0]].id}"):
+        place_with_camera(noisy, drawn, rough)

@@ -133,16 +133,20 @@ class HandEyePoses(Brief):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
         flange, board = self.base_from_flange, self.camera_from_board
         first: dict[bytes, int] = {}
+        copies: list[tuple[int, int]] = []
         for i in range(len(self)):
             content = board.rotation[i].tobytes() + board.translation[i].tobytes()
-            j = first.setdefault(content, i)
-            if j == i:
-                continue
+            if (j := first.setdefault(content, i)) != i:
+                copies.append((j, i))
+        for j, i in copies:
             pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
             moved = np.linalg.norm(flange.translation[i] - flange.translation[j])
             turned = Rigid(flange.rotation[j].T @ flange.rotation[i]).angle_rad()
             if moved == 0 and turned < 1e-12:
-                raise InputError("E-POSES-IDENTICAL", f"{pair} are identical poses; take one of them out")
+                more = f", and {len(copies) - 1} more pairs" if len(copies) > 1 else ""
+                every = f"{pair}{more} are identical poses"
+                out = "one of each" if more else "one of them"
+                raise InputError("E-POSES-IDENTICAL", f"{every}; take {out} out")
             raise InputError(
                 "E-POSES-IDENTICAL",
                 f"{pair}: the board's pose is the same to the last digit, while the flange moved by {moved:.3g} mm and "

@@ -4,8 +4,10 @@ A side may be inverted or mirrored, quaternions may be in another order, metres 
 belong to other poses. A symmetric board may be numbered from another end, and a flat one seem tilted the other way.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import permutations, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,8 +22,9 @@ from stcal.handeye.data.views import View, Views
 from stcal.handeye.judge.remarks import Aside, Grave, of_still, spoken
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
+from stcal.io.poses.rotations import ROTATION_VECTOR
 from stcal.io.quaternions import INVERTED as CONJUGATED
-from stcal.io.quaternions import ORDERS, Reading
+from stcal.io.quaternions import LAST, ORDERS, Reading
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """Factors by which a variant must reduce the product of the median residuals in rotation and translation, and the
@@ -65,21 +68,27 @@ def check_conventions(
         for still in of_still(pairs):
             if isinstance(still, Grave):
                 raise InputError("E-POSES-IDENTICAL", f"{contradict}, as {still}")
-        typical_of_variant = {
-            convention: _typical_or_far(variant, guess, with_scale)
-            for convention, variant in _variants(loop, setup, by_images).items()
-        }
-        gain = {
-            convention: as_read[0] / max(turn, 1e-12) * as_read[1] / max(shift, 1e-12)
-            for convention, (turn, shift) in typical_of_variant.items()
-        }
-        convention = max(gain, key=gain.__getitem__)
-        if gain[convention] > FAR_BETTER and as_read[1] > BETTER * typical_of_variant[convention][1]:
+        variants = _variants(loop, setup, by_images)
+        typical_of_variant = _typical_of(variants, guess, with_scale)
+        gain, convention = _best(as_read, typical_of_variant)
+        if convention is None:
+            more = _other_angles(loop, by_images)
+            more |= _other_places(loop, by_images) if as_read[0] <= WELL[0] else {}
+            typical_of_variant |= _typical_of(more, guess, with_scale)
+            convention = _best(as_read, typical_of_variant)[1]
+        if convention is None and as_read[0] > WELL[0]:
+            other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+            other_loop = Loop.of(pairs, other)
+            both = {"": other_loop, **_variants(other_loop, other, by_images)}
+            with_setup = {f"with --setup {other}{' and ' if k else ''}{k}": each for k, each in both.items()}
+            typical_of_variant |= _typical_of(with_setup, guess, with_scale)
+            convention = _best(as_read, typical_of_variant)[1]
+        if convention is not None:
             turn, shift = typical_of_variant[convention]
             raise InputError(
                 "E-HANDEYE-CONVENTION", f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {convention}"
             )
-        inverted = next(convention for convention in typical_of_variant if convention.startswith(INVERTED))
+        inverted = next(each for each in variants if each.startswith(INVERTED))
         if gain[inverted] > DOUBTFUL and as_read[1] > typical_of_variant[inverted][1]:
             turn, shift = typical_of_variant[inverted]
             than = f"by {np.degrees(turn):.2g}° and {shift:.2g} mm {inverted}"
@@ -93,6 +102,11 @@ def check_conventions(
                     f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that "
                     f"ends in -rad; if not, {remedy}"
                 )
+            elif as_read[0] <= WELL[0]:
+                remedy = (
+                    "as rotations agree, rows and conventions of rotation are right: check units, signs and order of "
+                    "the columns of positions"
+                )
             else:
                 remedy += (
                     f", and {'check the camera file' if by_images else 'look for another convention of rotations'}"
@@ -100,7 +114,8 @@ def check_conventions(
             raise InputError(
                 "E-HANDEYE-CONVENTION",
                 f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if poses of robot and camera did not belong together; {remedy}",
+                f"if {'positions' if as_read[0] <= WELL[0] else 'poses'} of robot and camera did not belong together; "
+                f"{remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
@@ -109,13 +124,88 @@ def check_conventions(
             *notes,
             Grave(
                 "the board lies behind the camera in all poses, as it does where both sides are inverted: turn both "
-                f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns; or the camera's "
+                f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns; or, if the "
+                "camera stood beside the robot, the camera's side alone, with --setup eye-to-hand; or the camera's "
                 "axes are those of OpenGL, y up and z backwards: change the signs of y and z of the board in its frame"
             ),
         )
     if behind.any():
         return (*notes, f"the board lies behind the camera in {pairs.names[int(behind.argmax())]}: check its pose")
     return notes
+
+
+def _typical_of(variants: dict[str, Loop], guess: Guess, with_scale: bool) -> dict[str, tuple[float, float]]:
+    """Returns :func:`_typical_or_far` of each loop."""
+    return {convention: _typical_or_far(variant, guess, with_scale) for convention, variant in variants.items()}
+
+
+def _best(as_read: tuple[float, float], typical: dict[str, tuple[float, float]]) -> tuple[dict[str, float], str | None]:
+    """Returns by how much each variant reduces the product of residuals; and the best, None if it is not far better."""
+    gain = {
+        convention: as_read[0] / max(turn, 1e-12) * as_read[1] / max(shift, 1e-12)
+        for convention, (turn, shift) in typical.items()
+    }
+    # Readings that give the same residuals, but for rounding, are told by the first of them.
+    best = max(gain, key=lambda each: float(f"{gain[each]:.3g}"))
+    better = gain[best] > FAR_BETTER and as_read[1] > BETTER * typical[best][1]
+    return gain, best if better else None
+
+
+ANGLES = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "rotvec")
+"""Orders of axes, fixed (xyz …) or turned (ZYX …), whose angles are mixed up with one another or with rotation vectors,
+by the names that --rotation has for them; the most frequent first."""
+
+
+def _other_angles(loop: Loop, by_images: bool) -> dict[str, Loop]:
+    """Returns the loop with angles that were read in one sequence, and meant in another."""
+    variants = {}
+    for side, role in (("robot", "robot"),) if by_images else (("robot", "robot"), ("board", "camera")):
+        poses = _of_side(loop, side)
+        inverted = side == "robot" and loop.inverted
+        read = poses.inverse() if inverted else poses
+        for one, other in permutations(ANGLES, 2):
+            meant = Poses(_of_angles(_angles_of(read.rotation, one), other), read.translation)
+            key = (
+                f"with the {side}'s angles, if they were read as {one}, taken as {other}: give --rotation "
+                f"{role}={other}-deg (or -rad), or name the columns so"
+            )
+            variants[key] = _with_side(loop, side, meant.inverse() if inverted else meant)
+    return variants
+
+
+def _angles_of(rotation: np.ndarray, order: str) -> np.ndarray:
+    """Returns the three angles (m, 3), rad, of rotations (m, 3, 3) in an order of axes, or their rotation vectors."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of the gimbal lock: its angles give the same rotation
+        turns = Rotation.from_matrix(rotation)
+        return turns.as_rotvec() if order == ROTATION_VECTOR else turns.as_euler(order)
+
+
+def _of_angles(angles: np.ndarray, order: str) -> np.ndarray:
+    """Returns the rotations (m, 3, 3) of three angles (m, 3), rad, in an order of axes, or of rotation vectors."""
+    turns = Rotation.from_rotvec(angles) if order == ROTATION_VECTOR else Rotation.from_euler(order, angles)
+    return turns.as_matrix()
+
+
+def _other_places(loop: Loop, by_images: bool) -> dict[str, Loop]:
+    """Returns the loop with other signs and another order of the coordinates of places, on either side."""
+    variants = {}
+    for side in ("robot",) if by_images else ("robot", "board"):
+        poses = _of_side(loop, side)
+        inverted = side == "robot" and loop.inverted
+        read = poses.inverse() if inverted else poses
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+            if order == (0, 1, 2) and signs == (1, 1, 1):
+                continue
+            meant = Poses(read.rotation, read.translation[:, order] * signs)
+            names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))
+            key = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
+            variants[key] = _with_side(loop, side, meant.inverse() if inverted else meant)
+    return variants
+
+
+def _with_side(loop: Loop, side: str, poses: Poses) -> Loop:
+    return replace(loop, stand_from_mount=poses) if side == "robot" else replace(loop, camera_from_board=poses)
 
 
 def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
@@ -137,18 +227,20 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         **_other_units(loop, by_images),
         f"with one side mirrored: if {states} left-handed poses, {remedy}": replace(loop, camera_from_board=mirrored),
     }
-    for which, robot_rows, board_rows in (("next", slice(1, None), slice(-1)), ("last", slice(-1), slice(1, None))):
+    for which, late, robot_rows, board_rows in (
+        ("below", "robot's", slice(1, None), slice(-1)),
+        ("above", "board's", slice(-1), slice(1, None)),
+    ):
         variants[
-            f"with each pose of the board beside the {which} one of the flange: if one side was stored a pose late, "
-            "move it by one row"
+            f"with each pose of the board beside that of the flange one row {which}: move the {late} side up by one row"
         ] = Loop(hand[robot_rows], eye[board_rows], loop.inverted)
     for reading in (*ORDERS, CONJUGATED):
         robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)
         kind = "conjugated" if reading.conjugated else "in another order"
-        # A file without names is of the order x, y, z, w by its form, such as TUM's: the other one is w, x, y, z.
+        order = "xyzw" if reading is LAST else "wxyz"
         robot_side, camera_side = (
             f"quaternions {kind}: if {reading.held}, "
-            + (reading.remedy if reading.conjugated else NAMED_ORDER.format(side=side, order="wxyz"))
+            + (reading.remedy if reading.conjugated else NAMED_ORDER.format(side=side, order=order))
             for side in ("robot", "camera")
         )
         both_sides = f"quaternions {kind}: if {reading.held}, {reading.remedy}"

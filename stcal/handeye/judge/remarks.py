@@ -242,7 +242,8 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     return (
         SizeDoubt(
             f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: "
-            "check its size and the camera file, or solve with the scale"
+            + ("name the columns so, x_in …, or give --length-unit; if not, " if unit_of(scale) else "")
+            + "check its size and the camera file, or solve with the scale"
         ),
     )
 

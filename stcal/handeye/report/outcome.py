@@ -13,7 +13,7 @@ from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.mistakes import flipped
 from stcal.handeye.judge.observability import COMMON_MM, in_words
-from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, Verdict, Word, spoken
+from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, SizeDoubt, Verdict, Word, spoken
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig import Rig, RigHeldOut
 from stcal.handeye.time_offset import TimeOffset
@@ -123,9 +123,9 @@ AS_ONE, AS_THREE = 1.0, 3.0
 WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 """Residuals (RMS), as an angle and as a share of the board's distance, beyond which poses do not belong together. Arms
 that were never calibrated and poses of single tags stay below half of these."""
-OTHER_SIZE, SIZE_SIGMAS = 0.02, 5.0
-"""Deviation of a board from its stated size, and in σ, beyond which it is another board or camera: prints and pitches
-are off by less than a hundredth."""
+OTHER_SIZE, SIZE_SIGMAS = 0.005, 5.0
+"""Deviation of a board from its stated size, and in σ, beyond which it is told: a printer is off by that
+much, a pitch that was measured is not."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
 
@@ -160,8 +160,10 @@ def _of_residuals(outcome: Outcome) -> Finding | None:
         f"board's distance of {away:.0f} mm",
         f"{np.degrees(turn):.2g}°, {shift:.3g} mm",
         f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm",
-        "pair each pose of the board with that of the flange at the same moment, and check units, directions and the "
-        "camera file",
+        ""
+        if any(isinstance(note, SizeDoubt) for note in outcome.all_notes())
+        else "pair each pose of the board with that of the flange at the same moment, and check units, directions and "
+        "the camera file",
     )
 
 

@@ -1,10 +1,11 @@
 """Options and result of an identification."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields
@@ -32,6 +33,17 @@ fold share the error of their solution, so that a standard error of independent 
 would do for 95 %."""
 OUTLIER_WEIGHT = 0.5
 """Weight below which an observation is named as an outlier: its residual is over twice Huber's limit."""
+
+
+NO_GAIN = 0.95
+"""Errors of held-out rows over those of the nominal robot from which on nothing was gained."""
+LEAST_SCALE, BY_CHANCE, LEAST_LENGTHS = 2e-4, 1e-3, 4
+"""Common relative change of all lengths, its probability by chance among changes of the same size, and number of
+lengths that were adjusted, from which on and down to which the scale is named."""
+FAR_FROM_STATED = 3.0
+"""Factor between the σ that residuals show and those that are stated from which on it is told."""
+MEDIAN_OF_NORMAL = 0.6745
+"""Median of the size of a normal error of σ 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,6 +264,66 @@ class Identified(Brief):
     def outliers(self) -> list[tuple[int, float]]:
         """Returns (row of the observations, error in mm) of each observation that weighs less than half."""
         return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
+
+
+def misgivings(result: Identified, nominal: Robot) -> tuple[str, ...]:
+    """Returns notes on a result whose own figures speak against it: stated σ that residuals contradict, no gain over
+    the nominal robot, or lengths that all differ by one factor.
+
+    ``nominal`` : the robot as its file has it.
+    """
+    notes = [] if (stated := _stated_otherwise(result)) is None else [stated]
+    if result.held_out is not None:
+        after, before = (float(np.sqrt(np.nanmean(e**2))) for e in (result.held_out.position_mm, result.nominal_mm))
+        if after > NO_GAIN * before > 0:
+            notes.append(
+                f"no gain: rows held out err by {after:.3g} mm (RMS) with the identified robot and by {before:.3g} mm "
+                "with the nominal one, base and tool fitted: what errs is not the robot's dimensions; check joint "
+                "values and measurements, rounding too"
+            )
+    lengths = np.array([[row.a, row.d] for row in nominal.rows]).ravel()
+    changes = np.array([[row.a, row.d] for row in result.robot.rows]).ravel() - lengths
+    square, free = float(lengths @ lengths), len(lengths) - 1
+    if square > 0 and result.seen.kind != "distance" and (changes != 0).sum() >= LEAST_LENGTHS:
+        scale = float(lengths @ changes) / square
+        rest = float(np.linalg.norm(changes - scale * lengths)) / np.sqrt(free * square)
+        if abs(scale) > LEAST_SCALE and 2 * t_distribution.sf(abs(scale) / max(rest, 1e-15), free) < BY_CHANCE:
+            notes.append(
+                f"all lengths of the robot are {1 + scale:.5f} ± {rest:.1g} times nominal: rather than of the arm, "
+                "this is the scale of the instrument, or of a board or target by which positions were measured; check "
+                "a known length"
+            )
+    return tuple(notes)
+
+
+def _stated_otherwise(result: Identified) -> str | None:
+    """Returns a note on stated σ that are far from what the residuals show, None where they are not."""
+    sigma = result.weighting
+    few = np.count_nonzero(result.weights < OUTLIER_WEIGHT)
+    remedy = "check --sigma-mm and --sigma-rad, or covariances, and their units; or leave them out, to have σ estimated"
+    if 2 * few > len(result.weights):
+        return (
+            f"{few} of {len(result.weights)} rows are outliers by the σ that are stated, which must be far too small: "
+            f"{remedy}"
+        )
+    if sigma.given:
+        ratio, what = sigma.factor, "residuals are"
+    else:
+        white = sigma.factor * sigma.whiten(result.residuals, result.seen)
+        columns = replace(sigma, estimated=()).columns(white.shape[1])
+        size = {
+            name: float(np.median(np.abs(white[:, own]))) / MEDIAN_OF_NORMAL
+            for name, own in columns.items()
+            if name not in sigma.estimated
+        }
+        if not size:
+            return None
+        name = max(size, key=lambda each: abs(np.log(max(size[each], 1e-12))))
+        ratio, what = size[name], f"residuals of {'orientations' if name == 'rad' else result.seen.kind + 's'} are"
+        what = what.replace("poses", "positions")
+    if 1 / FAR_FROM_STATED < ratio < FAR_FROM_STATED:
+        return None
+    return f"{what} {ratio:.2g} times the σ that are stated: {remedy}"
 
 
 def position_errors(found: np.ndarray) -> np.ndarray:

@@ -47,6 +47,7 @@ from stcal.robot.identification.result import (
     HeldOutRows,
     Identified,
     IdentifyOptions,
+    misgivings,
     position_errors,
 )
 from stcal.robot.identification.start import start
@@ -152,7 +153,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     wider, remarks = widened(prediction, findings or ())
     of_arm = any(not each.advice for each in findings or ())
     tested = held_out is not None or options.folds < LEAST_FOLDS
-    return Identified(
+    result = Identified(
         robot=identified,
         seen=observations,
         adjustment=adjusted,
@@ -181,6 +182,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + ((TRY_ELASTIC,) if remarks and of_arm and not solution.state.elastic else ())
         + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
+    return replace(result, notes=result.notes + misgivings(result, robot))
 
 
 def _modelled(

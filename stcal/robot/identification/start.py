@@ -352,12 +352,13 @@ def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple
     """Returns the RMS misfit as a share of the spread, and a mask (m,) of rows that are far off and take no part."""
     near = np.ones(len(data), bool)
     for _ in range(TRIMS):
-        state, misfit = _placed(robot, data[near], tools)
-        share = misfit / _extent(data[near])
+        used = data if near.all() else data[near]
+        state, misfit = _placed(robot, used, tools)
+        share = misfit / _extent(used)
         if data.positions is None:
             break
         errors = np.linalg.norm(residuals(state, observed(data, "position")), axis=1)
-        limit = max(FAR * float(np.median(errors[near])), FITS * _extent(data[near]))
+        limit = max(FAR * float(np.median(errors[near])), FITS * _extent(used))
         before, near = near, errors <= limit
         if share < FITS or (near == before).all() or near.mean() < MOSTLY_NEAR:
             break

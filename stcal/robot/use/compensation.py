@@ -312,7 +312,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         )
     if nominal is None:
         return _without_nominal(identified, targets)
-    apart, rigid = robots_apart(identified, nominal), _rigid(identified, targets)
+    apart, rigid, roles = robots_apart(identified, nominal), _rigid(identified, targets), _roles(identified, nominal)
     identified, nominal, others = _with_one_tool(identified, nominal, targets)
     confirmed, doubts = on_targets(nominal, targets)
     poses = poses_of(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
@@ -331,8 +331,38 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         sliding=identified.prismatic,
         reach_mm=reach_mm(identified, targets.tools[0]),
         beyond=stay.beyond,
-        doubts=((apart,) if apart else ()) + doubts + others + rigid,
+        doubts=((apart,) if apart else ()) + roles + doubts + others + rigid,
         controller=nominal,
+    )
+
+
+ROUND_MM = 0.01
+"""Lengths as drawn are multiples of this."""
+
+
+def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
+    """Returns a doubt if the files seem exchanged, or hold the same arm."""
+    lengths = [np.array([[row.a, row.d] for row in robot.rows]) for robot in (identified, nominal)]
+    if (identified.rows, identified.elasticity) == (nominal.rows, nominal.elasticity) and _same_tools(
+        identified, nominal
+    ):
+        return (
+            f"identified robot {identified.name} and nominal robot {nominal.name} are the same, so that nothing "
+            "is compensated: give the file of identify with --robot, and the model in the controller with --nominal",
+        )
+    drawn = [bool((np.abs(each / ROUND_MM - np.round(each / ROUND_MM)) < 1e-6).all()) for each in lengths]
+    if drawn == [True, False]:
+        return (
+            f"identified robot {identified.name} has all lengths as drawn, in steps of {ROUND_MM:g} mm, and nominal "
+            f"robot {nominal.name} has not, as if they were exchanged: --robot takes the file of identify, --nominal "
+            "the model in the controller",
+        )
+    return ()
+
+
+def _same_tools(one: Robot, other: Robot) -> bool:
+    return one.tools.keys() == other.tools.keys() and all(
+        np.array_equal(tool.matrix(), other.tools[name].matrix()) for name, tool in one.tools.items()
     )
 
 

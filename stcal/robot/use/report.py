@@ -67,7 +67,7 @@ def verification_report(result: Verification) -> Document:
     rows = []
     for k, each in enumerate(result.sets):
         reduced = result.reduction(k) if k else {}
-        cells = [(number(v, 4), f"{reduced[key]:.1f} %" if k else NONE) for key, v in each.figures().items()]
+        cells = [(number(v, 4), _percent(reduced[key]) if k else NONE) for key, v in each.figures().items()]
         rows.append([each.name, *(cell for pair in cells for cell in pair)])
     over = [("", 1), ("mean", 2), ("std", 2), ("max", 2), ("RMS of all pairs", 2)]
     errors = [
@@ -97,6 +97,11 @@ def verification_report(result: Verification) -> Document:
             ),
         ],
     )
+
+
+def _percent(less: float) -> str:
+    """Returns by how much a figure is less, per cent; none where the first one is 0."""
+    return f"{less:.1f} %" if np.isfinite(less) else NONE
 
 
 def compensation_report(result: Compensated, robot: Robot) -> Document:

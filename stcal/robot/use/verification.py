@@ -5,7 +5,7 @@ instrument. They all carry the error of the first position; the distances of all
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,7 +15,7 @@ from pydantic import Field
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.io.json import Part, ResultFile, Vector
-from stcal.io.table import Table, read_table
+from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
 
@@ -28,7 +28,14 @@ of their 2 m. Another robot's model, or rows in another order, cause more."""
 MOST_ELSEWHERE, MOST_COMPARED = 0.3, 1000
 """Largest share of the poses that may be named as not where they were commanded, and number of poses up to which all
 are compared with all."""
-SCALE_WITHIN = 0.01
+OFF, OFF_MM, LEAST_TO_COMPARE = 6.0, 0.1, 6
+"""How many times as much as that of most poses one's typical distance error must be, and how large, to name the pose;
+and smallest number of poses in which that is looked for."""
+WORSE = 1.2
+"""How many times as much as the first set another may err without a warning."""
+LEAST_SPREAD_MM = 20.0
+"""Largest commanded distance below which the unit is doubted."""
+SCALE_WITHIN = 0.005
 """Largest relative difference of scale.
 
 Arms are off by parts of a thousand; more indicates another unit or other poses.
@@ -121,8 +128,8 @@ class SetResult:
             return f"set {self.name}: {self.elsewhere}"
         if abs(self.scale - 1) > SCALE_WITHIN:
             return (
-                f"set {self.name}: measured distances are {self.scale:.4f} times the commanded ones; "
-                "check units and the order of the poses"
+                f"set {self.name}: measured distances are {self.scale:.4g} times the commanded ones; "
+                f"{_remedy_of_scale(self.scale)}"
             )
         allowed = max(MISSES * self.pairs_mm, MISSES_MM)
         if self.pairs_rms_mm <= allowed:
@@ -164,7 +171,51 @@ class Verification(Brief):
             for name, poses in self.missing.items()
             if poses
         ]
-        return found + [doubt for each in self.sets if (doubt := each.doubt())]
+        found += [doubt for each in self.sets if (doubt := each.doubt())]
+        first = self.sets[0]
+        if (most := float(self.distance_mm.max())) < LEAST_SPREAD_MM:
+            found.append(
+                f"commanded positions lie within {most:.3g} mm of the first one; if lengths are in another unit than "
+                "the names of their columns say, correct these"
+            )
+        for each in self.sets[1:]:
+            if each.pairs_rms_mm > WORSE * first.pairs_rms_mm and not each.doubt():
+                found.append(
+                    f"set {each.name} errs more than set {first.name}, the first in the file, {each.pairs_rms_mm:.3g} "
+                    f"against {first.pairs_rms_mm:.3g} mm (RMS of all pairs): the first is to be the one before "
+                    "compensation"
+                )
+        return found
+
+
+def _remedy_of_scale(scale: float) -> str:
+    """Returns what to check where measured distances are ``scale`` times the commanded ones."""
+    for unit, words in UNIT_WORDS.items():
+        for times, side in ((LENGTHS[unit], "commanded"), (1 / LENGTHS[unit], "measured")):
+            if abs(scale / times - 1) < SCALE_WITHIN:
+                return f"check units, as if the {side} ones were {words}"
+    near = abs(scale - 1) < MISSES
+    return "check the instrument's scale" if near else "check units and the order of the poses"
+
+
+def _also_late(commanded: np.ndarray, measured: np.ndarray) -> str:
+    """Returns that the positions (n, 3) fit one row further, empty if they do not."""
+    if len(commanded) < LEAST_TO_COMPARE:
+        return ""
+
+    def missed(first: np.ndarray, second: np.ndarray) -> float:
+        apart = [np.linalg.norm(xyz[1:] - xyz[:-1], axis=1) for xyz in (first, second)]
+        return float(np.median(np.abs(apart[0] - apart[1])))
+
+    now = missed(commanded, measured)
+    ways = {
+        "low: they fit the commanded ones above": missed(commanded[:-1], measured[1:]),
+        "high: they fit the commanded ones below": missed(commanded[1:], measured[:-1]),
+    }
+    way = min(ways, key=lambda each: ways[each])
+    if now < MISSES_MM or ways[way] > now / OFF:
+        return ""
+    return f"measured positions stand one row too {way}; correct the order of the rows"
 
 
 def read_measured(path: str | Path | Table) -> MeasuredPoses:
@@ -262,7 +313,12 @@ def verify(data: MeasuredPoses) -> Verification:
                 f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {next(iter(index))} and "
                 f"{group} (line {data.lines[rows_of_set[k]]}); the same commands needed",
             )
-    sets = tuple(_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items())
+    results = [_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items()]
+    same = "measured positions are those of the first set to the last digit; give those of the instrument"
+    sets = tuple(
+        replace(each, elsewhere=same) if k and (data.measured[rows_of_set] == data.measured[first]).all() else each
+        for k, (each, rows_of_set) in enumerate(zip(results, index.values(), strict=True))
+    )
     at = data.commanded[first]
     distances = np.linalg.norm(at[1:] - at[0], axis=1)
     return Verification(data.where, tuple(common), distances, sets, missing, data.notes)
@@ -277,7 +333,18 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
         missed = np.abs(own - distances)
         return missed, np.flatnonzero(np.median(missed, axis=1) > max(MISSES * np.median(distances), MISSES_MM))
 
+    if late := _also_late(commanded, measured):
+        return late
+    if (measured == commanded).all():
+        return "measured positions are the commanded ones to the last digit; give those of the instrument"
     missed, wrong = off(measured)
+    if not len(wrong) and len(names) >= LEAST_TO_COMPARE:
+        typical = np.median(missed, axis=1)
+        far = np.flatnonzero(typical > max(OFF * float(np.median(typical)), OFF_MM))
+        if 0 < len(far) <= MOST_ELSEWHERE * len(names):
+            listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in far)
+            most = f"{np.median(typical):.2g} mm"
+            return f"pose{'s' * (len(far) > 1)} {listed}: far worse than the others, {most} (median); measure again"
     good = np.setdiff1d(np.arange(len(names)), wrong)
     if not len(wrong) or len(wrong) > MOST_ELSEWHERE * len(names) or missed[np.ix_(good, good)].max() > MISSES_MM:
         return ""

@@ -81,8 +81,8 @@ class ComparePosesFile(ResultFile):
 
     images: dict[ByImage, PoseErrors] = Field(
         description="`translation_um`, `rotation_mdeg` of camera_from_target against the truth, camera frame; with "
-        "covariances also `normalised_error` √(eᵀC⁻¹e/6), about 1 when σ is true, in all poses alike where their errors "
-        "are common"
+        "covariances also `normalised_error` √(eᵀC⁻¹e/6), about 1 when σ is true, in all poses alike where their "
+        "errors are common"
     )
     not_in_truth: list[str] = Field(description="measured images whose pose the truth does not state")
 

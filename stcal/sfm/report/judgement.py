@@ -240,7 +240,10 @@ def _by_result(report: dict) -> tuple[Use, str]:
         )
     testing = [check["verdict"] for check in checks if check["key"] in TESTED_BY]
     if testing and set(testing) == {"not possible"}:
-        return "with care", f"With care: the photographs are too few to test one another, {missing} checks were not possible."
+        return (
+            "with care",
+            f"With care: the photographs are too few to test one another, {missing} checks were not possible.",
+        )
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
     return "yes", f"Yes: {passed}{open_}."
@@ -551,7 +554,9 @@ def _more(report: dict, verdict: Use) -> list[str]:
         if read:
             was, it = ("was", "it") if len(read) == 1 else ("were", "them")
             advice.append(f"Read why {_faces(read)} {was} left out, and photograph {it} again from other places.")
-    open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"])]
+    open_ = [
+        c for c in report.get("checks", []) if c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"])
+    ]
     if verdict == "yes" and open_:
         remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")
         same = sum(check["remedy"] == open_[0]["remedy"] for check in open_)

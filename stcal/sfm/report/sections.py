@@ -311,7 +311,9 @@ def checks_section(checks: list[dict]) -> list[Block]:
         f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds for one check, however "
         f"many images or points it tested",
         Table(heads, open_, css="text"),
-        fold(f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")),
+        fold(
+            f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
+        ),
         fold("What was measured", Table(columns_measured, measured, css="text")),
     ]
 

@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
-from stcal.handeye.judge.mistakes import repair
+from stcal.handeye.judge.mistakes import HALL_MM, repair
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.pipeline import Validated, validated
 from stcal.handeye.report.outcome import ArmFound, Outcome
@@ -140,6 +140,7 @@ def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, 
     why = f"and the board only {board:.0f} mm off the base's origin" if exchanged else "farther than brackets reach"
     said = (
         f"the camera is {away:.0f} mm off the flange, {why}, and no residual tells the setup: "
+        f"{'name the columns x_mm … if lengths are mm that stand in columns of metres; ' if away > HALL_MM else ''}"
         "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
     )
     return (Grave(said) if away > TOO_FAR_MM else said,)

@@ -323,3 +323,63 @@ def test_rokae_held_out(shared_data, tmp_path):
     # 0.115 mm asked; 0.06 would be below the noise of a coordinate times 1.6
     assert 0.06 < found.held_out.position_mm.mean() <= 0.115
     assert found.nominal_mm.mean() > 10 * found.held_out.position_mm.mean()
+
+
+def of_distances(data: Measurements, factor: float = 1.0) -> Measurements:
+    """Distances of the positions from the first, times a factor, in place of the positions."""
+    away = factor * np.linalg.norm(data.points() - data.points()[0], axis=1)
+    return replace(
+        data, positions=None, rotations=None, covariance=None, distances=away, from_row=np.zeros(len(data), int)
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        (lambda data: of_distances(data, 1e-3), "lengths are metres"),
+        (lambda data: replace(of_distances(data), q=data.q * [1, 1, -1, 1, 1, 1]), "joint 3 had the opposite sign"),
+        (lambda data: replace(of_distances(data), q=data.q[:, [0, 1, 3, 2, 4, 5]]), "q3 and q4 were exchanged"),
+    ],
+)
+def test_mistakes_in_distances_are_named_too(spoilt, said):
+    with pytest.raises(InputError, match=f"it would fit if .*{said}"):
+        identify(mh80(), spoilt(simulated(31, 40)[1]), QUICK)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"sigma_mm": 5e-5}, "outliers by the σ that are stated"),
+        ({"sigma_mm": 50.0}, "residuals of positions are 0.0"),
+        ({"sigma_mm": 50.0, "sigma_rad": 2e-4}, "residuals of positions are 0.0"),
+        ({"sigma_rad": 0.0115}, "residuals of orientations are 0.0"),
+        ({"sigma_mm": 0.05}, ""),
+        ({"sigma_mm": 0.05, "sigma_rad": 2e-4}, ""),
+    ],
+)
+def test_stated_sigma_that_residuals_contradict_are_told(options, said):
+    notes = identify(mh80(), simulated(32, 60)[1], replace(QUICK, **options)).notes
+    assert [note for note in notes if "that are stated" in note] == (
+        [] if not said else [*filter(said_in(said), notes)]
+    )
+    assert not said or any(said in note for note in notes)
+
+
+def said_in(said: str):
+    return lambda note: said in note
+
+
+def test_a_common_scale_of_all_lengths_is_no_robot():
+    data = simulated(33, 60)[1]
+    grown = replace(data, positions=1.01 * data.points())
+    notes = [" ".join(identify(mh80(), each, QUICK).notes) for each in (data, grown)]
+    assert "all lengths of the robot are" not in notes[0]
+    assert re.search(r"all lengths of the robot are 1\.0(09|10)\d+ ±", notes[1])
+
+
+def test_joint_values_that_were_rounded_gain_nothing_and_say_so():
+    data = simulated(34, 60)[1]
+    rounded = replace(data, q=np.radians(np.round(np.degrees(data.q))))
+    notes = [" ".join(identify(mh80(), each, IdentifyOptions(repeats=1)).notes) for each in (data, rounded)]
+    assert "no gain" not in notes[0]
+    assert "no gain: rows held out err by" in notes[1]

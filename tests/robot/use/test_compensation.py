@@ -317,3 +317,13 @@ def test_payloads_that_cannot_be_are_refused(tmp_path, cell, option, message):
     with pytest.raises(InputError) as error:
         read_targets(path, case.real, payload_kg=option)
     assert message in str(error.value)
+
+
+def test_files_that_are_exchanged_or_the_same_are_told(tmp_path):
+    case = Case(tmp_path)
+    targets = case.poses[:3]
+    assert not any(
+        "as drawn" in note or "are the same" in note for note in compensate(case.real, targets, case.nominal).notes()
+    )
+    assert "as if they were exchanged" in compensate(case.nominal, targets, case.real).notes()[0]
+    assert "are the same, so that nothing is compensated" in compensate(case.real, targets, case.real).notes()[0]

@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
 from stcal.robot.use.report import verification_report
-from stcal.robot.use.verification import MeasuredPoses, read_measured, verification_file, verify
+from stcal.robot.use.verification import MeasuredPoses, Verification, read_measured, verification_file, verify
 from tests.outcome import fails_with
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
@@ -158,7 +158,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert caught.value.code == 2
 
 
-@pytest.mark.parametrize(("off_mm", "warned"), [(0.0, False), (15.0, False), (4100.0, True)])
+@pytest.mark.parametrize(("off_mm", "warned"), [(0.01, False), (15.0, False), (4100.0, True)])
 def test_commands_of_another_robot_are_said(off_mm, warned):
     """Distances that miss the commanded ones, though they are as long in all: no other unit."""
     rng = np.random.default_rng(3)
@@ -184,6 +184,26 @@ def ten_poses(change) -> str:
     return verify(data).sets[0].doubt()
 
 
+def ten_of_two_sets(first, second) -> Verification:
+    """Ten poses in two sets, each measured to ``first`` and ``second`` mm in the robot's frame."""
+    rng = np.random.default_rng(5)
+    commanded = rng.uniform(-500, 500, (10, 3))
+    measured = [commanded + rng.normal(0, sigma, commanded.shape) for sigma in (first, second)]
+    names = tuple(map(str, range(10))) * 2
+    sets = ("before",) * 10 + ("after",) * 10
+    return verify(
+        MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)),
+    )
+
+
+def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
+    assert ten_of_two_sets(1.0, 0.1).warnings() == []
+    assert "set after errs more than set before" in ten_of_two_sets(0.1, 1.0).warnings()[0]
+    assert "are the commanded ones to the last digit" in ten_of_two_sets(0.0, 0.1).warnings()[0]
+    both = ten_of_two_sets(1.0, 0.0)
+    assert "set after: measured positions are the commanded ones" in both.warnings()[0]
+
+
 def exchange(at: np.ndarray) -> None:
     at[[2, 6]] = at[[6, 2]]
 
@@ -197,3 +217,18 @@ def test_exchanged_and_wrong_poses_are_named():
     assert ten_poses(exchange) == "set after: poses P3, P7 are exchanged; correct the order of the rows"
     assert ten_poses(displace) == "set after: pose P5: not where commanded, the others are; correct or remove"
     assert "check units and the order" in ten_poses(lambda at: at.__imul__(1.1))
+    assert "as if the commanded ones were inches" in ten_poses(lambda at: at.__imul__(25.4))
+
+
+def late(at: np.ndarray) -> None:
+    at[:] = np.roll(at, 1, axis=0)
+
+
+def slip(at: np.ndarray) -> None:
+    at[0] += [0, 5, 0]
+
+
+def test_a_row_that_is_late_and_one_pose_of_a_few_millimetres_are_named():
+    """The first pose is in all distances from it: its error looks like one of all others."""
+    assert "stand one row too low: they fit the commanded ones above" in ten_poses(late)
+    assert ten_poses(slip).startswith("set after: pose P1 (")

@@ -2,14 +2,19 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stcal.design import reference_target
 from stcal.errors import InputError, InputNote
+from stcal.geometry.rigid import Rigid
+from stcal.io.table import COVARIANCE as COLUMNS
+from stcal.io.table import POSE, pose_cells
 from stcal.sfm.measurement.target import read_target
-from stcal.sfm.report.compare import compare, comparison_table
+from stcal.sfm.report.compare import compare, compare_poses, comparison_table, poses_table
+from stcal.synthetic.dataset import TruthFile
 from tests.outcome import fails_with
 from tests.shared import own_copy, unsealed_copy
 
@@ -121,3 +126,30 @@ def test_a_place_beyond_all_reach_is_named(small_run, small_dataset, tmp_path):
     path.write_text(json.dumps(content))
     with fails_with(f"E-VALUE-TOO-FAR … truth.json: circles.{label}"):
         compare(small_run, path)
+
+
+def test_measured_poses_are_compared_with_the_truth(small_dataset, tmp_path):
+    """Errors over σ of poses that err by what their covariances say are about 1; images are found by their file."""
+    truth = TruthFile.model_validate_json((small_dataset / "truth.json").read_text())
+    true = {name: Rigid.from_matrix(pose) for name, pose in truth.poses().items()}
+    rng, sigma = np.random.default_rng(0), np.array([1e-4, 2e-4, 1e-4, 0.01, 0.02, 0.05])
+
+    def table(unit: float = 1.0, names=None) -> Path:
+        rows = [["image", *POSE, *COLUMNS]]
+        for name, pose in true.items():
+            moved = Rigid.exp(np.append(rng.normal(0, sigma[:3]), [0, 0, 0])).rotation @ pose.rotation
+            found = Rigid(moved, unit * (pose.translation + rng.normal(0, sigma[3:])))
+            rows.append([names(name) if names else name, *pose_cells(found, np.diag(sigma**2))])
+        path = tmp_path / "poses.csv"
+        path.write_text("\n".join(map(",".join, rows)) + "\n", encoding="utf-8")
+        return path
+
+    found = compare_poses(table(), small_dataset / "truth.json")
+    assert found.images.keys() == true.keys()
+    over = np.array([each.normalised_error for each in found.images.values()])
+    assert 0.4 < (over**2).mean() < 1.6  # χ² of 8 images of 6 each, over 48: 1 ± 3 × 0.2
+    assert f"RMS of {len(true)} poses" in poses_table(found)
+    with fails_with("E-COMPARE-UNITS … poses is in m"):
+        compare_poses(table(1e-3), small_dataset / "truth.json")
+    with fails_with("E-COMPARE-IMAGES … names like"):
+        compare_poses(table(names=lambda name: f"other-{Path(name).name}"), small_dataset / "truth.json")

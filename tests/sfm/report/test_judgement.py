@@ -243,7 +243,11 @@ def test_checks_that_nobody_can_make_possible_are_not_missed():
 def test_photographs_that_do_not_test_one_another_are_no_yes():
     """Two of five checks passed, but none that residuals decide."""
     keys = {"centres": "not possible", "labels": "not possible", "agreement": "not possible"}
-    own = report(check("pitch", "passed"), check("radius", "passed"), *(check(k, v, remedy="add images") for k, v in keys.items()))
+    own = report(
+        check("pitch", "passed"),
+        check("radius", "passed"),
+        *(check(k, v, remedy="add images") for k, v in keys.items()),
+    )
     told = judgement_of(own)
     assert told.verdict == "with care"
     assert told.use == "With care: the photographs are too few to test one another, 3 checks were not possible."

@@ -306,7 +306,8 @@ _STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
 def todays(table: Table) -> bool:
     """True if the columns are those of the package's own tables: a place with its unit, and a quaternion."""
     prefixes = ("", *(f"{name}_" for name in EVERY_FRAME))
-    return any(table.has(f"{prefix}x", LENGTHS) and f"{prefix}qw" in table for prefix in prefixes)
+    placed = [prefix for prefix in prefixes if table.has(f"{prefix}x", LENGTHS)]
+    return bool(placed) and all(f"{prefix}qw" in table for prefix in placed)
 
 
 def read_columns(table: Table, key: str, statements: Said) -> Content | None:
