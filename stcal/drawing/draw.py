@@ -14,7 +14,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.formats import dxf, pdf, svg
 from stcal.drawing.net import net_parts
 from stcal.drawing.parts import Part, board_parts, said_mm, target_parts
-from stcal.drawing.sheets import MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
+from stcal.drawing.sheets import FURNITURE, MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import save
@@ -189,7 +189,9 @@ def drawn_text(drawn: Drawn) -> str:
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
         single = ", or one by one without --net" if drawn.parts[0].name.startswith("net") else ""
         through = ", the worse as one runs through a pattern" if any(sheet.cuts for sheet in drawn.sheets) else ""
+        room = [said_mm(side - margin) for side, margin in zip(PAPERS[drawn.paper], FURNITURE, strict=True)]
         lines.append(
+            f"a sheet of {drawn.paper} has room for {' × '.join(room)} mm, either way round, dimensions included; "
             f"parts that are glued of several sheets are off at the seams{through}: state it in sigma_mm, or "
             f"{larger}{single}"
         )

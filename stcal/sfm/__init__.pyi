@@ -28,6 +28,7 @@ from .planning.bodies import plan as plan
 from .planning.forecast import CentreNoise as CentreNoise
 from .planning.session import PlanOptions as PlanOptions
 from .report.compare import compare as compare
+from .report.compare import compare_poses as compare_poses
 from .runs.crosscheck import Tolerances as Tolerances
 from .runs.folder import report_again as report_again
 from .runs.options import RunOptions as RunOptions

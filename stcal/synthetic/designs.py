@@ -140,14 +140,29 @@ MIN_CELL_PX = 2.0
 Body = Literal["cube", "dodecahedron"]
 
 
-def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int) -> TargetDesign:
+def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, faces: str = "") -> TargetDesign:
     """Return a body of tags by its width between opposite faces, mm, which may be a text.
+
+    ``faces`` : ids of the faces that it is to have, such as ``1,2,3,4,5``; all of them if empty.
 
     Raises
     ------
     InputError
-        The width is not a number above 0, or the dictionary or an id in it does not exist.
+        The width is not a number above 0, the dictionary or an id in it does not exist, or a face does not, or fewer
+        than two remain.
     """
+    whole = _whole_body(kind, size, dictionary, first_id)
+    kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]
+    if unknown := [name for name in kept if name not in ids]:
+        raise InputError(
+            "E-OPTION-VALUE", f"--faces {faces}: the {kind} has no face {unknown[0]}; use some of {', '.join(ids)}"
+        )
+    if kept and len(set(kept)) < 2:
+        raise InputError("E-OPTION-VALUE", f"--faces {faces}: one face; two or more needed, such as 1,2,3")
+    return replace(whole, faces=tuple(face for face in whole.faces if not kept or face.id in kept))
+
+
+def _whole_body(kind: Body, size: str | float, dictionary: str, first_id: int) -> TargetDesign:
     width = width_of(size)
     faces = 6 if kind == "cube" else 12
     family = known_tags([(dictionary, first_id + face) for face in range(faces)], "--tags, --dictionary")[0][0]

@@ -381,7 +381,7 @@ def design(
     faces: Annotated[
         str,
         "Place circles on these sides of front, right, back, left and top; on all five if not given. The first one "
-        "is the reference face.",
+        "is the reference face. With --tags, place tags on these faces alone, by number: 1,2,3,4,5.",
     ] = "",
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
@@ -411,17 +411,16 @@ def design(
     from stcal.synthetic.designs import made_text as body_text
     from stcal.synthetic.designs import width_of
 
-    of_circles = {"--faces": faces, "--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
+    of_circles = {"--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
     of_tags = {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}
     if tags is not None and (unfit := [name for name, given in of_circles.items() if given]):
-        fewer = "; for fewer faces, delete a [[face]] of target.toml" if unfit[0] == "--faces" else ""
-        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out{fewer}")
+        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
     if tags is None and (unfit := [name for name, given in of_tags.items() if given]):
         raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of tags, and there are none without --tags; add it")
     model = read_camera(camera) if camera else None
     if tags is not None:
         session = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, seed=seed)
-        made = design_tag_body(tags, width_of(size), dictionary, first_id, session, folder)
+        made = design_tag_body(tags, width_of(size), dictionary, first_id, session, folder, faces)
     else:
         polarity = "bright" if bright else "dark"
         sides, names = size_of(size), faces_of(faces)

@@ -145,7 +145,8 @@ class BudgetFile(ResultFile):
         "`faces.json`; `changed`: files that are not as the run left them"
     )
     fields: dict[ByName, str] = Field(
-        description="`number` (of the certificate), `laboratory`, `instrument`, `operator`, `date` (of the "
+        description="`number` (of the certificate), `laboratory`, `place` (of the calibration), `customer`, "
+        "`instrument`, `operator`, `date` (of the "
         "calibration), `traceability` and others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")

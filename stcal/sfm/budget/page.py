@@ -135,7 +135,9 @@ def budget_report(file: BudgetFile) -> Document:
                     *([file.holds] if file.holds and file.size_known else []),
                     Table(_heads("position of face", "mm", "µm"), positions),
                     Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
-                    Table(["<distance of", "in the run, mm", "corrected, mm", "U, µm"], lengths),
+                    Table(
+                        ["<distance of", "as in faces.json, mm", "corrected for what is stated, mm", "U, µm"], lengths
+                    ),
                     *(
                         _shares(file, [(name, u) for _, columns in kinds for name, u in columns.items()])
                         if kinds
@@ -266,10 +268,10 @@ def _what_u_is(file: BudgetFile) -> str:
     k = f"{file.coverage_factor:g}"
     return (
         f"The expanded uncertainty U is the combined standard uncertainty multiplied by the coverage factor k = {k}, "
-        "which for a normal distribution gives a coverage probability of about 95 % (JCGM 100:2008, GUM). In tables it "
-        f"is of one axis: {k} times the σ of the run, with the contributions of what is stated. Where it is of x, y "
-        "and z together, it is the root of their summed variances, and the sphere of this radius covers more, as the "
-        "coverage in the tables says"
+        "which for a normal distribution gives a coverage probability of about 95 % (JCGM 100:2008, GUM). U of x, of y "
+        f"or of z is of that axis alone: {k} times its σ in the run and in what is stated. U of a position is "
+        f"{k} times the root of the three variances together; a sphere of that radius covers more than 95 %, how much is said in "
+        "the tables"
     )
 
 

@@ -29,7 +29,7 @@ from stcal.sfm.adjust.uncertainty import (
     Contributions,
 )
 
-FIELDS = ("number", "laboratory", "instrument", "operator", "date", "traceability")
+FIELDS = ("number", "laboratory", "place", "customer", "instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, after those that are given, and empty if they are not."""
 LONGEST = 500
 DEFAULT = "; the default, which `design` writes too: measure it and state it"

@@ -302,8 +302,9 @@ def design_tag_body(
     first_id: int = 0,
     session: PlanOptions | None = None,
     out: str | Path | None = None,
+    faces: str = "",
 ) -> DesignedTarget:
-    """Returns a cube or dodecahedron with a tag on each face, and its σ.
+    """Returns a cube or dodecahedron with a tag on each face, or on some, and its σ.
 
     Parameters
     ----------
@@ -319,6 +320,8 @@ def design_tag_body(
         Photographs of the forecast: ``images``, ``distance_mm``, ``width`` or ``camera``, and ``seed``.
     out : str or Path, optional
         Folder for ``target.toml``; nothing is written if None.
+    faces : str
+        Ids of the faces with a tag, such as ``1,2,3,4,5``; all of them if empty.
 
     Returns
     -------
@@ -329,12 +332,12 @@ def design_tag_body(
     Raises
     ------
     InputError
-        The size is not within 1 mm and 100 m, a tag does not exist, ``target.toml`` exists, or the body does not fit
-        into the image.
+        The size is not within 1 mm and 100 m, a tag or a face does not exist, ``target.toml`` exists, or the body does
+        not fit into the image.
     """
     require_size([size_mm], f"{size_mm:g}")
     path, _ = _free(out)
-    target, (noise, source) = tag_body(kind, size_mm, dictionary, first_id), expected_noise(of_corners=True)
+    target, (noise, source) = tag_body(kind, size_mm, dictionary, first_id, faces), expected_noise(of_corners=True)
     forecast, reason = None, ""
     try:
         forecast = plan_body(replace(session or PlanOptions(), noise=noise), target, target.rough_poses())

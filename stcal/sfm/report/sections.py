@@ -132,7 +132,11 @@ def headline(report: dict, words: Words) -> list[tuple[str, str, str]]:
         (number(summary["sigma0"], 2), "", "σ₀ of the joint adjustment"),
         (number(summary["sigma_factor"], 2), "×", factor_in_words(summary["sigma_factor"])),
         (number(sigma and sigma[0], 1), "µm", "largest σ of a face's position"),
-        *([(number(ppm, 1), "ppm", "largest difference of λ by rows")] if words.board else []),
+        *(
+            [(number(ppm, 1), "ppm", "largest difference of the scale by the board's rows from that by all dots")]
+            if words.board
+            else []
+        ),
     ]
 
 
@@ -198,7 +202,7 @@ def _worst_values(report: dict, words: Words) -> list[list[str]]:
                 if words.board
                 else "the model against what was stated",
             ),
-            *([("λ by rows against least squares (ppm)", ppm, 1, over)] if words.board else []),
+            *([("Scale by the board's rows against that by all dots (ppm)", ppm, 1, over)] if words.board else []),
             ("Residual (px)", single, 4, "one centre in one image"),
         )
     ]

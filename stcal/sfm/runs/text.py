@@ -115,7 +115,7 @@ def _found_camera(result: RunResult) -> Iterator[str]:
     yield (
         f"camera: found from the photographs: f {focal[0]:.2f} ± {sigma[0]:.2f}, {focal[1]:.2f} ± {sigma[1]:.2f} px, "
         f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px from the centre of the "
-        "first pixel (the camera file, as COLMAP's, counts from its corner: 0.5 px more)"
+        "first pixel (in the camera file from that pixel's corner, as in COLMAP: there 0.5 px more)"
     )
     if sigma[0] > WEAK_FOCAL * focal[0]:
         yield (

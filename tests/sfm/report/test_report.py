@@ -292,7 +292,7 @@ def test_trust_names_the_worst(joint):
     assert trust["σ of a face's position (µm)"][0] == "3.1"
     # The only way to a face agrees with itself: that is no check.
     assert trust["Disagreement of chains, position (µm)"] == ["–", "–"]
-    assert trust["λ by rows against least squares (ppm)"] == ["0.5", "group a"]
+    assert trust["Scale by the board's rows against that by all dots (ppm)"] == ["0.5", "group a"]
     assert "σ hold for the given intrinsics" in joint
     assert "no second chain confirms them: face 2." in joint
 
