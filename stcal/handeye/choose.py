@@ -358,9 +358,12 @@ def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, meas
     by_candidate = {each.candidate: each for each in tried}
     chosen_mm, plain = by_candidate[chosen].mean_mm(), tried[0]
     where = "at the board" if measure == "board_mm" else "of the board's origin"
-    parts = [f"of {len(tried)} ways {chosen.in_words()} is taken: {chosen_mm:.3g} mm {where} on poses held out"]
+    parts = [
+        f"{len(tried)} ways of solving were compared by poses held out; the best, {chosen.in_words()}, errs by "
+        f"{chosen_mm:.3g} mm {where}"
+    ]
     if plain.candidate != chosen:
-        parts[0] += f", {plain.candidate.in_words()} {plain.mean_mm():.3g} mm" if plain.error_mm.size else ""
+        parts[0] += f", {plain.candidate.in_words()} by {plain.mean_mm():.3g} mm" if plain.error_mm.size else ""
     filed_mm = [each.mean_mm() for each in tried if chosen.camera and not each.candidate.camera and each.error_mm.size]
     if filed_mm:
         parts.append(f"the camera file costs {min(filed_mm) - chosen_mm:.2g} mm")

@@ -592,7 +592,7 @@ def test_angles_in_another_convention_are_named(read, meant):
     pairs = simulated(np.random.default_rng(52), 12, **NOISE).pairs
     angles = Rotation.from_matrix(pairs.base_from_flange.rotation).as_euler(meant)
     wrong = with_flange(pairs, rotation=Rotation.from_euler(read, angles).as_matrix())
-    with fails_with(f"E-HANDEYE-CONVENTION … read as {read}, taken as {meant}: give --rotation robot={meant}-deg"):
+    with fails_with(f"E-HANDEYE-CONVENTION … --rotation robot={meant}-deg (or -rad) if they were read as {read}"):
         handeye(wrong)
 
 

@@ -223,7 +223,7 @@ def again(sides):
         (None, change(3, "0.2"), INPUT, ["line 5: quaternion of length", "is the order qw, qx, qy, qz?"]),
         (None, change(0, "nan"), INPUT, ["line 5: base_from_flange_x_mm is 'nan'"]),
         (None, change(1, ""), INPUT, ["line 5: base_from_flange_y_mm is ''"]),
-        (inverted, None, INPUT, ["contradict each other", "if these are board_from_camera, rename"]),
+        (inverted, None, INPUT, ["contradict each other", "either these are board_from_camera: rename"]),
         (in_metres, None, INPUT, ["if they are metres, name the columns x_m"]),
     ],
 )

@@ -110,8 +110,8 @@ def simulate(
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     body_seed: Annotated[
         int | None,
-        "Draw the errors of target, camera and the board of --one-board with this seed: another --seed then "
-        "photographs the same ones again. That of --seed if not given.",
+        "Draw the errors of target, camera and the board of --one-board with this seed, to photograph the same ones "
+        "again with another --seed. If not given, it is that of --seed.",
         Opt(min=0, max=MOST_SEED),
     ] = None,
     margin: PlateMargin = 15.0,

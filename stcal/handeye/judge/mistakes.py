@@ -85,9 +85,8 @@ def check_conventions(
             convention = _best(as_read, typical_of_variant)[1]
         if convention is not None:
             turn, shift = typical_of_variant[convention]
-            raise InputError(
-                "E-HANDEYE-CONVENTION", f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm {convention}"
-            )
+            but = f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm "
+            raise InputError("E-HANDEYE-CONVENTION", f"{but}{_with_its_like(convention, typical_of_variant)}")
         inverted = next(each for each in variants if each.startswith(INVERTED))
         if gain[inverted] > DOUBTFUL and as_read[1] > typical_of_variant[inverted][1]:
             turn, shift = typical_of_variant[inverted]
@@ -151,9 +150,25 @@ def _best(as_read: tuple[float, float], typical: dict[str, tuple[float, float]])
     return gain, best if better else None
 
 
+def _with_its_like(convention: str, typical: dict[str, tuple[float, float]]) -> str:
+    """Returns the convention, and the readings of angles that leave the same residuals: how they were read tells which
+    one it is."""
+    start, angles, first = convention.partition(OTHER_ANGLES)
+    if not angles:
+        return convention
+    residuals = np.array(typical[convention])
+    like = [
+        each.removeprefix(start + angles)
+        for each, other in typical.items()
+        if each.startswith(start + angles) and np.allclose(other, residuals, rtol=1e-3) and each != convention
+    ]
+    return start + angles + ", ".join([first, *like])
+
+
 ANGLES = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "rotvec")
 """Orders of axes, fixed (xyz …) or turned (ZYX …), whose angles are mixed up with one another or with rotation vectors,
 by the names that --rotation has for them; the most frequent first."""
+OTHER_ANGLES = " angles in another convention: "
 
 
 def _other_angles(loop: Loop, by_images: bool) -> dict[str, Loop]:
@@ -165,10 +180,7 @@ def _other_angles(loop: Loop, by_images: bool) -> dict[str, Loop]:
         read = poses.inverse() if inverted else poses
         for one, other in permutations(ANGLES, 2):
             meant = Poses(_of_angles(_angles_of(read.rotation, one), other), read.translation)
-            key = (
-                f"with the {side}'s angles, if they were read as {one}, taken as {other}: give --rotation "
-                f"{role}={other}-deg (or -rad), or name the columns so"
-            )
+            key = f"with the {side}'s{OTHER_ANGLES}--rotation {role}={other}-deg (or -rad) if they were read as {one}"
             variants[key] = _with_side(loop, side, meant.inverse() if inverted else meant)
     return variants
 
@@ -221,7 +233,7 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         "; or images are mirrored: use them as taken" if by_images else ""
     )
     variants = {
-        f"{INVERTED}: if these are {named}, {NAMED}; if all are named rightly, give --setup {kind}": (
+        f"{INVERTED}: either these are {named}: {NAMED}; or all are named rightly, and --setup is {kind}": (
             replace(loop, camera_from_board=eye.inverse())
         ),
         **_other_units(loop, by_images),

@@ -475,8 +475,8 @@ def _errors(result: Identified) -> dict[str, np.ndarray]:
     if result.held_out is not None:
         errors[f"held out, {result.held_out.folds} folds"] = result.held_out.position_mm
     if result.predicted is not None:
-        errors["σ, the same rows"] = result.predicted.here_mm
-        errors["σ, over the joints' ranges"] = result.predicted.ranges_mm
+        errors["σ of the position, the same rows"] = result.predicted.here_mm
+        errors["σ of the position, over the joints' ranges"] = result.predicted.ranges_mm
     return errors
 
 

@@ -1,12 +1,12 @@
 """Start of an identification: base and tools fitted with the nominal axes; refuses data that do not fit the robot."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain, combinations, product
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
@@ -32,6 +32,8 @@ to the data, the valley is flat, and the misfit shows it."""
 STILL_MM = 0.01
 QUARTERS_DEG = (90, -90, 180)
 """Errors of a joint's zero that conventions of a robot's home position cause."""
+ZERO_STEP_DEG = 30
+"""Step at which other errors of a joint's zero are looked for; between two steps there is one minimum."""
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
@@ -80,8 +82,8 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
             raise InputError(
                 "E-IDENTIFY-MISFIT",
                 f"{data.where}: robot {robot.name} as its file stands misses the measurements by {misfit:.3g} mm RMS, "
-                f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; it fits with base and tool fitted to them "
-                "(base-tool)",
+                f"{FITS * extent:.3g} mm allowed, {FITS:.0%} of their spread; it fits with base and tool fitted to "
+                "them (base-tool)",
             )
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
@@ -277,10 +279,11 @@ def _points_of_distances(
 def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
     """Raises an error that says what is wrong with the data, or with the robot file."""
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
-    says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
+    says += f"{FITS * extent:.3g} mm allowed, {FITS:.0%} of their spread; "
     thinned = _thinned(data)
     singles = chain([("", robot, data)], _guesses(robot, thinned), _arms(robot, thinned), _late(robot, data))
-    for guesses in (singles, _elsewhere(robot, data, tools), _pairs_of_mistakes(robot, thinned)):
+    others = _elsewhere(robot, data, tools), _any_zero(robot, thinned, tools), _pairs_of_mistakes(robot, thinned)
+    for guesses in (singles, *others):
         fitting = []
         for reason, variant, guess in guesses:
             try:
@@ -379,6 +382,10 @@ def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
     n = len(robot.rows)
     yield from _other_convention(robot, data)
     yield from _zeros(robot, data)
+    angles = np.array([[row.alpha, row.theta] for row in robot.rows])
+    if angles.any() and np.abs(angles).max() <= np.radians(2 * np.pi):
+        rows = tuple(replace(row, alpha=np.degrees(row.alpha), theta=np.degrees(row.theta)) for row in robot.rows)
+        yield "angles of the robot file were radians; write them in degrees", replace(robot, rows=rows), data
     for i, k in combinations(range(n), 2):
         if n > MOST_JOINTS or robot.joints[i].type != robot.joints[k].type:
             continue
@@ -430,6 +437,23 @@ def _zeros(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measu
             yield reason, replace(robot, rows=_turned(robot.rows, {i: turn})), data
 
 
+def _any_zero(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Yields the turn of each inner joint's zero that fits best, whatever its size."""
+    for i in _inner(robot):
+
+        def misfit(turn: float, i: int = i) -> float:
+            return _placed(replace(robot, rows=_turned(robot.rows, {i: turn})), data, tools)[1]
+
+        try:
+            start_deg = min(range(-180, 180, ZERO_STEP_DEG), key=misfit)
+            ends = start_deg - ZERO_STEP_DEG, start_deg + ZERO_STEP_DEG
+            turn = float(minimize_scalar(misfit, bounds=ends, method="bounded", options={"xatol": 0.02}).x)
+        except (DegenerateError, ConvergenceError):
+            continue
+        reason = f"theta of joint {i + 1} were larger by {turn:+.1f}°; correct theta_deg, or the joint's zero"
+        yield reason, replace(robot, rows=_turned(robot.rows, {i: turn})), data
+
+
 def _signs(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
     for i in range(n := len(robot.rows)):
         reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
@@ -455,7 +479,7 @@ def _inner(robot: Robot) -> list[int]:
     return [i for i in range(1, len(robot.rows) - 1) if robot.joints[i].type == "revolute"]
 
 
-def _turned(rows: tuple[DHRow, ...], turns_deg: dict[int, int]) -> tuple[DHRow, ...]:
+def _turned(rows: tuple[DHRow, ...], turns_deg: Mapping[int, float]) -> tuple[DHRow, ...]:
     """Returns the rows with θ larger by these angles."""
     return tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in enumerate(rows))
 

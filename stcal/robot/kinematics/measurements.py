@@ -295,6 +295,12 @@ def _in_reach(data: Measurements, robot: Robot) -> None:
     away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
     reach = max(reach_mm(robot, tool) for tool in robot.tools)
     worst = int(away.argmax())
+    if (usual := float(np.median(away))) > 2 * reach + LONGEST_TOOL_MM:
+        raise InputError(
+            "E-MEASURED-REACH",
+            f"{data.where}: positions are {usual:.4g} mm from their middle (median), robot {robot.name} reaches "
+            f"{reach:.4g} mm; correct the unit of x, y, z: are these mm, in columns of another unit?",
+        )
     if away[worst] > 2 * reach + LONGEST_TOOL_MM:
         raise InputError(
             "E-MEASURED-REACH",

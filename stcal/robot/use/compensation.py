@@ -537,7 +537,7 @@ def compensated_summary(result: Compensated) -> list[str]:
         before, after = result.before_mm[both], max(result.found.error_mm[both].max(), LEAST_SHOWN_MM)
         lines.append(
             f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
-            f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less, by the same robot: the real one "
-            "misses by the error of held-out rows that identify states"
+            f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less. The real robot errs by more: by "
+            "about the error of rows held out that identify stated"
         )
     return lines

@@ -101,7 +101,9 @@ def verification_report(result: Verification) -> Document:
 
 def _percent(less: float) -> str:
     """Returns by how much a figure is less, per cent; none where the first one is 0."""
-    return f"{less:.1f} %" if np.isfinite(less) else NONE
+    if not np.isfinite(less):
+        return NONE
+    return f"{less:.1f} %" if less >= 0 else f"{-less:.1f} % more"
 
 
 def compensation_report(result: Compensated, robot: Robot) -> Document:
@@ -362,7 +364,7 @@ def _wrong(result: Evaluation) -> list[str]:
     more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
     fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
     return [
-        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; the rows are "
+        f"rows that no robot explains (the least error that any of them leaves): {named}{more}{fitted}; the rows are "
         "wrong, or all models lack something"
     ]
 

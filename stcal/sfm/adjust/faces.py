@@ -268,8 +268,8 @@ def _fitted(face: FaceDesign, circles: Sequence[str], xyz: np.ndarray) -> Poses:
     if spread[1] <= 1e-6 * spread[0]:
         raise DegenerateError(
             "E-FACE-FRAME-CIRCLES",
-            f"face {face.id}: {len(design)} of its corners mapped, {MIN_KNOWN} off one line needed; add views that "
-            "show it",
+            f"face {face.id}: {len(design)} of its corners mapped, {MIN_KNOWN} needed that are not on one "
+            "line; add views that show it",
         )
     middle = xyz.mean(1)
     rotation, _ = best_rotations(np.einsum("kni,nj->kij", xyz - middle[:, None], design - design.mean(0)))

@@ -255,8 +255,8 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
             surface = "the board" if key == "board" else f"face {key}"
             raise MappingError(
                 "E-GROUP-FEW-CIRCLES",
-                f"group {model.group}: {surface}: {len(members)} circles mapped, 3 off one line needed for its plane; "
-                f"add views that show {surface}",
+                f"group {model.group}: {surface}: {len(members)} circles mapped, 3 needed for its plane that are not "
+                f"on one line; add views that show {surface}",
             ) from error
     radius = np.array([radius_mm[label] for label in model.labels]) / mm_per_unit
     rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]

@@ -270,8 +270,8 @@ def _what_u_is(file: BudgetFile) -> str:
         f"The expanded uncertainty U is the combined standard uncertainty multiplied by the coverage factor k = {k}, "
         "which for a normal distribution gives a coverage probability of about 95 % (JCGM 100:2008, GUM). U of x, of y "
         f"or of z is of that axis alone: {k} times its σ in the run and in what is stated. U of a position is "
-        f"{k} times the root of the three variances together; a sphere of that radius covers more than 95 %, how much is said in "
-        "the tables"
+        f"{k} times the root of the three variances together; a sphere of that radius covers more than 95 %, as the "
+        "coverage in the tables says"
     )
 
 

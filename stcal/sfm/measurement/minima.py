@@ -133,7 +133,7 @@ def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int
     xy = (plane_from_target @ problem.xyz[rows])[:, :2]
     long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
     if broad < MIN_BREADTH * long:
-        return f"{len(rows)} circles, {MIN_CIRCLES} off one line needed"
+        return f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line"
     try:
         homography = fit_homography(xy, problem.centre[rows])
     except DegenerateError as error:

@@ -139,7 +139,7 @@ def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, 
         return ()
     why = f"and the board only {board:.0f} mm off the base's origin" if exchanged else "farther than brackets reach"
     said = (
-        f"the camera is {away:.0f} mm off the flange, {why}, and no residual tells the setup: "
+        f"the camera is {away:.0f} mm off the flange, {why}, and residuals are the same in both setups: "
         f"{'name the columns x_mm … if lengths are mm that stand in columns of metres; ' if away > HALL_MM else ''}"
         "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
     )

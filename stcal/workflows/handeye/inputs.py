@@ -307,7 +307,8 @@ def _require_unsaid(statements: Said, where: str) -> None:
         raise InputError(
             "E-OPTION-NEEDS",
             f"{where}: the names of columns state unit and rotation; leave {', '.join(statements.options())} out, and "
-            "rename columns that are wrong (x_m in place of x_mm)",
+            "rename columns that are wrong (base_from_flange_x_m in place of …_x_mm, board_from_camera_x_mm in place "
+            "of camera_from_board_x_mm)",
         )
 
 

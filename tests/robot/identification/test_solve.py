@@ -374,7 +374,7 @@ def test_a_common_scale_of_all_lengths_is_no_robot():
     grown = replace(data, positions=1.01 * data.points())
     notes = [" ".join(identify(mh80(), each, QUICK).notes) for each in (data, grown)]
     assert "all lengths of the robot are" not in notes[0]
-    assert re.search(r"all lengths of the robot are 1\.0(09|10)\d+ ±", notes[1])
+    assert re.search(r"all lengths of the robot are 1\.0(08|09|10|11)\d+ ±", notes[1])
 
 
 def test_joint_values_that_were_rounded_gain_nothing_and_say_so():
@@ -383,3 +383,22 @@ def test_joint_values_that_were_rounded_gain_nothing_and_say_so():
     notes = [" ".join(identify(mh80(), each, IdentifyOptions(repeats=1)).notes) for each in (data, rounded)]
     assert "no gain" not in notes[0]
     assert "no gain: rows held out err by" in notes[1]
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        ({2: -np.radians(30)}, "theta of joint 3 were larger by [+]30"),
+        ({1: np.radians(10)}, "theta of joint 2 were larger by -(9|10)"),
+    ],
+)
+def test_a_zero_that_is_off_by_any_angle_is_named(spoilt, said):
+    rows = tuple(replace(row, theta=row.theta + spoilt.get(i, 0.0)) for i, row in enumerate(mh80().rows))
+    with pytest.raises(InputError, match=f"it would fit if .*{said}"):
+        identify(replace(mh80(), rows=rows), simulated(35, 40)[1], QUICK)
+
+
+def test_angles_of_the_robot_file_in_radians_are_named():
+    rows = tuple(replace(row, alpha=np.radians(row.alpha), theta=np.radians(row.theta)) for row in mh80().rows)
+    with pytest.raises(InputError, match="it would fit if angles of the robot file were radians"):
+        identify(replace(mh80(), rows=rows), simulated(36, 40)[1], QUICK)

@@ -138,7 +138,7 @@ def test_wrong_rows_are_named_and_not_fitted_to():
     assert own.errors_mm[~result.wrong] == pytest.approx(clean.errors_mm, abs=1e-6)
     assert own.errors_mm[7] == pytest.approx(30, abs=0.5)
     text = evaluation_report(result).text()
-    assert "no robot explains, with the least error that one leaves: line 9 (" in text
+    assert "rows that no robot explains (the least error that any of them leaves): line 9 (" in text
     assert "line 22 (" in text
     plain, robust = (line.split() for line in text.splitlines() if line.startswith(("true  ", "true, ")))
     assert plain[1] == "40"
