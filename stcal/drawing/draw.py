@@ -99,6 +99,21 @@ def net_for(target: TargetDesign, paper: str) -> list[Part]:
     return few if any(sheet.cuts for sheet in paper_sheets(small, paper, "")) else small
 
 
+def net_text(target: TargetDesign, paper: str = "A4") -> str:
+    """Return how large the net of a body is, and how many sheets of a paper it takes."""
+    whole = net_parts(target)
+    sizes = [" × ".join(said_mm(side) for side in np.ptp(part.outline, axis=0)) for part in whole]
+    count = len(paper_sheets(net_for(target, paper), paper, ""))
+    room = "" if count == len(whole) else f", as a sheet has room for {_room(paper)}"
+    return f"net to fold, {', '.join(sizes)} mm: {count} sheet{'s' * (count > 1)} of {paper}{room}"
+
+
+def _room(paper: str) -> str:
+    """Return the room that a sheet has for parts and their dimensions."""
+    room = [said_mm(side - margin) for side, margin in zip(PAPERS[paper], FURNITURE, strict=True)]
+    return f"{' × '.join(room)} mm"
+
+
 def load_design(path: str | Path) -> Design:
     """Read a target, or a board or boards of any kind."""
     if not Path(path).exists():
@@ -183,15 +198,14 @@ def drawn_text(drawn: Drawn) -> str:
         lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
     if bare := sum(sheet.bare for sheet in drawn.sheets):
         which = "the sheet is" if sheets == 1 else f"{bare} of {sheets} sheets are"
-        lines.append(f"{which} without dimensions and table, with which more would be needed")
+        lines.append(f"{which} without dimensions and table, which would take more sheets")
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
         single = ", or one by one without --net" if drawn.parts[0].name.startswith("net") else ""
         through = ", the worse as one runs through a pattern" if any(sheet.cuts for sheet in drawn.sheets) else ""
-        room = [said_mm(side - margin) for side, margin in zip(PAPERS[drawn.paper], FURNITURE, strict=True)]
         lines.append(
-            f"a sheet of {drawn.paper} has room for {' × '.join(room)} mm, either way round, dimensions included; "
+            f"a sheet of {drawn.paper} has room for {_room(drawn.paper)}, either way round, dimensions included; "
             f"parts that are glued of several sheets are off at the seams{through}: state it in sigma_mm, or "
             f"{larger}{single}"
         )

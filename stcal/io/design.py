@@ -144,21 +144,32 @@ class _CornerFile(Strict):
 
 Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
 LEAST_PPM = 1e-3
-"""Smallest expansion in ppm/K, or σ of a pitch in ppm, that anyone can state: less is one in 1/K, or a fraction."""
+"""Smallest expansion in ppm/K that anyone can state: less is one in 1/K."""
+LEAST_PITCH_PPM = 0.1
+"""Smallest σ of a pitch in ppm that anyone can state, 5 nm of 50 mm: less is a fraction, per cent, or mm."""
+LEAST_C, MOST_C = -100.0, 200.0
 
 
-def _in_ppm(value: float, per: str = "/K", fraction: str = " 1/K") -> float:
-    if 0 < abs(value) < LEAST_PPM:
+def _in_ppm(value: float, per: str = "/K", fraction: str = " 1/K", least: float = LEAST_PPM) -> float:
+    if 0 < abs(value) < least:
+        percent = "" if per else f", and in % {1e4 * value:g}"
         raise ValueError(
-            f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}; 0 or at least {LEAST_PPM:g} needed"
+            f"in ppm{per}, so that {value:g}{fraction} is {1e6 * value:g}{percent}; 0 or at least {least:g} needed"
         )
+    return value
+
+
+def _in_celsius(value: float) -> float:
+    if not LEAST_C <= value <= MOST_C:
+        kelvin = f"; {value:g} K are {value - 273.15:g} °C" if LEAST_C <= value - 273.15 <= MOST_C else ""
+        raise ValueError(f"in °C, {LEAST_C:g} to {MOST_C:g} possible{kelvin}")
     return value
 
 
 Expansion = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True), AfterValidator(_in_ppm)]
 ExpansionSigma = Annotated[Ppm, AfterValidator(_in_ppm)]
-PitchSigma = Annotated[Ppm, AfterValidator(lambda value: _in_ppm(value, "", " as a fraction"))]
-Celsius = Annotated[float, Field(ge=-100, le=200, allow_inf_nan=False, strict=True)]
+PitchSigma = Annotated[Ppm, AfterValidator(lambda value: _in_ppm(value, "", " as a fraction", LEAST_PITCH_PPM))]
+Celsius = Annotated[float, Field(allow_inf_nan=False, strict=True), AfterValidator(_in_celsius)]
 Kelvin = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)]
 
 

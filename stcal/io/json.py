@@ -58,7 +58,8 @@ def first_mistake(
     else:
         shown = " ".join(repr(first["input"]).split())
         shown = shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…"
-        code, reason = "E-KEY-VALUE", f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        said = first["msg"].removeprefix("Value error, ")
+        code, reason = "E-KEY-VALUE", f"{shown}: {said[0].lower()}{said[1:]}"
     unknown = _unknown_beside(error) if code == "E-KEY-MISSING" else []
     if unknown:
         reason += f"; unknown key {', '.join(unknown)} in its place, perhaps misspelt"

@@ -67,6 +67,7 @@ from stcal.sfm.runs.solve import (
     ungrouped,
     unknown_face_notes,
     unseen_board,
+    unseen_circles,
     usable_groups,
     wrong_file,
 )
@@ -499,6 +500,7 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
             *not_as_drawn(calibration.target.target_from_face, target),
             *(misnamed_groups(observations, target) if board.rows else ()),
             *unseen_board(solutions, board),
+            *unseen_circles(solutions, target),
         ),
     )
 

@@ -402,6 +402,7 @@ def design(
 ) -> None:
     """Make a target for a box, with circles that identify each face even if any three are hidden; or make a cube or
     dodecahedron of tags. Forecast its σ."""
+    from stcal.drawing.draw import net_text
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make.design import DesignOptions, design_tag_body, design_target, made_text
@@ -434,6 +435,8 @@ def design(
             say(f"board: {board_in_words(made.board)}")
     elif made.forecast is not None:
         say(body_text(made.target, made.forecast.setup.camera, distance))
+    if tags is not None:
+        say(net_text(made.target))
     for path in made.files:
         say(path)
     if made.forecast is not None:

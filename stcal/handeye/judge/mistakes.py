@@ -244,7 +244,8 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         ("above", "board's", slice(-1), slice(1, None)),
     ):
         variants[
-            f"with each pose of the board beside that of the flange one row {which}: move the {late} side up by one row"
+            f"with each pose of the board beside that of the flange one row {which}: move the {late} poses up by one "
+            "row, or the names of their images"
         ] = Loop(hand[robot_rows], eye[board_rows], loop.inverted)
     for reading in (*ORDERS, CONJUGATED):
         robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)

@@ -213,9 +213,10 @@ def _of_share(outcome: Outcome) -> Finding | None:
         return None
     distance, sigma, shift = share
     share_of_transform, word = sigma**2 / (sigma**2 + shift**2), _word(sigma**2 / (sigma**2 + shift**2), HALF, MOST)
+    alone = "" if outcome.result.common_covariance is None else ", without what all poses err by in common,"
     said = (
-        f"σ of {FRAMES[outcome.result.setup].camera} is {sigma:.2g} mm where the board was ({distance:.0f} mm away), "
-        f"the error of a single pose {shift:.2g} mm (RMS)"
+        f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was ({distance:.0f} mm "
+        f"away), the error of a single pose {shift:.2g} mm (RMS)"
     )
     remedy = "take more poses, and turn the flange more, about two axes" if word != GOOD else ""
     return Finding("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
@@ -235,8 +236,8 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
     distance, sigma, shift = share
     word: Word = CARE if sigma > shift else GOOD
     said = (
-        f"of the σ of {FRAMES[outcome.result.setup].camera}, {sigma:.2g} mm where the board was ({distance:.0f} mm "
-        "away) come from errors that all poses of the board have in common"
+        f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
+        f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
     )
     remedy = "calibrate the camera better, or solve from the images: more poses do not help" if word != GOOD else ""
     return Finding(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)

@@ -284,7 +284,7 @@ def misgivings(result: Identified, nominal: Robot) -> tuple[str, ...]:
     lengths = np.array([[row.a, row.d] for row in nominal.rows]).ravel()
     changes = np.array([[row.a, row.d] for row in result.robot.rows]).ravel() - lengths
     square, free = float(lengths @ lengths), len(lengths) - 1
-    if square > 0 and result.seen.kind != "distance" and (changes != 0).sum() >= LEAST_LENGTHS:
+    if square > 0 and (changes != 0).sum() >= LEAST_LENGTHS:
         scale = float(lengths @ changes) / square
         rest = float(np.linalg.norm(changes - scale * lengths)) / np.sqrt(free * square)
         if abs(scale) > LEAST_SCALE and 2 * t_distribution.sf(abs(scale) / max(rest, 1e-15), free) < BY_CHANCE:

@@ -495,6 +495,9 @@ def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Mea
         reason = f"lengths are {words} in columns of mm; call the columns x_{unit} … or distance_{unit}"
         scaled = {name: LENGTHS[unit] * values for name, values in lengths.items() if values is not None}
         yield reason, robot, replace(data, **scaled)
+        reason = f"lengths are mm in columns of {words}; call the columns x_mm … or distance_mm"
+        scaled = {name: values / LENGTHS[unit] for name, values in lengths.items() if values is not None}
+        yield reason, robot, replace(data, **scaled)
     reason = "all joint values had the opposite sign; check the rows and the joints' directions"
     yield reason, robot, replace(data, q=np.where(turning, -q, q))
     yield from _signs(robot, data)

@@ -313,6 +313,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     if nominal is None:
         return _without_nominal(identified, targets)
     apart, rigid, roles = robots_apart(identified, nominal), _rigid(identified, targets), _roles(identified, nominal)
+    radians = _in_radians(targets, identified.prismatic)
     identified, nominal, others = _with_one_tool(identified, nominal, targets)
     confirmed, doubts = on_targets(nominal, targets)
     poses = poses_of(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
@@ -331,11 +332,12 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         sliding=identified.prismatic,
         reach_mm=reach_mm(identified, targets.tools[0]),
         beyond=stay.beyond,
-        doubts=((apart,) if apart else ()) + roles + doubts + others + rigid,
+        doubts=(*((apart,) if apart else ()), *roles, *radians, *doubts, *others, *rigid),
         controller=nominal,
     )
 
 
+FEW_ROWS = 3
 ROUND_MM = 0.01
 """Lengths as drawn are multiples of this."""
 
@@ -358,6 +360,18 @@ def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
             "the model in the controller",
         )
     return ()
+
+
+def _in_radians(targets: Targets, sliding: np.ndarray) -> tuple[str, ...]:
+    """Returns a doubt if joint values without poses are all as small as radians are that were taken for degrees."""
+    if targets.poses is not None or targets.q is None or len(targets.q) < FEW_ROWS or sliding.all():
+        return ()
+    most = float(np.degrees(np.abs(targets.q[:, ~sliding]).max()))
+    if most > 2 * np.pi:
+        return ()
+    return (
+        f"joint values are {most:.3g}° at most, as of radians in columns of degrees: if so, call the columns q1_rad …",
+    )
 
 
 def _same_tools(one: Robot, other: Robot) -> bool:

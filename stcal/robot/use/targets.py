@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
@@ -331,6 +332,11 @@ def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Ite
     turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
     reason = "joint values were radians in columns of degrees; call the columns q1_rad …"
     yield reason, poses, poses_of(robot, targets, turned)
+    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+        if (order, signs) != ((0, 1, 2), (1, 1, 1)):
+            names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))
+            reason = f"x, y, z were {names}; correct order and signs of the columns of positions"
+            yield reason, Poses(poses.rotation, poses.translation[:, order] * signs), reached
     paired = _paired(targets, poses, reached, reach_mm(robot))
     if paired is not None:
         yield "joint values stood in other rows; give each pose its own", poses, paired

@@ -31,8 +31,10 @@ are compared with all."""
 OFF, OFF_MM, LEAST_TO_COMPARE = 6.0, 0.1, 6
 """How many times as much as that of most poses one's typical distance error must be, and how large, to name the pose;
 and smallest number of poses in which that is looked for."""
-WORSE = 1.2
-"""How many times as much as the first set another may err without a warning."""
+NO_BETTER, WORSE = 0.8, 1.2
+"""How many times as much as the first set another errs about as it does, and more than it does."""
+MOST_OF_IT = 0.75
+"""Share of the squared errors of distances from which on their scale is named."""
 LEAST_SPREAD_MM = 20.0
 """Largest commanded distance below which the unit is doubted."""
 SCALE_WITHIN = 0.005
@@ -139,6 +141,12 @@ class SetResult:
             f"pairs), {allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
         )
 
+    def by_scale(self) -> bool:
+        """Returns whether most of the squared errors are those of one scale."""
+        return (
+            (self.scale - 1) * self.pairs_mm
+        ) ** 2 > MOST_OF_IT * self.pairs_rms_mm**2 and self.pairs_rms_mm > OFF_MM
+
     def figures(self) -> dict[str, float]:
         """Returns the figures that are compared between sets, mm."""
         return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
@@ -178,12 +186,24 @@ class Verification(Brief):
                 f"commanded positions lie within {most:.3g} mm of the first one; if lengths are in another unit than "
                 "the names of their columns say, correct these"
             )
+        for each in self.sets:
+            if not each.doubt() and each.by_scale():
+                found.append(
+                    f"set {each.name}: measured distances are {each.scale:.5f} times the commanded ones, which is most "
+                    "of their error: check the instrument's scale"
+                )
         for each in self.sets[1:]:
+            if NO_BETTER * first.pairs_rms_mm < each.pairs_rms_mm <= WORSE * first.pairs_rms_mm and not each.doubt():
+                found.append(
+                    f"set {each.name} errs as set {first.name} does, {each.pairs_rms_mm:.3g} against "
+                    f"{first.pairs_rms_mm:.3g} mm (RMS of all pairs): were these positions commanded with compensated "
+                    "joint values, and was --robot of compensate the file of identify?"
+                )
             if each.pairs_rms_mm > WORSE * first.pairs_rms_mm and not each.doubt():
                 found.append(
                     f"set {each.name} errs more than set {first.name}, the first in the file, {each.pairs_rms_mm:.3g} "
-                    f"against {first.pairs_rms_mm:.3g} mm (RMS of all pairs): the first is to be the one before "
-                    "compensation"
+                    f"against {first.pairs_rms_mm:.3g} mm (RMS of all pairs): were the sets exchanged? The one before "
+                    "compensation comes first"
                 )
         return found
 

@@ -396,6 +396,29 @@ def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
 
+USUAL_K, USUAL_SIGMA_K, USUAL_EXPANSION = 25.0, 10.0, 250.0
+"""Distance from 20 °C, σ of a temperature, K, and expansion, ppm/K, beyond which a statement is asked about: rooms are
+nearer, thermometers better, and plastics expand less."""
+
+
+def _unusual(statement: Statement) -> list[str]:
+    """Returns questions about statements that are possible, and as unusual as those in another unit."""
+    asked = []
+    for body, size in (("board", statement.board), ("target", statement.target)):
+        if size.temperature_c is not None and abs(size.temperature_c - REFERENCE_C) > USUAL_K:
+            fahrenheit = (size.temperature_c - 32) / 1.8
+            asked.append(
+                f"the {body}'s temperature is {size.temperature_c:g} °C: or °F, which were {fahrenheit:.1f} °C?"
+            )
+        if (size.temperature_sigma_k or 0.0) > USUAL_SIGMA_K:
+            asked.append(f"σ of the {body}'s temperature is {size.temperature_sigma_k:g} K: is that its value?")
+        if abs(size.expansion_ppm_per_k or 0.0) > USUAL_EXPANSION:
+            asked.append(
+                f"the {body} expands by {size.expansion_ppm_per_k:g} ppm/K, more than plastics do: is that so?"
+            )
+    return asked
+
+
 def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     unknown = [source.title for source in budget.sources if source.origin == "not stated"]
@@ -410,8 +433,8 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
     elif budget.conditions.correction and not is_refused(run):
         ppm = PPM * budget.conditions.correction
         notes.append(
-            f"for the stated expansion lengths of the run are to be changed by {ppm:+.1f} ppm; "
-            "this is not done in faces.json, and the expanded uncertainties hold for corrected lengths"
+            f"for the stated expansion, lengths in faces.json are still to be changed by {ppm:+.1f} ppm; the tables "
+            "here have them changed, and U holds for these"
         )
     failed = _failed(run)
     if failed:
@@ -435,9 +458,10 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
             "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured "
             "both (one_thermometer of the statement), U is too large"
         )
+    notes += _unusual(budget.statement)
     notes += verified.said()
     notes.append(
-        "the reference face's frame is the target frame and carries no uncertainty; what its own points do not tell "
-        "is in the other faces"
+        "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
+        "the frame is in the poses of the other faces"
     )
     return notes

@@ -349,7 +349,7 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         if (
             source.key == "intrinsics" and source.origin == "estimated" and none
         ):  # what they do is in the rows of the centres, with which they were adjusted
-            parts = ["in the others"] * len(parts)
+            parts = ["in the other rows"] * len(parts)
         rows.append(
             [source.title, slope, *("–" if source.origin == "not stated" else contribution for contribution in parts)]
         )

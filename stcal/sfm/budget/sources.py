@@ -101,11 +101,15 @@ def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, 
 
 
 def _require_past(text: str, where: str) -> None:
-    """Checks that the date of a calibration, if it is written as ISO 8601 has it, is not in the future."""
+    """Checks that the date of a calibration, if there is one, is of ISO 8601 and not in the future."""
+    if not text.strip():
+        return
     try:
         day = datetime.fromisoformat(text.strip()).date()
-    except ValueError:
-        return
+    except ValueError as error:
+        raise InputError(
+            "E-OPTION-VALUE", f"{where}: date {text}: no date as YYYY-MM-DD (ISO 8601); write it so"
+        ) from error
     if day > date.today() + timedelta(days=1):  # in some time zone it is tomorrow
         raise InputError("E-OPTION-VALUE", f"{where}: date {text}: in the future; give the date of the calibration")
 

@@ -311,8 +311,8 @@ def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile]
     if not views:
         raise DetectionError(
             "E-BOARD-NOT-FOUND",
-            f"camera: no board recognised in {len(files)} images{why}; check the board file (rows, columns, polarity, "
-            "radius) and keep a third of the dots in view at least",
+            f"camera: no board recognised in {len(files)} images{why}; check the board file (rows, columns, "
+            "corner, polarity, radius) and keep a third of the dots in view at least",
         )
     raise DegenerateError(
         "E-CALIBRATE-FEW-VIEWS",

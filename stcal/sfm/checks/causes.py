@@ -70,15 +70,19 @@ class _Fitted:
     left: float
 
 
-def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = False) -> Check | None:
+def whole_set_cause(
+    networks: Sequence[Network], camera: Camera, moved: bool = False, from_file: bool = True
+) -> Check | None:
     """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals.
 
     The residuals beyond chance are those that the most flexible hypothesis explains. Of all hypotheses that explain
     ``EXPLAINS_ALL`` of it, less what chance may do, the one with fewest parameters is named.
 
-    ``moved`` : whether the target seems to have moved, and no few images are the culprits.
+    ``moved`` : whether the target seems to have moved, and no few images are the culprits; ``from_file`` : False if the
+    camera was found from the same photographs, so that no file can be wrong.
     """
-    fitted = [f for cause in _hypotheses(camera) if (f := _fit(cause, networks)) is not None]
+    possible = [cause for cause in _hypotheses(camera) if from_file or cause.direction is None]
+    fitted = [f for cause in possible if (f := _fit(cause, networks)) is not None]
     if not fitted:
         return None
     richest = max(fitted, key=lambda f: f.explained)

@@ -163,7 +163,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
             step(None)
     failed = any(check.verdict == "failed" for check in checks)
     moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
-    cause = evidence.cause or (whole_set_cause(networks, camera, moved) if failed else None)
+    cause = evidence.cause or (whole_set_cause(networks, camera, moved, evidence.camera_given) if failed else None)
     return (cause, *checks) if cause else tuple(checks)
 
 

@@ -29,6 +29,8 @@ right. Eccentricity makes 0.2."""
 OF_A_UNIT = 0.1
 """Largest relative deviation of a ratio of distances from the factor of another unit. Runs are off by a few per cent at
 worst."""
+FAR_BEYOND = 20.0
+"""Error over σ above which, in all poses, the truth is doubted."""
 MOST_LISTED = 20
 """Largest number of images that the table of poses has a row for."""
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
@@ -364,6 +366,8 @@ def poses_table(comparison: ComparePosesFile) -> str:
     text = text_table(rows)
     if more := len(errors) - len(worst):
         text.append(f"{more} poses with smaller errors of position: --json writes all")
+    if (values[:, 2] > FAR_BEYOND).all():
+        text.append("errors are far beyond σ in all poses: is this the truth of these photographs?")
     if unknown := comparison.not_in_truth:
         text.append(f"not in the truth: {', '.join(unknown[:3])}{' …' if len(unknown) > 3 else ''}")
     return "\n".join(text)

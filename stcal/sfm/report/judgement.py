@@ -249,6 +249,16 @@ def _by_result(report: dict) -> tuple[Use, str]:
     return "yes", f"Yes: {passed}{open_}."
 
 
+FEW_IMAGES = 6
+"""Number of photographs below which more of them are the first thing to do."""
+
+
+def _are_few(report: dict) -> bool:
+    """Returns whether too few photographs were used of a body that is its own setting, without groups."""
+    alone = all(group["name"] == TOP_GROUP for group in report["groups"])
+    return alone and report["summary"]["images_mapped"] < FEW_IMAGES
+
+
 def applies(verdict: str, remedy: str) -> bool:
     """Returns whether a check could be made or made possible: not one of circles or a board where there are none."""
     return verdict != "not possible" or bool(remedy)
@@ -516,7 +526,7 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
 
 def _source(report: dict, kind: str) -> tuple[str, str]:
     """Returns the name of a source other than the photographs that limits the result, and its remedy."""
-    few = "More photographs help little: "
+    few = "" if _are_few(report) else "More photographs help little: "
     if kind == "sizes":
         summary = report["summary"]
         given = "distances" in summary.get("scale_from", [])
@@ -525,7 +535,7 @@ def _source(report: dict, kind: str) -> tuple[str, str]:
             common = "all edges may have the same error, which no residual shows"
             return "The size, by the edges of tags", f"{few}{common}; {distance} with [[scale]] in target.toml."
         remedy = f"measure it better than size_sigma_mm says, or {distance} with [[scale]] in target.toml."
-        return "The size of the print", few + remedy
+        return "The size of the print", (few + remedy) if few else remedy[0].upper() + remedy[1:]
     remedies = {
         "board": ("The places of the board's dots", "measure them, or take a better plate, and state sigma_mm in "
                   "board.toml."),
@@ -538,12 +548,15 @@ def _source(report: dict, kind: str) -> tuple[str, str]:
                        "file."),
     }  # fmt: skip
     name, remedy = remedies[kind]
-    return name, few + remedy
+    return name, (few + remedy) if few else remedy[0].upper() + remedy[1:]
 
 
 def _more(report: dict, verdict: Use) -> list[str]:
     """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""
     advice = []
+    used, given = (report["summary"][key] for key in ("images_mapped", "images"))
+    if report["faces"] and _are_few(report):
+        advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
     if report["faces"] and (missing := report["summary"]["faces_not_seen"]):
         read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
         unseen = [face for face in missing if face not in read]

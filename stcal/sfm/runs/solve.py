@@ -141,6 +141,7 @@ def detected_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, l
 
 
 CACHE_VERSION = 7
+FEW_NAMED = 6
 SHOW_MORE = "show two faces of it at once, or one by more corners"
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
@@ -462,8 +463,7 @@ def solve_body(
         except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
             errors.append(error)
         else:
-            members = [image for image in group if image.name in refined.model.images]
-            missing = left_out(group, model, SHOW_MORE) | left_out(members, refined.model, SHOW_MORE)
+            missing = left_out(group, refined.model, SHOW_MORE) | left_out(group, model, SHOW_MORE)
             pair = pair_of_model(refined.model)
             outliers = (*gross.values(), *refined.outliers)
             solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers))
@@ -477,6 +477,21 @@ def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str
     """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
     dots = (label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
     return unseen_lines(dots, board.rows, board.columns)
+
+
+def unseen_circles(solutions: Sequence[GroupSolution], target: TargetDesign) -> list[str]:
+    """Returns a note on circles or corners of the faces in the result that no image shows as the design has them."""
+    mapped = {label for s in solutions for label in s.model.labels}
+    faces = {label.plane for label in mapped}
+    every = (label for face in target.faces if face.id in faces for label in face.labels())
+    missing = [str(label) for label in every if label not in mapped]
+    if not missing:
+        return []
+    named = ", ".join(missing[:FEW_NAMED]) + (" …" if len(missing) > FEW_NAMED else "")
+    return [
+        f"{named}: not in the result, as too few images show {'it' if len(missing) == 1 else 'them'} as drawn; check "
+        "radius and place in target.toml, unless something hides it"
+    ]
 
 
 def solve_groups(

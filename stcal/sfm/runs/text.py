@@ -243,11 +243,14 @@ def _faces(result: RunResult) -> Iterator[str]:
             yield f"read and left out, of {len(images)} images: face {face}"
         elif face in seen:
             images = sum(any(x.plane == face for x in i.observations.labels) for i in result.labelled)
-            what = (
-                "1 image; 2 needed, better 5"
-                if images == 1
-                else f"{images} images, but by too few points for its frame"
-            )
+            used = {name for solution in result.solutions for name in solution.model.images}
+            shown = [i.observations for i in result.labelled if any(x.plane == face for x in i.observations.labels)]
+            if images == 1:
+                what = "1 image; 2 needed, better 5"
+            elif not used.intersection(image.name for image in shown):
+                what = f"{images} images, which were left out"
+            else:
+                what = f"{images} images, but by too few points for its frame"
             yield f"face {face} is not in the result: seen in {what}"
     if unseen := [face for face in absent if face not in seen and not images_left_out(face, notes)]:
         yield f"not seen in any image: face{'' if len(unseen) == 1 else 's'} {', '.join(unseen)}"

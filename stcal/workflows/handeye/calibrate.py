@@ -17,7 +17,7 @@ from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
 from stcal.handeye.judge.mistakes import HALL_MM, repair
-from stcal.handeye.judge.remarks import Grave, SizeDoubt
+from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt
 from stcal.handeye.pipeline import Validated, validated
 from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.result import HandEye
@@ -122,6 +122,18 @@ def calibrate_handeye(
     return with_offset(calibrate(given, setup, method, options, validation, told, time_offset), offset)
 
 
+def _of_no_covariance(given: HandEyeInput, result: HandEye) -> tuple[str, ...]:
+    """Returns a note where the board's poses state no σ: what they all err by in common shows in no residual."""
+    if given.views is not None or given.pairs.camera_from_board_covariance is not None or result.covariance is None:
+        return ()
+    return (
+        Aside(
+            "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the "
+            "board's size, is not in σ; `measure` writes it (columns cov_… and common…)"
+        ),
+    )
+
+
 FAR_MM, TOO_FAR_MM = 600.0, 1000.0
 """Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
 stated; brackets are shorter."""
@@ -142,6 +154,7 @@ def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, 
         f"the camera is {away:.0f} mm off the flange, {why}, and residuals are the same in both setups: "
         f"{'name the columns x_mm … if lengths are mm that stand in columns of metres; ' if away > HALL_MM else ''}"
         "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
+        + ("; or both sides are the inverses of what they are named: rename both, or give --poses-are" * exchanged)
     )
     return (Grave(said) if away > TOO_FAR_MM else said,)
 
@@ -188,7 +201,7 @@ def calibrate(
         result, options, notes = solution.result, solution.options, solution.notes
         if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
             notes = (*notes, meant)
-        notes = (*notes, *_of_setup(given, setup, result))
+        notes = (*notes, *_of_setup(given, setup, result), *_of_no_covariance(given, result))
         if not offset_known:
             result, lagging = lag_tried(given, setup, options, result)
             notes = (*notes, *lagging)

@@ -333,7 +333,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[board]\npitch_sigma_ppm = 30e-6\n", "in ppm, so that 3e-05 as a fraction is 30;"),
+        ("[board]\npitch_sigma_ppm = 30e-6\n", "in ppm, so that 3e-05 as a fraction is 30, and in % 0.3;"),
         ('[fields]\ndate = "2999-01-01"\n', "date 2999-01-01: in the future"),
         ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
         ("[target]\nexpansion_ppm_per_k = 0.000023\n", "in ppm/K, so that 2.3e-05 1/K is 23;"),

@@ -327,11 +327,13 @@ def test_too_few_circles_and_wrong_labels(scene, known):
     for count in (0, 1, 3):
         with fails_with("E-MEASURE-FEW-CIRCLES … 4"):
             pose_of(image.select(list(range(count))), known.truth, scene.camera)
-    with fails_with("E-MEASURE-AMBIGUOUS … off one line"):  # circles 1, 2, 3 and a lie in line
+    with fails_with("E-MEASURE-AMBIGUOUS … not on one line"):  # circles 1, 2, 3 and a lie in line
         pose_of(image.select([image.labels.index(f"2:{c}") for c in "123a"]), known.truth, scene.camera)
     _, _, both = one_view(scene, np.random.default_rng(11), ("1", "2"), NOISE_PX, (20, 30), (900, 1000))
     in_line = [*(both.labels.index(f"2:{c}") for c in "123a"), both.labels.index("1:1")]
-    with fails_with("E-MEASURE-AMBIGUOUS … face 2 … 4 circles … off one line"):  # and not for the one circle of face 1
+    with fails_with(
+        "E-MEASURE-AMBIGUOUS … face 2 … 4 circles … not on one line"
+    ):  # and not for the one circle of face 1
         pose_of(both.select(in_line), known.truth, scene.camera)
     with fails_with("E-LABEL-REPEATED"):
         pose_of(image.select([0, *range(len(image))]), known.truth, scene.camera)
