@@ -442,6 +442,8 @@ def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
             solved += 1
             tested = any(c.key in TESTED_BY and c.verdict == "passed" for c in result.checks)
             assert tested or result.judgement.verdict != "yes"
+            named = {name for s in result.solutions for name in (*s.left_out, *s.model.images)}
+            assert named == {image.observations.name for image in result.labelled}
     assert 0 < solved < 4
     assert all("; add " in line or "take " in line for line in refusals), refusals
 

@@ -360,7 +360,7 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
     missed, wrong = off(measured)
     if not len(wrong) and len(names) >= LEAST_TO_COMPARE:
         typical = np.median(missed, axis=1)
-        far = np.flatnonzero(typical > max(OFF * float(np.median(typical)), OFF_MM))
+        far = np.flatnonzero(typical > max(OFF * float(np.median(typical)), OFF_MM)).tolist()
         if 0 < len(far) <= MOST_ELSEWHERE * len(names):
             listed = ", ".join(f"{names[i]} ({typical[i]:.2g} mm)" for i in far)
             most = f"{np.median(typical):.2g} mm"

@@ -71,7 +71,7 @@ class _Fitted:
 
 
 def whole_set_cause(
-    networks: Sequence[Network], camera: Camera, moved: bool = False, from_file: bool = True
+    networks: Sequence[Network], camera: Camera, moved: bool = False, from_file: bool = True, most_left: float = 1.0
 ) -> Check | None:
     """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals.
 
@@ -79,7 +79,8 @@ def whole_set_cause(
     ``EXPLAINS_ALL`` of it, less what chance may do, the one with fewest parameters is named.
 
     ``moved`` : whether the target seems to have moved, and no few images are the culprits; ``from_file`` : False if the
-    camera was found from the same photographs, so that no file can be wrong.
+    camera was found from the same photographs, so that no file can be wrong; ``most_left`` : largest factor on the
+    residuals that a cause may leave.
     """
     possible = [cause for cause in _hypotheses(camera) if from_file or cause.direction is None]
     fitted = [f for cause in possible if (f := _fit(cause, networks)) is not None]
@@ -105,6 +106,8 @@ def whole_set_cause(
     size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
     square = sum(float((n.residual**2).sum()) for n in networks)
     after = float(np.sqrt(best.left * _redundancy(networks) / square))
+    if after > most_left:
+        return None
     reason = (
         f"{size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
         f"{'s' * (best.test.freedom == 1)} {100 * best.explained / most:.0f} % of what any cause explains; residuals "

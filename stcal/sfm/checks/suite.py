@@ -49,6 +49,9 @@ JOINT = (
 )
 """Checks that need the joint result and its covariances."""
 CONTROL = "Uncorrected control"
+GROUPS, BESIDE_A_GROUP = "groups", 0.9
+"""Check that names a group without which all is well, and largest factor on the residuals that a cause of the whole set
+may leave to be named in place of that group."""
 MICRO = 1e3
 IN_PAIRS = 2
 """Number of functions that make two checks each: of the board, and of the radii."""
@@ -163,7 +166,12 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
             step(None)
     failed = any(check.verdict == "failed" for check in checks)
     moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
-    cause = evidence.cause or (whole_set_cause(networks, camera, moved, evidence.camera_given) if failed else None)
+    # A group without which all is well is the cause, unless another one explains far more than chance of the residuals.
+    of_group = any(check.key == GROUPS and check.verdict == "failed" and len(check.names) == 1 for check in checks)
+    most_left = BESIDE_A_GROUP if of_group else 1.0
+    cause = evidence.cause
+    if cause is None and failed:
+        cause = whole_set_cause(networks, camera, moved, evidence.camera_given, most_left)
     return (cause, *checks) if cause else tuple(checks)
 
 

@@ -199,7 +199,7 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
     measured, covariance = table.poses(), table.pose_covariances()
     images: dict[str, PoseErrors] = {}
     unknown: list[str] = []
-    distances: list[tuple[float, float]] = []
+    distances: list[list[float]] = []
     for i, name in enumerate(table.text("image")):
         same = [name] if name in true else by_file.get(Path(name).name, [])
         if len(same) != 1:
@@ -207,14 +207,15 @@ def compare_poses(poses: str | Path, truth: str | Path) -> ComparePosesFile:
             continue
         pose = true[same[0]]
         images[name] = _pose_errors(measured[i], pose, None if covariance is None else covariance[i])
-        distances.append(tuple(float(np.linalg.norm(p.translation)) for p in (pose, measured[i])))
+        distances.append([float(np.linalg.norm(p.translation)) for p in (pose, measured[i])])
     if not images:
         raise InputError(
             "E-COMPARE-IMAGES",
             f"{poses}, truth {truth}: no image in common that the truth states one pose of; give the truth of the same "
             f"photographs{f', with names like {next(iter(true))}' if true else ''}",
         )
-    _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", *np.median(distances, axis=0), "poses")
+    true_mm, measured_mm = np.median(distances, axis=0).tolist()
+    _require_same_unit(f"poses {poses}, truth {truth}", "camera and target", true_mm, measured_mm, "poses")
     return ComparePosesFile(images=images, not_in_truth=unknown)
 
 

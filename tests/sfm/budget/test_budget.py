@@ -335,6 +335,10 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     [
         ("[board]\npitch_sigma_ppm = 30e-6\n", "in ppm, so that 3e-05 as a fraction is 30, and in % 0.3;"),
         ('[fields]\ndate = "2999-01-01"\n', "date 2999-01-01: in the future"),
+        ('[fields]\ndate = "05.01.2031"\n', "date 05.01.2031: no date as YYYY-MM-DD"),
+        ('[fields]\ndate = "2026-02-31"\n', "date 2026-02-31: no date as YYYY-MM-DD"),
+        ("[board]\npitch_sigma_ppm = 0.012\n", "in % 120;"),
+        ("[board]\ntemperature_c = 295.65\n", "295.65 K are 22.5 °C"),
         ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
         ("[target]\nexpansion_ppm_per_k = 0.000023\n", "in ppm/K, so that 2.3e-05 1/K is 23;"),
         ("[board]\nexpansion_sigma_ppm_per_k = 1e-6\n", "in ppm/K, so that 1e-06 1/K is 1;"),

@@ -9,7 +9,8 @@ import pytest
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.plane import circle_image_offset
 from stcal.labels import CircleLabel
-from stcal.sfm.checks.causes import _turned, cause_of_file
+from stcal.sfm.checks import suite
+from stcal.sfm.checks.causes import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.checks.culprits import moved_apart
 from stcal.sfm.checks.verdict import ranked
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
@@ -108,6 +109,21 @@ def test_the_planted_cause_is_named_first(few, lab, name):
     assert check.title.startswith(OF_WHOLE_SET)
     assert words in check.title
     assert check.remedy
+
+
+def test_no_file_is_wrong_where_there_is_none(few, lab, monkeypatch):
+    """Nor is a cause named that leaves more of the residuals than is allowed, as beside a group that is found out."""
+    asked = []
+    monkeypatch.setattr(suite, "whole_set_cause", lambda *given: asked.append(given))
+    images, camera = PLANTED["focal length short"][0](few, lab.observe(few))
+    lab.check(few, images, camera=camera)
+    networks, given, moved, *_ = asked[0]
+    found = whole_set_cause(networks, given, moved)
+    assert found is not None
+    assert "of the camera file" in found.title
+    other = whole_set_cause(networks, given, moved, from_file=False)
+    assert other is None or "camera file" not in other.title
+    assert whole_set_cause(networks, given, moved, most_left=0.0) is None
 
 
 def test_the_size_of_the_cause_is_said(few, lab):
