@@ -39,7 +39,7 @@ from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
-from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, not_as_drawn
+from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays, seen_by
@@ -497,8 +497,9 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
             *unusable,
             *unsolved,
             *calibration.notes,
-            *not_as_drawn(calibration.target.target_from_face, target),
+            *not_as_drawn(calibration.target.target_from_face, target, bool(board.rows) and set(groups) == {TOP_GROUP}),
             *(misnamed_groups(observations, target) if board.rows else ()),
+            *(misplaced_images(observations, {i.observations.name: i.notes for i in labelled}, target)),
             *unseen_board(solutions, board),
             *unseen_circles(solutions, target),
         ),

@@ -10,7 +10,7 @@ from stcal.boards.target import body_toml
 from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
-from stcal.sfm.data.as_drawn import misnamed_groups, not_as_drawn
+from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.body import Corners, wrong_sizes
 from stcal.sfm.mapping.placed import place_with_camera
@@ -129,3 +129,17 @@ def test_sizes_that_others_contradict_are_named_before_anything_is_adjusted(face
     assert list(found.values()) == pytest.approx([factor] * len(faces), rel=0.05)
     with fails_with(f"E-BODY-SIZES … face {CUBE.faces[faces[0]].id}"):
         place_with_camera(noisy, drawn, rough)
+
+
+def test_photographs_that_belong_to_another_group_are_named():
+    """By the faces that were read in them, also where these were left out."""
+    target = reference_target()
+    right, wrong = seen("12", "1", "2"), seen("14", "1", "4")
+    stray = seen("12")[0]
+    notes = {stray.name: ("a pattern like face 1: left out", "a pattern like face 4: left out")}
+    images = [stray, *right[1:], *wrong]
+    [note] = misplaced_images(images, notes, target)
+    assert note == "12/0 shows faces 1 and 4, as group 14 does: move it there if it was taken with these"
+    both = {stray.name: (*notes[stray.name], "a pattern like face 2: left out")}
+    assert misplaced_images(images, both, target) == []
+    assert misplaced_images([*right, *wrong], {}, target) == []

@@ -233,7 +233,7 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         "; or images are mirrored: use them as taken" if by_images else ""
     )
     variants = {
-        f"{INVERTED}: either these are {named}: {NAMED}; or all are named rightly, and --setup is {kind}": (
+        f"{INVERTED}: either these are {named}: {NAMED}; or all are named rightly: give --setup {kind}": (
             replace(loop, camera_from_board=eye.inverse())
         ),
         **_other_units(loop, by_images),

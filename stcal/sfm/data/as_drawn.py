@@ -19,18 +19,21 @@ MOST_TURNED_DEG = 25.0
 body, or drawn turned, is off by far more."""
 LIKE_DRAWN = 1.3
 """Largest factor between distances of faces and those of their rough poses."""
+LIKE_A_FACE = re.compile(r"a pattern like face ([^:]+):")
+"""How a note of an image begins on a face that was read and left out."""
 SHOWN, RARELY = 2, 3
 """Number of images that must show a face before its group counts as one of it, and how many times as many must show it
 as a face that the group is named after."""
 
 
-def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign) -> list[str]:
+def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, one_folder: bool = False) -> list[str]:
     """Returns notes on faces that are not where the rough poses of the design have them.
 
     Parameters
     ----------
     target_from_face : poses of the faces by id, mm
     design : design of the target; faces without a rough pose are not compared
+    one_folder : whether photographs in one folder were taken to be of one setting of target and board
     """
     rough = {face: pose for face, pose in design.rough_poses().items() if face in target_from_face}
     if len(rough) < 2:
@@ -53,7 +56,10 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign) ->
         if not {a, b} & _turned(found, exchanged).keys():
             what += f", as if the names of faces {a} and {b} were exchanged"
             break
-    return [*notes, f"{NOT_AS_DRAWN}{what}: correct names, ids or rough_pose"]
+    folders = (
+        "put the photographs of each setting of target and board into a folder of its own; or " if one_folder else ""
+    )
+    return [*notes, f"{NOT_AS_DRAWN}{what}: {folders}correct names, ids or rough_pose"]
 
 
 def _size_ratio(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> float:
@@ -93,6 +99,30 @@ def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDes
                 "correct the names of faces in target.toml, or of folders"
             )
     return notes
+
+
+def misplaced_images(
+    observations: Sequence[ImageObservations], notes: Mapping[str, Sequence[str]], design: TargetDesign
+) -> list[str]:
+    """Returns notes on images that show the faces after which another group is named, and not those of their own.
+
+    ``notes`` : by name of the image, in which faces are named that were read and left out.
+    """
+    ids = [face.id for face in design.faces]
+    named = {image.group: faces_in_name(image.group, ids) for image in observations}
+    found = []
+    for image in observations:
+        read = {match[1] for note in notes.get(image.name, ()) if (match := LIKE_A_FACE.match(note))}
+        seen = (set(image.face_ids()) | read) & set(ids)
+        if not named[image.group] or named[image.group] <= seen:
+            continue
+        others = [group for group, faces in named.items() if faces and faces <= seen]
+        if len(others) == 1:
+            found.append(
+                f"{image.name} shows {_faces(sorted(seen))}, as group {others[0]} does: move it there if it was taken "
+                "with these"
+            )
+    return found
 
 
 def faces_in_name(group: str, ids: Sequence[str]) -> set[str]:

@@ -123,7 +123,9 @@ def judgement_of(report: dict) -> Judgement:
     report : content of ``report.json``
     """
     verdict, use = _use(report)
-    by_result = _control(report) or _by_checks(report) or _by_gaps(report)
+    failed = any(check["verdict"] == "failed" for check in report.get("checks", []))
+    lost = None if failed else _by_lost_group(report)  # what is only suspicious comes after it
+    by_result = _control(report) or lost or _by_checks(report) or _by_gaps(report)
     cause = by_result or _by_drawing(report) or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")

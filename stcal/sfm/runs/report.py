@@ -110,7 +110,8 @@ class CheckRow(Part):
     title: str = Field(description="what is checked")
     verdict: Verdict = Field(
         description="`passed`; `suspicious`: by chance in one honest run of 1000, and `agreement` where the joint "
-        "adjustment has not settled; `failed`: of 100 000; `not possible` in this run"
+        "adjustment has not settled; `failed`: of 100 000; `not possible` in this run (without a "
+        "`remedy`: not applicable to what was photographed)"
     )
     reason: str = Field(description="the verdict in words")
     measured: list[MeasuredRow] = Field(

@@ -7,7 +7,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
@@ -141,6 +141,8 @@ def detected_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, l
 
 
 CACHE_VERSION = 7
+LEAST_WITHOUT, MOST_WITHOUT = 3, 40
+"""Number of images of a group above which, and up to which, one that contradicts the others is looked for."""
 FEW_NAMED = 6
 SHOW_MORE = "show two faces of it at once, or one by more corners"
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
@@ -351,10 +353,32 @@ def refine_or_explain(
     try:
         return refine(model, camera, target, board, eccentricity)
     except (MappingError, ConvergenceError) as error:
+        if (image := _odd_one_out(model, camera, target, board, eccentricity)) is not None:
+            raise MappingError(
+                error.code,
+                f"group {model.group}: {image} contradicts the others, which agree without it; leave it out, with "
+                f"--exclude {image}, or take it again",
+            ) from error
         if moved_apart(model, camera, target, board):
             agree = "the circles of the faces agree with one another, and the dots of the board do"
             error.append(f"{LIKELY}{MOVED}, as {agree}: {MOVED_REMEDY}")
         raise
+
+
+def _odd_one_out(
+    model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign, eccentricity: bool
+) -> str | None:
+    """Returns the one image without which a group can be refined; None if there is none, or more than one."""
+    cures: list[str] = []
+    if not LEAST_WITHOUT < len(model.images) <= MOST_WITHOUT:
+        return None
+    for k, image in enumerate(model.images):
+        with suppress(MappingError, ConvergenceError, DegenerateError):
+            refine(model.without(model.image_index == k), camera, target, board, eccentricity)
+            cures.append(image)
+        if len(cures) > 1:
+            return None
+    return cures[0] if cures else None
 
 
 def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Check | None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.errors import MappingError
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.plane import circle_image_offset
 from stcal.labels import CircleLabel
@@ -14,7 +15,10 @@ from stcal.sfm.checks.causes import _turned, cause_of_file, whole_set_cause
 from stcal.sfm.checks.culprits import moved_apart
 from stcal.sfm.checks.verdict import ranked
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+from stcal.sfm.runs import solve
+from stcal.sfm.runs.solve import refine_or_explain
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
+from tests.outcome import fails_with
 from tests.sfm.checks.test_checks import Lab
 
 
@@ -281,3 +285,19 @@ def test_target_and_board_that_moved_apart_agree_by_themselves(few, lab, labels_
     wrong = replace(few.camera, distortion=few.camera.distortion - 0.3 * np.eye(len(few.camera.distortion))[0])
     still = labels_only.models(few, lab.observe(few))[0]
     assert not moved_apart(still, wrong, few.target, few.board)
+
+
+@pytest.mark.parametrize("wrong", [(2,), (1, 2)])
+def test_one_photograph_that_contradicts_a_group_is_named(few, lab, monkeypatch, wrong):
+    """As a cropped one does: the group was lost without a word about which photograph it is. Of two, none is named."""
+    model = next(each for each in lab.labels_only.models(few, lab.observe(few)) if each.group == "12")
+    names = {model.images[k] for k in wrong}
+
+    def fails_with_them(group, *_):
+        if names & set(group.images):
+            raise MappingError("E-GROUP-CONTRADICTS", f"group {group.group}: observations contradict")
+
+    monkeypatch.setattr(solve, "refine", fails_with_them)
+    said = f"{model.images[2]} contradicts the others" if len(wrong) == 1 else "observations contradict"
+    with fails_with(f"E-GROUP-CONTRADICTS … group 12: {said}"):
+        refine_or_explain(model, few.camera, few.target, few.board)
