@@ -1,7 +1,7 @@
 """Refusal of an environment in which another distribution has written into this package.
 
-The ``stcal`` of PyPI is another project with a package of the same name. Installed beside this one, each overwrites
-files of the other, and what is imported is a mixture.
+The ``stcal`` of the package index is another project with a package of the same name. Installed beside this one, each
+overwrites files of the other, and what is imported is a mixture.
 """
 
 from pathlib import Path
