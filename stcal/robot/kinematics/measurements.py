@@ -28,6 +28,8 @@ STATUS, AMBIGUOUS = "status", "ambiguous"
 """Column ``status`` of ``stcal-sfm measure``, and its word for an undecided pose."""
 MAX_TURNS = 4
 """Largest joint value in turns. Larger ones are degrees in a column of radians."""
+FROM_ITSELF_MM = 1e-3
+"""Largest distance of a position from itself in a file, of rounding."""
 LONGEST_TOOL_MM = 10_000.0
 """Longest possible tool, by which a target may be farther than the arm reaches."""
 ORIENTATION = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
@@ -270,7 +272,15 @@ def read_measurements(
         raise InputError(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but distances have no orientation; leave it out"
         )
-    seen = {"distances": distances, "from_row": _from_rows(table), "notes": unread(table, own)}
+    from_row = _from_rows(table)
+    if len(itself := np.flatnonzero((from_row == np.arange(len(table))) & (distances > FROM_ITSELF_MM))):
+        i = int(itself[0])
+        raise InputError(
+            "E-MEASURED-DISTANCES",
+            f"{table.where}: line {table.lines[i]}: the distance of a position from itself is {distances[i]:.4g} mm, "
+            "0 needed: distances start at the first row, which is missing, or at the row that column from_row names",
+        )
+    seen = {"distances": distances, "from_row": from_row, "notes": unread(table, own)}
     return Measurements(table.where, table.lines, q, targets, **seen, conditions=conditions)
 
 

@@ -88,6 +88,7 @@ def test_distances_from_rows(tmp_path):
         ("q1_mm,q2_deg,x_mm,y_mm,z_mm\n1,2,3,4,5\n1,2,inf,4,5\n", "E-TABLE-NUMBER … data.csv … 3 … x_mm … 'inf'"),
         ("q1_mm,q2_rad,x_mm,y_mm,z_mm\n1,90,3,4,5\n", "E-JOINT-VALUE … data.csv … 2 … q2_rad … 90 … 4"),
         ("q1_mm,q2_rad\n1,0\n", "E-MEASURED-KIND … data.csv … x_mm … y_mm … z_mm … distance_mm"),
+        ("q1_mm,q2_rad,distance_mm\n1,0,3\n2,0,5\n", "E-MEASURED-DISTANCES … line 2 … itself is 3 mm … first row"),
         ("q1_mm,q2_rad,distance_mm,from_row\n1,0,3,7\n", "E-MEASURED-FROM-ROW … data.csv … from_row … 7 … 1"),
         ("q1_mm,q2_rad,x_mm,y_mm,z_mm,qw,qx\n1,0,3,7,4,1,0\n", "E-TABLE-COLUMN-MISSING … data.csv … qw, qx … qy, qz"),
         ("q1_mm,q2_rad,x_mm,y_mm,z_mm,qw,qx,qy,qz\n1,0,3,7,4,1,1,0,0\n", "E-QUATERNION-LENGTH … data.csv … 1.414"),
