@@ -50,7 +50,8 @@ def place_of(path: Path) -> str:
 def documents() -> list[Path]:
     """All pages that are written by hand."""
     own = [path for path in sorted(DOCS.rglob("*.md")) if path.relative_to(DOCS).parts[0] not in NOT_PAGES]
-    return [*own, ROOT / "README.md", ROOT / "data_layout.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+    at_top = ("README.md", "data_layout.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")
+    return [*own, *(ROOT / name for name in at_top)]
 
 
 def collect(source: Path) -> None:
