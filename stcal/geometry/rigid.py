@@ -7,6 +7,7 @@ translation (mm), left perturbation in the outer frame.
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import permutations, product
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
@@ -434,6 +435,15 @@ class Affine(_ByValue):
         if isinstance(other, Affine):
             return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
         return np.asarray(other, float) @ self.linear.T + self.translation
+
+
+def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Yields points (m, 3) with their axes in every other order and with every other sign: what stands in place of x, y
+    and z, such as ``y, x, −z``, and the points."""
+    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+        if (order, signs) != ((0, 1, 2), (1, 1, 1)):
+            names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))
+            yield names, xyz[:, order] * signs
 
 
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:

@@ -14,7 +14,8 @@ from stcal.handeye.solve import handeye as handeye_by
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
-from stcal.workflows.handeye.inputs import PREFIXES
+from stcal.workflows.handeye.calibrate import Splits, calibrate
+from stcal.workflows.handeye.inputs import PREFIXES, HandEyeInput
 from tests.support.handeye import simulated
 
 COMMON = np.array([[1e-3, 0, 0, 0, 0.4, 0], [0, -1e-3, 0, 0.4, 0, 0], [0, 0, 0, 0, 0, 0.8]]).T
@@ -120,3 +121,13 @@ def test_the_verdict_does_not_ask_for_more_poses():
     assert "have in common" in found.verdict.sentence()
     assert "more poses do not help" in found.verdict.reasons()[0].remedy
     assert np.linalg.eigvalsh(found.covariance - found.common_covariance).min() > 0
+
+
+def test_poses_of_the_board_without_covariance_say_what_sigma_lack():
+    pairs = simulated(np.random.default_rng(3), 12, robot=(1e-4, 0.03), camera=(2e-4, 0.05)).pairs
+    stated = replace(pairs, camera_from_board_covariance=np.tile(OWN, (12, 1, 1)))
+    notes = [
+        calibrate(HandEyeInput("t", each), "eye-in-hand", "pose", HandEyeOptions(), Splits(0, 0)).all_notes()
+        for each in (pairs, stated)
+    ]
+    assert [any("state no covariance" in note for note in each) for each in notes] == [True, False]

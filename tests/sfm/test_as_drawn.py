@@ -143,3 +143,11 @@ def test_photographs_that_belong_to_another_group_are_named():
     both = {stray.name: (*notes[stray.name], "a pattern like face 2: left out")}
     assert misplaced_images(images, both, target) == []
     assert misplaced_images([*right, *wrong], {}, target) == []
+
+
+def test_of_two_faces_none_is_blamed_for_its_size():
+    scene = make_body_scene(CUBE, body_camera(640), BodyOptions(images=16, distance_mm=300, seed=5))
+    images, _ = corners_seen(scene, 0.02)
+    one, two = (next(face for face in CUBE.faces if face.id == name) for name in ("1", "5"))
+    with fails_with("E-BODY-SIZES … faces 1 and 5 contradict one another … face 5 is 10 times as large against face 1"):
+        place_with_camera(images, [one, replace(two, xy_mm=two.xy_mm / 10)], scene.camera)

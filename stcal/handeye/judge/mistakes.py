@@ -7,7 +7,7 @@ belong to other poses. A symmetric board may be numbered from another end, and a
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from itertools import permutations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.formats.record import FRAMES
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.views import View, Views
@@ -206,11 +206,8 @@ def _other_places(loop: Loop, by_images: bool) -> dict[str, Loop]:
         poses = _of_side(loop, side)
         inverted = side == "robot" and loop.inverted
         read = poses.inverse() if inverted else poses
-        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
-            if order == (0, 1, 2) and signs == (1, 1, 1):
-                continue
-            meant = Poses(read.rotation, read.translation[:, order] * signs)
-            names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))
+        for names, places in other_axes(read.translation):
+            meant = Poses(read.rotation, places)
             key = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
             variants[key] = _with_side(loop, side, meant.inverse() if inverted else meant)
     return variants

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations, product
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.spatial import KDTree
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_fields
-from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.quaternions import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
@@ -332,11 +331,9 @@ def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Ite
     turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
     reason = "joint values were radians in columns of degrees; call the columns q1_rad …"
     yield reason, poses, poses_of(robot, targets, turned)
-    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
-        if (order, signs) != ((0, 1, 2), (1, 1, 1)):
-            names = ", ".join(("−" if sign < 0 else "") + "xyz"[k] for k, sign in zip(order, signs, strict=True))
-            reason = f"x, y, z were {names}; correct order and signs of the columns of positions"
-            yield reason, Poses(poses.rotation, poses.translation[:, order] * signs), reached
+    for names, places in other_axes(poses.translation):
+        reason = f"x, y, z were {names}; correct order and signs of the columns of positions"
+        yield reason, Poses(poses.rotation, places), reached
     paired = _paired(targets, poses, reached, reach_mm(robot))
     if paired is not None:
         yield "joint values stood in other rows; give each pose its own", poses, paired

@@ -327,3 +327,15 @@ def test_files_that_are_exchanged_or_the_same_are_told(tmp_path):
     )
     assert "as if they were exchanged" in compensate(case.nominal, targets, case.real).notes()[0]
     assert "are the same, so that nothing is compensated" in compensate(case.real, targets, case.real).notes()[0]
+
+
+def test_axes_that_are_exchanged_and_radians_without_poses_are_told(tmp_path):
+    case = Case(tmp_path)
+    cells = np.column_stack([case.poses.translation[:, [1, 0, 2]], case.poses.quaternions(), np.degrees(case.q)])
+    head = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", *JOINTS]
+    path = case.write(head, [[repr(float(v)) for v in row] for row in cells])
+    with fails_with("E-ROBOT-MISMATCH … if x, y, z were y, x, z"):
+        compensate(case.real, read_targets(path, case.nominal), case.nominal)
+    small = case.write(JOINTS, [[repr(float(v)) for v in row] for row in case.q])
+    notes = compensate(case.real, read_targets(small, case.nominal), case.nominal).notes()
+    assert any("as of radians in columns of degrees" in note for note in notes)

@@ -204,6 +204,17 @@ def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
     assert "set after: measured positions are the commanded ones" in both.warnings()[0]
 
 
+def test_a_compensation_that_gained_nothing_and_a_scale_are_named():
+    assert "set after errs as set before does" in ten_of_two_sets(1.0, 1.0).warnings()[0]
+    assert (
+        "1.00200 times the commanded ones, which is most of their error"
+        in verify(MeasuredPoses("t", range(2, 12), ("a",) * 10, tuple("abcdefghij"), TEN, 1.002 * TEN)).warnings()[0]
+    )
+
+
+TEN = np.random.default_rng(6).uniform(-500, 500, (10, 3))
+
+
 def exchange(at: np.ndarray) -> None:
     at[[2, 6]] = at[[6, 2]]
 

@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.file import BudgetFile
+from stcal.sfm.budget.file import BudgetFile, _unusual
 from stcal.sfm.budget.lengths import against_stated
 from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
@@ -375,3 +375,13 @@ def test_a_sigma_as_files_are_written_with_counts_as_assumed(small_run, stcal_sf
     rows = {row["key"]: row for row in json.loads(out.read_text())["sources"]}
     assert rows["board_dots"]["origin"] == "assumed"
     assert "the default" in rows["board_dots"]["words"]
+
+
+def test_statements_as_unusual_as_those_in_another_unit_are_asked_about():
+    def asked(**values) -> list[str]:
+        return _unusual(Statement(StatedSize(**values), StatedSize(), {}, {}, False))
+
+    assert asked(temperature_c=23.0, temperature_sigma_k=0.5, expansion_ppm_per_k=70.0) == []
+    assert "or °F, which were 22.5 °C?" in asked(temperature_c=72.5)[0]
+    assert "50 K: is that its value?" in asked(temperature_sigma_k=50.0)[0]
+    assert "700 ppm/K" in asked(expansion_ppm_per_k=700.0)[0]

@@ -16,7 +16,7 @@ from stcal.sfm.checks.culprits import moved_apart
 from stcal.sfm.checks.verdict import ranked
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 from stcal.sfm.runs import solve
-from stcal.sfm.runs.solve import refine_or_explain
+from stcal.sfm.runs.solve import GroupSolution, refine_or_explain
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
 from tests.outcome import fails_with
 from tests.sfm.checks.test_checks import Lab
@@ -301,3 +301,16 @@ def test_one_photograph_that_contradicts_a_group_is_named(few, lab, monkeypatch,
     said = f"{model.images[2]} contradicts the others" if len(wrong) == 1 else "observations contradict"
     with fails_with(f"E-GROUP-CONTRADICTS … group 12: {said}"):
         refine_or_explain(model, few.camera, few.target, few.board)
+
+
+def test_circles_that_no_image_shows_as_drawn_are_named(few, lab):
+    models = lab.labels_only.models(few, lab.observe(few))
+    solutions = [GroupSolution((), model, "", 0, {}, ()) for model in models]
+    assert solve.unseen_circles(solutions, few.target) == []
+
+    def without(model, lost: str):
+        return model.without(np.array([model.labels[p] == lost for p in model.point_index]))
+
+    cut = [replace(each, model=without(each.model, "1:4")) for each in solutions]
+    [note] = solve.unseen_circles(cut, few.target)
+    assert note.startswith("1:4: not in the result, as too few images show it as drawn; check radius and place")
