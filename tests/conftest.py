@@ -51,8 +51,8 @@ typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls h
 
 
 def pytest_configure(config):
-    """Fewer examples of each property where slow tests are left out; all of them with the others."""
-    if "not slow" in config.option.markexpr:
+    """Fewer examples of each property but in `scripts/full`."""
+    if "not full" in config.option.markexpr:
         settings.load_profile("quick")
 
 
