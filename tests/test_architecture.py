@@ -38,7 +38,7 @@ INSIDE = {
         ("adjust",),
         ("checks", "camera", "measurement"),
         ("runs",),
-        ("interop", "diagnose", "planning", "budget"),
+        ("interop", "planning", "budget"),
         ("make",),
         (".",),
     ),
@@ -55,7 +55,7 @@ LIBRARIES = {
     "pycolmap": ("sfm/mapping", "sfm/interop"),
     "sqlite3": ("sfm/mapping", "sfm/interop", "io/cameras/foreign.py"),
     "cv2": (
-        *("io/images.py", "io/photographs", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
+        *("io/images.py", "io/photographs", "boards", "sfm/detect", "synthetic"),
         *(
             "io/device.py",
             "io/cameras/foreign.py",
