@@ -118,7 +118,6 @@ CALLS = (
     Call("sfm draw", "@data/target.toml --out >target.pdf", 2.0),
     Call("sfm draw", "@own.toml --out >net.svg --net"),
     Call("sfm draw", "@data/board.toml --out >board.svg --margin-mm 5"),
-    Call("sfm draw", "@locate/board.toml --out >board.dxf", 1.0),
     Call("sfm simulate", "+set --width 324 --images 2 --workers 1", 3.0),
     Call("sfm simulate", f"+set {_DESIGNS} --camera @data/cameras.txt --groups 12 --images 2 --workers 1", 3.0),
     Call("sfm demo", "--out +demo --workers 1", 40.0),
@@ -128,13 +127,10 @@ CALLS = (
     Call("sfm report", "@run --out >page.html", 3.0),
     Call("sfm export-database", "@run +copy.db --schema 3.8"),
     Call("sfm export-database", "@run +copy.db --schema 4.2"),
-    *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt", "ply", "nvm")),
+    *(Call("sfm export-model", f"@run +model --format {kind}") for kind in ("colmap-bin", "colmap-txt", "nvm")),
     Call("sfm export-model", "@run +model --format bundler"),
-    *(
-        Call("sfm export", f"@run +box.{suffix} --name box")
-        for suffix in ("urdf", "xacro", "yaml", "yml", "csv", "ply")
-    ),
-    *(Call("sfm export", f"@run +box.{suffix}") for suffix in ("dxf", "gltf", "glb", "rrd")),
+    *(Call("sfm export", f"@run +box.{suffix} --name box") for suffix in ("urdf", "xacro", "yaml", "yml", "csv")),
+    *(Call("sfm export", f"@run +box.{suffix}") for suffix in ("gltf", "glb")),
     Call("sfm export", "@run +box.txt --form ros2"),
     Call("sfm crosscheck", "@run --colmap @no-colmap", code=2),
     Call("sfm faces", "@run/models --run @run --out +faces.json", 1.0),

@@ -32,10 +32,8 @@ def export_database(
 @app.command(name="export-model")
 def export_model(
     run: Run,
-    out: Annotated[
-        Path, "Write to this place: a new file for ply and nvm, a new or empty folder for the others.", Arg("OUT")
-    ],
-    kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, ply, nvm or bundler.", Opt("--format")],
+    out: Annotated[Path, "Write to this place: a new file for nvm, a new or empty folder for the others.", Arg("OUT")],
+    kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, nvm or bundler.", Opt("--format")],
 ) -> None:
     """Write the run's final model in mm, in the target frame, for other programs, with a file of labels."""
     from stcal.sfm.interop.crosscheck import model_text
@@ -50,17 +48,16 @@ def export_run(
     out: Annotated[
         Path,
         "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1), .yml (OpenCV), .csv, .ply, .dxf, .gltf, .glb or .rrd (Rerun).",
+        "1), .yml (OpenCV), .csv, .gltf or .glb.",
         Arg("FILE", writes=True),
     ],
     form: Annotated[
         str,
-        "Write this form, whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb or "
-        "rerun.",
+        "Write this form, whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, gltf or glb.",
     ] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
-    """Write faces and circles for robots, drawings and viewers, with σ and cameras if the form can hold them."""
+    """Write faces and circles for robots and viewers, with σ and cameras if the form can hold them."""
     from stcal.sfm.interop.crosscheck import export_text
     from stcal.sfm.interop.export import export_run as export
 

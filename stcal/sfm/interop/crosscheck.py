@@ -490,10 +490,10 @@ def database_text(written: Exported) -> str:
 
 def model_text(written: ExportedModel, kind: str) -> str:
     """Returns a text on the contents of the model, and on the ideal camera if the format needs one."""
-    contents = f"{written.images} images and {written.points} points"
-    if kind == "ply":
-        contents = f"{written.points} points, not the cameras of the {written.images} images, which other formats hold"
-    lines = [f"{contents}; mm, target frame: {written.path}", f"labels: {written.labels}"]
+    lines = [
+        f"{written.images} images and {written.points} points; mm, target frame: {written.path}",
+        f"labels: {written.labels}",
+    ]
     if written.focal_px is not None and written.centre_px is not None:
         x, y = written.centre_px
         lines.append(
@@ -515,7 +515,7 @@ def export_text(written: ExportedRun) -> str:
         lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
     if lost := FORMS[written.form].lost:
         lines.append(f"not in it: {lost}")
-    return "\n".join([*lines, *written.notes])
+    return "\n".join(lines)
 
 
 def faces_text(calibration: Calibration, run: SavedRun) -> str:
