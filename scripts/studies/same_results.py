@@ -157,10 +157,8 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
     files = ["--out", "@/poses.csv", "--json", "@/poses.json", "--report", "@/p.html"]
     add("measure", "sfm", "measure", images, "--camera", camera, "--faces", sample / "faces.json", *files)
     add("calibrate_camera", "sfm", "calibrate-camera", images, "--out", "@/cameras.txt")
-    add("pairs", "sfm", "pairs", sample, "--json", "@/pairs.json")
     add("advise", "sfm", "advise", sample, "--count", "2", "--json", "@/advice.json")
     add("plan", "sfm", "plan", "--images", "6", "--json", "@/plan.json")
-    add("doctor", "sfm", "doctor", sample, "--json", "@/doctor.json")
     for kind in ("colmap-txt", "nvm", "bundler"):
         add(f"export_{kind}", "sfm", "export-model", sample, "@/model", "--format", kind)
     add("faces", "sfm", "faces", demo / "run" / "models", "--run", demo / "run", "--out", "@/faces.json")

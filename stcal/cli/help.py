@@ -122,7 +122,6 @@ class Commands(TyperGroup):
 EXAMPLES = {
     "sfm run": ("photos --camera cameras.txt --target target.toml --board board.toml --out result",),
     "sfm detect": ("photos --camera cameras.txt --out look",),
-    "sfm verify": ("result",),
     "sfm report": ("result --pdf",),
     "sfm init": ("design",),
     "sfm simulate": ("set --images 5 --width 1728",),
@@ -135,8 +134,6 @@ EXAMPLES = {
     "sfm export": ("result target.urdf", "result target.csv"),
     "sfm crosscheck": ("result",),
     "sfm faces": ("model --run result --out faces.json",),
-    "sfm pairs": ("result",),
-    "sfm doctor": ("result --images photos",),
     "sfm plan": ("--camera cameras.txt --target target.toml --board board.toml --images 6",),
     "sfm advise": ("result --count 3",),
     "sfm watch": ("photos --camera cameras.txt --out result",),
@@ -178,9 +175,8 @@ GROUPS = {
     },
     "sfm": {
         "Make and photograph a target": ("init", "design", "draw", "plan", "capture", "watch"),
-        "Calibrate it": ("run", "report", "budget", "advise", "calibrate-camera"),
+        "Calibrate it": ("detect", "run", "report", "budget", "advise", "calibrate-camera"),
         "Use it": ("measure", "export"),
-        "Where something is wrong": ("detect", "doctor", "pairs", "verify"),
         "COLMAP": ("crosscheck", "faces", "export-model", "export-database"),
         "Simulate": ("demo", "simulate", "compare"),
     },

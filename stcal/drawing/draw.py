@@ -11,15 +11,15 @@ from stcal.boards.file import board_content
 from stcal.boards.several import load_boards
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
-from stcal.drawing.formats import dxf, pdf, svg
-from stcal.drawing.net import net_parts
+from stcal.drawing.formats import pdf, svg
+from stcal.drawing.net import net_part
 from stcal.drawing.parts import Part, board_parts, said_mm, target_parts
 from stcal.drawing.sheets import FURNITURE, MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import save
 
-SUFFIXES = (".pdf", ".svg", ".dxf")
+SUFFIXES = (".pdf", ".svg")
 OWN = "own"
 """Value of ``paper`` for pages as large as their content."""
 MARGIN_MM = 10.0
@@ -46,7 +46,7 @@ def draw(
     margin_mm: float = MARGIN_MM,
     net: bool = False,
 ) -> Drawn:
-    """Draw a target or a board 1:1 to a file, whose suffix gives the form: ``.pdf``, ``.svg`` or ``.dxf``.
+    """Draw a target or a board 1:1 to a file, whose suffix gives the form: ``.pdf`` or ``.svg``.
 
     Parameters
     ----------
@@ -56,11 +56,11 @@ def draw(
         File of the drawing; an earlier one is replaced.
     paper : str
         ``A5`` … ``A0``, ``Letter``, ``Legal``, ``Tabloid``, or ``own`` for pages as large as their content; if empty,
-        A4 for PDF and ``own`` for SVG and DXF.
+        ``own`` for SVG, and for PDF A4, or the smallest that takes a net on one sheet.
     margin_mm : float
         Distance from the outermost circles to the edge of a plate without an outline, mm.
     net : bool
-        Whether the plates of a target are unfolded into one plane, by their outlines and rough poses.
+        Whether the plates of a target are unfolded into one net on one sheet, by their outlines and rough poses.
 
     Returns
     -------
@@ -75,37 +75,37 @@ def draw(
     path = Path(out)
     if margin_mm < 0:
         raise InputError("E-OPTION-RANGE", f"draw: margin_mm {margin_mm:g}: 0 or more needed")
-    paper = _paper(path, paper)
+    given, paper = paper, _paper(path, paper)
     name, loaded = (design, load_design(design)) if isinstance(design, str | Path) else (type(design).__name__, design)
     if net and not isinstance(loaded, TargetDesign):
         raise InputError("E-DRAW-DESIGN", f"--net: {name} is a board; nets are of targets")
-    parts = net_for(loaded, paper) if net and isinstance(loaded, TargetDesign) else _parts(loaded, margin_mm)
+    if net and isinstance(loaded, TargetDesign):
+        parts = [net_part(loaded)]
+        fitting = paper_for(parts)
+        paper = paper if given or paper == OWN else fitting or OWN
+        if paper != OWN and len(paper_sheets(parts, paper, "")) > 1:
+            raise InputError(
+                "E-DRAW-SHEETS",
+                f"--net: {_size(parts[0])}, and a sheet of {paper} has room for {_room(paper)}; take --paper "
+                f"{fitting or OWN}, or draw the plates one by one without --net",
+            )
+    else:
+        parts = target_parts(loaded, margin_mm) if isinstance(loaded, TargetDesign) else board_parts(loaded, margin_mm)
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
     save(path, content_of(sheets, path))
     return Drawn(path, parts, sheets, paper)
 
 
-def _parts(what: Design, margin_mm: float) -> list[Part]:
-    return target_parts(what, margin_mm) if isinstance(what, TargetDesign) else board_parts(what, margin_mm)
+def net_text(target: TargetDesign) -> str:
+    """Return how large the net of a body is, and which paper takes it."""
+    part = net_part(target)
+    paper = paper_for([part])
+    return f"net to fold, {_size(part)}: {f'one sheet of {paper}' if paper else 'larger than A0'}"
 
 
-def net_for(target: TargetDesign, paper: str) -> list[Part]:
-    """Return the net in few pieces, or, if a seam would run through a circle or tag, in pieces of one sheet each."""
-    few = net_parts(target)
-    if paper == OWN or not any(sheet.cuts for sheet in paper_sheets(few, paper, "")):
-        return few
-    small = net_parts(target, lambda part: len(paper_sheets([part], paper, "")) == 1)
-    return few if any(sheet.cuts for sheet in paper_sheets(small, paper, "")) else small
-
-
-def net_text(target: TargetDesign, paper: str = "A4") -> str:
-    """Return how large the net of a body is, and how many sheets of a paper it takes."""
-    whole = net_parts(target)
-    sizes = [" × ".join(said_mm(side) for side in np.ptp(part.outline, axis=0)) for part in whole]
-    count = len(paper_sheets(net_for(target, paper), paper, ""))
-    room = "" if count == len(whole) else f", as a sheet has room for {_room(paper)}"
-    return f"net to fold, {', '.join(sizes)} mm: {count} sheet{'s' * (count > 1)} of {paper}{room}"
+def _size(part: Part) -> str:
+    return f"{' × '.join(said_mm(side) for side in np.ptp(part.outline, axis=0))} mm"
 
 
 def _room(paper: str) -> str:
@@ -134,8 +134,8 @@ def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sh
 
 
 def paper_for(parts: Sequence[Part]) -> str | None:
-    """Return the smallest paper of the A series that takes each part on one sheet, or None."""
-    for paper in ("A5", "A4", "A3", "A2", "A1", "A0"):
+    """Return the smallest paper from A4 to A0 that takes each part on one sheet, or None."""
+    for paper in ("A4", "A3", "A2", "A1", "A0"):
         try:
             if len(paper_sheets(parts, paper, "")) == len(parts):
                 return paper
@@ -149,8 +149,7 @@ def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
 
     Raises InputError: there are more or larger sheets than the form holds.
     """
-    suffix = path.suffix.lower()
-    if suffix == ".pdf":
+    if path.suffix.lower() == ".pdf":
         largest = max(max(sheet.width, sheet.height) for sheet in sheets)
         if largest > MOST_MM:
             raise InputError(
@@ -162,7 +161,7 @@ def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
         raise InputError(
             "E-DRAW-SHEETS", f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none"
         )
-    return svg(sheets[0]) if suffix == ".svg" else dxf(sheets[0])
+    return svg(sheets[0])
 
 
 def _paper(path: Path, paper: str) -> str:
@@ -175,12 +174,7 @@ def _paper(path: Path, paper: str) -> str:
     names = {name.lower(): name for name in (*PAPERS, OWN)}
     if paper and paper.lower() not in names:
         raise InputError("E-OPTION-VALUE", f"--paper {paper}: unknown; one of {', '.join(names.values())} needed")
-    name = names.get(paper.lower(), "A4" if suffix == ".pdf" else OWN)
-    if suffix == ".dxf" and name != OWN:
-        raise InputError(
-            "E-OPTION-CONFLICT", f"--paper {paper}: a DXF is no page; take .pdf or .svg, or leave --paper out"
-        )
-    return name
+    return names.get(paper.lower(), "A4" if suffix == ".pdf" else OWN)
 
 
 def drawn_text(drawn: Drawn) -> str:
@@ -192,21 +186,17 @@ def drawn_text(drawn: Drawn) -> str:
     sheets = len(drawn.sheets)
     kind = "of its own size" if drawn.paper == OWN else drawn.paper
     lines.append(f"{drawn.path}: {sheets} sheet{'s' if sheets > 1 else ''} {kind}")
-    if drawn.path.suffix.lower() == ".dxf":
-        lines.append("lengths are mm; PATTERN and GROUND are inked or milled, CUT is cut, the other layers are to read")
-    else:
-        lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
+    lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
     if bare := sum(sheet.bare for sheet in drawn.sheets):
         which = "the sheet is" if sheets == 1 else f"{bare} of {sheets} sheets are"
         lines.append(f"{which} without dimensions and table, which would take more sheets")
     if drawn.paper != OWN and sheets > len(drawn.parts):
         whole = paper_for(drawn.parts)
         larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
-        single = ", or one by one without --net" if drawn.parts[0].name.startswith("net") else ""
         through = ", the worse as one runs through a pattern" if any(sheet.cuts for sheet in drawn.sheets) else ""
         lines.append(
             f"a sheet of {drawn.paper} has room for {_room(drawn.paper)}, either way round, dimensions included; "
             f"parts that are glued of several sheets are off at the seams{through}: state it in sigma_mm, or "
-            f"{larger}{single}"
+            f"{larger}"
         )
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Sheets in mm as SVG, as DXF for laser and mill, and as PDF through matplotlib."""
+"""Sheets in mm as SVG, and as PDF through matplotlib."""
 
 import io
 import warnings
@@ -9,7 +9,6 @@ import numpy as np
 
 from stcal.drawing.parts import LAYERS, Area, Disc, Shape, Text
 from stcal.drawing.sheets import Sheet
-from stcal.errors import InputError
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
 CAPITAL_SHARE = 0.72
@@ -71,70 +70,6 @@ def _path(points: np.ndarray, height: float, closed: bool = True) -> str:
 def _number(value: float) -> str:
     """Return the text of a length to the nanometre, without trailing zeros."""
     return f"{value:.6f}".rstrip("0").rstrip(".")
-
-
-DXF_COLOURS = {"GROUND": 9, "PATTERN": 7, "CUT": 1, "FOLD": 3, "DIMENSIONS": 8, "LABELS": 8}
-"""AutoCAD's colour numbers of the layers."""
-APPLICATION = "STCAL"
-
-
-def new_drawing():
-    """Return an empty drawing, R2010, mm.
-
-    Raises InputError: ``stereo-target-calibration[cad]`` is not installed.
-    """
-    try:
-        from ezdxf import units
-        from ezdxf.filemanagement import new
-    except ImportError as error:
-        raise InputError("E-EXTRA-MISSING", "DXF: needs ezdxf; install stereo-target-calibration[cad]") from error
-    return new("R2010", units=units.MM)
-
-
-def dxf_text(drawing) -> str:
-    """Return the drawing as the text of a file."""
-    stream = io.StringIO()
-    drawing.write(stream)
-    return stream.getvalue()
-
-
-def dxf(sheet: Sheet) -> str:
-    """Return the text of the file, R2010.
-
-    It holds ``CIRCLE``, closed ``LWPOLYLINE`` (the area between it and those inside it is inked) and ``TEXT``. Labels
-    of circles and the ink are extended data ``STCAL``.
-
-    Raises InputError: ``stereo-target-calibration[cad]`` is not installed.
-    """
-    drawing = new_drawing()
-    drawing.appids.add(APPLICATION)
-    drawing.linetypes.add("FOLD", [4.5, 3.0, -1.5], description="__ __")
-    for layer in LAYERS:
-        drawing.layers.add(layer, color=DXF_COLOURS[layer], linetype="FOLD" if layer == "FOLD" else "CONTINUOUS")
-    space = drawing.modelspace()
-    for shape in sheet.shapes():
-        for entity in _entities(space, shape):
-            if not isinstance(shape, Text):
-                name = [(1000, shape.name)] if isinstance(shape, Disc) and shape.name else []
-                entity.set_xdata(APPLICATION, [(1000, shape.ink), *name])
-    drawing.header.custom_vars.append("stcal", sheet.title)
-    return dxf_text(drawing)
-
-
-def _entities(space, shape: Shape) -> list:
-    attribs = {"layer": shape.layer}
-    if isinstance(shape, Disc):
-        return [space.add_circle((shape.x, shape.y), shape.radius, dxfattribs=attribs)]
-    if isinstance(shape, Area):
-        return [space.add_lwpolyline(np.asarray(line).tolist(), close=True, dxfattribs=attribs) for line in shape.lines]
-    if isinstance(shape, Text):
-        from ezdxf.enums import TextEntityAlignment
-
-        text = space.add_text(shape.words, height=shape.height, rotation=90 if shape.turned else 0, dxfattribs=attribs)
-        align = {"start": "LEFT", "middle": "CENTER", "end": "RIGHT"}[shape.anchor]
-        text.set_placement((shape.x, shape.y), align=TextEntityAlignment[align])
-        return [text]
-    return [space.add_lwpolyline(shape.points.tolist(), close=shape.closed, dxfattribs=attribs)]
 
 
 INCH_MM = 25.4

@@ -3,7 +3,7 @@
 The plates are the faces' ``outline_mm``, placed by their rough poses.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,12 +47,10 @@ class _Plate:
         return self.place(self.face.outline_mm)
 
 
-def net_parts(target: TargetDesign, fits: Callable[[Part], bool] = lambda _: True) -> list[Part]:
-    """Return the net in few pieces, in each of which no plates overlap.
+def net_part(target: TargetDesign) -> Part:
+    """Return the net of all plates.
 
-    ``fits`` : whether a piece of several plates may be as large as this; by default it may always.
-
-    Raises InputError: a face has no outline or rough pose, or no two plates share an edge.
+    Raises InputError: a face has no outline or rough pose, or a plate has no place in the net.
     """
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:
@@ -63,34 +61,28 @@ def net_parts(target: TargetDesign, fits: Callable[[Part], bool] = lambda _: Tru
             )
     target = replace(target, faces=tuple(as_seen(face) for face in target.faces))
     shared = _shared_edges(target)
-    if not shared:
-        raise InputError(
-            "E-DRAW-NET", "--net: no two plates share an edge; correct outline_mm and rough_pose, or draw without --net"
-        )
     faces = [replace(face, outline_mm=_against_the_clock(face)) for face in target.faces]
-    remaining = sorted(faces, key=lambda face: -sum(face.id == face_id for face_id, _ in shared))
-    pieces: list[list[_Plate]] = []
+    first = max(faces, key=lambda face: sum(face.id == face_id for face_id, _ in shared))
+    plates = [_Plate(first, np.eye(2), np.zeros(2))]
+    free = {face.id for face in faces} - {first.id}
     folds: set[tuple[tuple[str, int], tuple[str, int]]] = set()
-    while remaining:
-        piece = [_Plate(remaining[0], np.eye(2), np.zeros(2))]
-        free = {face.id for face in remaining[1:]}
-        for plate in piece:  # grows
-            for edge in range(len(plate.corners())):
-                partner = shared.get((plate.face.id, edge))
-                if partner is None or partner[0] not in free:
-                    continue
-                unfolded = _unfolded(plate, edge, target.face(partner[0]), partner[1])
-                if not _is_clear(unfolded.corners(), piece):
-                    continue
-                more = folds | {((plate.face.id, edge), partner), (partner, (plate.face.id, edge))}
-                if fits(_part("net", [*piece, unfolded], target, shared, more)):
-                    piece.append(unfolded)
-                    free.remove(partner[0])
-                    folds = more
-        pieces.append(piece)
-        remaining = [face for face in remaining if face.id in free]
-    names = [f"net {n} of {len(pieces)}" for n in range(1, len(pieces) + 1)] if len(pieces) > 1 else ["net"]
-    return [_part(name, piece, target, shared, folds) for name, piece in zip(names, pieces, strict=True)]
+    for plate in plates:  # grows
+        for edge in range(len(plate.corners())):
+            partner = shared.get((plate.face.id, edge))
+            if partner is None or partner[0] not in free:
+                continue
+            unfolded = _unfolded(plate, edge, target.face(partner[0]), partner[1])
+            if _is_clear(unfolded.corners(), plates):
+                plates.append(unfolded)
+                free.remove(partner[0])
+                folds |= {((plate.face.id, edge), partner), (partner, (plate.face.id, edge))}
+    if free:
+        raise InputError(
+            "E-DRAW-NET",
+            f"--net: the plate of face {min(free)} shares no edge with the others, or would lie on one; correct "
+            "outline_mm and rough_pose, or draw plates one by one without --net",
+        )
+    return _part(plates, target, shared, folds)
 
 
 def _shared_edges(target: TargetDesign) -> dict[tuple[str, int], tuple[str, int]]:
@@ -147,12 +139,12 @@ def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
     return True
 
 
-def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -> Part:
+def _part(plates: list[_Plate], target: TargetDesign, shared, folds) -> Part:
     grounds: list[Shape] = []
     shapes: list[Shape] = []
     lines: list[Line] = []
     tabs: list[np.ndarray] = []
-    for plate in piece:
+    for plate in plates:
         plate_part = face_part(plate.face, target.polarity, 0.0)
         for shape in plate_part.shapes:
             if isinstance(shape, Disc):
@@ -174,7 +166,7 @@ def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -
                     lines.append(Line(ends, "FOLD", "grey", dashed=True))
                 continue
             tab = _tab(ends) if partner and edge_id < partner else None
-            if tab is None or not _is_clear(tab, piece) or any(_overlap(tab, drawn_tab) for drawn_tab in tabs):
+            if tab is None or not _is_clear(tab, plates) or any(_overlap(tab, drawn_tab) for drawn_tab in tabs):
                 lines.append(Line(ends, "CUT", width=0.1))
                 continue
             tabs.append(tab)
@@ -184,10 +176,10 @@ def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -
             words = f"under {partner[0]}"
             at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
             shapes.append(Text(*at, words, LETTERS, "middle", turned=not level))
-    every = np.concatenate([*(plate.corners() for plate in piece), *tabs])
+    every = np.concatenate([*(plate.corners() for plate in plates), *tabs])
     (left, below), (right, above) = every.min(0), every.max(0)
     outline = np.array([[left, below], [right, below], [right, above], [left, above]])
-    return Part(name, outline, (*grounds, *shapes, *_sketch(piece, right + APART, above)), lines=tuple(lines))
+    return Part("net", outline, (*grounds, *shapes, *_sketch(plates, right + APART, above)), lines=tuple(lines))
 
 
 def _tab(ends: np.ndarray) -> np.ndarray:
@@ -200,18 +192,18 @@ def _tab(ends: np.ndarray) -> np.ndarray:
     return np.array([ends[0], ends[0] + width * (along + out), ends[1] + width * (out - along), ends[1]])
 
 
-def _sketch(piece: list[_Plate], left: float, above: float) -> list[Shape]:
+def _sketch(plates: list[_Plate], left: float, above: float) -> list[Shape]:
     """Return a small sketch of the plates, each with the name of its face, and the numbers of its circles."""
-    every = np.concatenate([plate.corners() for plate in piece])
-    scale = SKETCH if any(plate.face.printed for plate in piece) else SKETCH_OF_CIRCLES
+    every = np.concatenate([plate.corners() for plate in plates])
+    scale = SKETCH if any(plate.face.printed for plate in plates) else SKETCH_OF_CIRCLES
     shift = np.array([left, above]) - scale * np.array([every[:, 0].min(), every[:, 1].max()])
     words: list[Text] = []
-    for plate in piece:
+    for plate in plates:
         if plate.face.printed is None:  # corners of tags have no numbers
             places = scale * plate.place(plate.face.xy_mm) + shift
             words += words_with_room(places, plate.face.ids, SMALL_LETTERS, words)
-    outlines = [scale * plate.corners() + shift for plate in piece]
-    for plate, corners in zip(piece, outlines, strict=True):
+    outlines = [scale * plate.corners() + shift for plate in plates]
+    for plate, corners in zip(plates, outlines, strict=True):
         words.append(_name(plate.face.id, corners, words))
     return [*(Line(corners, "LABELS", closed=True) for corners in outlines), *words]
 

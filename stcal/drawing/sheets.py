@@ -178,10 +178,6 @@ class Sheet:
     cuts: bool = False
     bare: bool = False
 
-    def shapes(self) -> list[Shape]:
-        """Return all shapes of the page."""
-        return [shape for item in self.placed for shape in item.shapes]
-
 
 def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
     """Return one sheet with all parts, as large as needed."""

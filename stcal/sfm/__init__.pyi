@@ -5,12 +5,10 @@ from .checks.verdict import Trial as Trial
 from .checks.verdict import judge as judge
 from .detect.labels import Detection as Detection
 from .detect.labels import detect_circles as detect_circles
-from .diagnose.doctor import doctor as doctor
 from .interop.crosscheck import crosscheck as crosscheck
 from .interop.export import export_run as export_run
 from .interop.export_database import export_database as export_database
 from .interop.export_model import export_model as export_model
-from .interop.gates import initial_pairs as initial_pairs
 from .interop.native import calibrate_models as calibrate_models
 from .make.design import DesignOptions as DesignOptions
 from .make.design import design_tag_body as design_tag_body
@@ -35,4 +33,3 @@ from .runs.options import RunOptions as RunOptions
 from .runs.result import ImageResult as ImageResult
 from .runs.result import RunResult as RunResult
 from .runs.saved import load_run as load_run
-from .runs.verify import verify as verify

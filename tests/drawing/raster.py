@@ -15,6 +15,11 @@ PER_MM = 4
 OBLIQUE_RAD = np.radians(50)
 
 
+def shapes_of(sheet) -> list:
+    """All shapes of a page."""
+    return [shape for item in sheet.placed for shape in item.shapes]
+
+
 def page_image(sheet, per_mm: int = PER_MM) -> np.ndarray:
     """The page, grey, as matplotlib fills it: pixels ``per_mm`` a millimetre."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -1,8 +1,6 @@
 """Lengths in files are exact, sheets of a paper cover what is split over them, and what cannot be drawn is refused."""
 
-import importlib
 import re
-import sys
 from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -32,6 +30,7 @@ from stcal.drawing.sheets import (
     table,
 )
 from stcal.io.design import board_toml, target_toml
+from tests.drawing.raster import shapes_of
 from tests.outcome import fails_with
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -76,33 +75,6 @@ def test_svg_has_the_target_in_mm(files):
         assert radius < x < width - radius
         circles[each.get("data-label")] = (np.array([x, -y]), radius)
     assert_is_the_target(circles)
-
-
-@pytest.mark.slow
-def test_dxf_has_the_target_in_mm(files):
-    ezdxf = importlib.import_module("ezdxf")
-    drawing = ezdxf.readfile(draw(files / "target.toml", files / "target.dxf").path)
-    assert not drawing.audit().errors
-    assert drawing.header["$INSUNITS"] == ezdxf.units.MM
-    circles = {}
-    for each in drawing.modelspace().query('CIRCLE[layer=="PATTERN"]'):
-        ink, label = [tag.value for tag in each.get_xdata("STCAL")[-2:]]
-        assert ink == "white"
-        circles[label] = (np.array(each.dxf.center)[:2], each.dxf.radius)
-    assert_is_the_target(circles)
-    plates = drawing.modelspace().query('LWPOLYLINE[layer=="CUT"]')
-    assert sum(line.closed for line in plates) == len(reference_target().faces)
-
-
-def test_dxf_has_black_areas_as_closed_lines(files):
-    (files / "board.toml").write_text('type = "chessboard"\nrows = 3\ncolumns = 4\nsquare_mm = 12.5\n')
-    drawing = importlib.import_module("ezdxf").readfile(draw(files / "board.toml", files / "board.dxf").path)
-    squares = drawing.modelspace().query('LWPOLYLINE[layer=="PATTERN"]')
-    assert len(squares) == 10
-    for square in squares:
-        assert square.closed
-        xy = np.array(square.get_points("xy"))
-        np.testing.assert_allclose(np.linalg.norm(xy - np.roll(xy, 1, axis=0), axis=1), 12.5)
 
 
 @pytest.mark.slow
@@ -183,7 +155,7 @@ def test_a_board_that_fits_a_sheet_without_its_dimensions_is_not_cut():
     (part,) = board_parts(board, 10.0)
     (sheet,) = paper_sheets([part], "A4", "board")
     assert (sheet.bare, sheet.cuts, sheet.width) == (True, False, 297.0)
-    discs = [shape for shape in sheet.shapes() if isinstance(shape, Disc)]
+    discs = [shape for shape in shapes_of(sheet) if isinstance(shape, Disc)]
     assert len(discs) == 13 * 17
     assert not any(sheet.bare for sheet in paper_sheets([part], "A3", "board"))
 
@@ -193,7 +165,7 @@ def test_parts_on_one_sheet_stand_in_rows():
     part = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)[0]
     sheet = one_sheet([replace(part, name=f"board {i}") for i in range(9)], "boards")
     assert 0.3 < (sheet.width - FURNITURE[0]) / (sheet.height - FURNITURE[1]) < 3
-    cut = [s for s in sheet.shapes() if isinstance(s, Line) and s.closed]
+    cut = [s for s in shapes_of(sheet) if isinstance(s, Line) and s.closed]
     boxes = [extent([line]) for line in cut]
     for i, one in enumerate(boxes):
         assert (one[0] >= 0).all()
@@ -237,10 +209,9 @@ def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():
 @pytest.mark.parametrize(
     ("name", "paper", "said"),
     [
-        ("a.png", "", "E-OUTPUT-SUFFIX … .png … .pdf, .svg, .dxf"),
+        ("a.png", "", "E-OUTPUT-SUFFIX … .png … .pdf, .svg"),
         ("a", "", "E-OUTPUT-SUFFIX … missing"),
         ("a.pdf", "A9", "E-OPTION-VALUE … --paper … A9 … A5"),
-        ("a.dxf", "A4", "E-OPTION-CONFLICT … --paper … A4"),
         ("a.svg", "A4", "E-DRAW-SHEETS … 2"),
     ],
 )
@@ -291,12 +262,6 @@ def test_circles_without_a_radius_are_refused(files):
     )
     with fails_with("E-BOARD-RADIUS … radius_mm"):
         draw(files / "grid.yaml", files / "grid.pdf")
-
-
-def test_dxf_names_the_library_that_is_missing(files, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ezdxf", None)
-    with fails_with("E-EXTRA-MISSING"):
-        draw(files / "board.toml", files / "board.dxf")
 
 
 @pytest.mark.slow

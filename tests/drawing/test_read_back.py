@@ -15,7 +15,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_images, label_single  # noqa: F401
 from stcal.synthetic.designs import second_design
-from tests.drawing.raster import camera_of, obliquely, page_image, pdf_pages, pixel_from_page
+from tests.drawing.raster import camera_of, obliquely, page_image, pdf_pages, pixel_from_page, shapes_of
 
 CIRCLE_PX, CORNER_PX = 0.1, 0.3
 """How well centres and corners are found again in an image without noise, blurred a little: edges of 8-bit pixels, and
@@ -28,7 +28,7 @@ ANGLES = np.arange(64) * np.pi / 32
 def rims_px(sheet, page) -> dict[str, np.ndarray]:
     """Rims of the circles in the page's image, by label, (64, 2)."""
     rim = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
-    discs = [s for s in sheet.shapes() if isinstance(s, Disc)]
+    discs = [s for s in shapes_of(sheet) if isinstance(s, Disc)]
     return {s.name: pixel_from_page(page, [s.x, s.y] + s.radius * rim) for s in discs}
 
 
@@ -80,7 +80,7 @@ def test_dots_are_read_back():
 def points_px(sheet, part, board, page) -> np.ndarray:
     """Where the points of a board of squares are in the page's image."""
     areas = [s for s in part.shapes if isinstance(s, Area)]
-    there = [s for s in sheet.shapes() if isinstance(s, Area)]
+    there = [s for s in shapes_of(sheet) if isinstance(s, Area)]
     shift = there[0].lines[0][0] - areas[0].lines[0][0]
     return pixel_from_page(page, board.xy_mm() * [1, -1] + shift)
 

@@ -93,7 +93,6 @@ OF_IMAGES = {
     for each in reversed((*CALLS, *MORE))
     if "bayer" in inspect.signature(COMMANDS[each.command]).parameters and "@handeye/poses.csv" not in each.words
 }
-OF_IMAGES.pop("sfm doctor")  # it looks at images that were not mapped, of which the call's run has none
 
 
 @pytest.mark.slow

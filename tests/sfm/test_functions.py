@@ -5,7 +5,6 @@ Functions take a run as its folder, as `load_run` reads it, or as `run` returned
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +14,6 @@ from PIL import Image
 import stcal
 from stcal import sfm
 from stcal.io.files import json_text
-from stcal.sfm.diagnose.findings import DoctorFile
-from stcal.sfm.interop.gates import PairsFile
 from stcal.sfm.planning.file import plan_text
 from tests.outcome import fails_with
 from tests.shared import own_copy
@@ -26,17 +23,6 @@ def written_json(stcal_sfm, out, *words) -> dict:
     """What a command writes as JSON."""
     assert stcal_sfm(*words, "--json", out)[0] == 0
     return json.loads(out.read_text(encoding="utf-8"))
-
-
-def test_verify_and_pairs_and_doctor(stcal_sfm, small_result, small_run, small_dataset, tmp_path):
-    answer = written_json(stcal_sfm, tmp_path / "a.json", "verify", small_run)
-    assert json.loads(json_text(sfm.verify(small_result))) == answer
-    answer = written_json(stcal_sfm, tmp_path / "b.json", "pairs", small_run, "--group", "14")
-    assert json.loads(json_text(PairsFile.of(sfm.initial_pairs(small_run, "14")))) == answer
-    images = small_dataset / "images"
-    answer = written_json(stcal_sfm, tmp_path / "c.json", "doctor", small_run, "--images", images, "--workers", "1")
-    found = DoctorFile.of(sfm.doctor(sfm.load_run(small_run), images, workers=1))
-    assert json.loads(json_text(found)) == answer
 
 
 def test_compare(stcal_sfm, small_run, small_dataset, tmp_path):
@@ -61,7 +47,7 @@ def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
 def test_exports(stcal_sfm, small_result, small_run, tmp_path):
     for words, call in (
         (("export", "urdf"), lambda out: sfm.export_run(small_result, out)),
-        (("export-model", "ply", "--format", "ply"), lambda out: sfm.export_model(small_run, out, "ply")),
+        (("export-model", "nvm", "--format", "nvm"), lambda out: sfm.export_model(small_run, out, "nvm")),
         (("export-database", "db", "--schema", "3.8"), lambda out: sfm.export_database(small_result, out, "3.8")),
     ):
         one, two = tmp_path / f"one.{words[1]}", tmp_path / f"two.{words[1]}"
@@ -146,7 +132,7 @@ def test_report_again(stcal_sfm, small_run, tmp_path):
 
 @pytest.mark.parametrize(
     "call",
-    [sfm.verify, sfm.doctor, sfm.initial_pairs, sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise],
+    [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise],
     ids=lambda call: call.__name__,
 )
 def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
@@ -156,10 +142,3 @@ def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
         call(replace(small_result, out=None))
     with fails_with(f"E-RUN-FOLDER … {tmp_path}"):
         call(tmp_path)
-
-
-def test_a_damaged_file_is_changed(small_run, tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    shutil.copy(small_run / "stcal-run.json", run)
-    assert not sfm.verify(run).whole

@@ -1,12 +1,12 @@
-"""Commands ``stcal-sfm`` for the exchange with COLMAP and other programs, and for images and circles left out."""
+"""Commands ``stcal-sfm`` for the exchange with COLMAP and other programs."""
 
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from stcal.cli.options import WRITES, Arg, JsonFile, Opt, Run, Workers
-from stcal.cli.terminal import StageProgress, say, write_if
+from stcal.cli.options import WRITES, Arg, Opt, Run
+from stcal.cli.terminal import StageProgress, say
 from stcal.errors import InputError, MappingError
 
 app = typer.Typer()
@@ -14,9 +14,6 @@ app = typer.Typer()
 
 Chained = Literal["chain", "paper"]
 """Way in which the faces of single groups are combined."""
-
-
-SHOWN_PAIRS = 10
 
 
 @app.command(name="export-database")
@@ -35,10 +32,8 @@ def export_database(
 @app.command(name="export-model")
 def export_model(
     run: Run,
-    out: Annotated[
-        Path, "Write to this place: a new file for ply and nvm, a new or empty folder for the others.", Arg("OUT")
-    ],
-    kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, ply, nvm or bundler.", Opt("--format")],
+    out: Annotated[Path, "Write to this place: a new file for nvm, a new or empty folder for the others.", Arg("OUT")],
+    kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, nvm or bundler.", Opt("--format")],
 ) -> None:
     """Write the run's final model in mm, in the target frame, for other programs, with a file of labels."""
     from stcal.sfm.interop.crosscheck import model_text
@@ -53,17 +48,16 @@ def export_run(
     out: Annotated[
         Path,
         "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
-        "1), .yml (OpenCV), .csv, .ply, .dxf, .gltf, .glb or .rrd (Rerun).",
+        "1), .yml (OpenCV), .csv, .gltf or .glb.",
         Arg("FILE", writes=True),
     ],
     form: Annotated[
         str,
-        "Write this form, whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb or "
-        "rerun.",
+        "Write this form, whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, gltf or glb.",
     ] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
-    """Write faces and circles for robots, drawings and viewers, with σ and cameras if the form can hold them."""
+    """Write faces and circles for robots and viewers, with σ and cameras if the form can hold them."""
     from stcal.sfm.interop.crosscheck import export_text
     from stcal.sfm.interop.export import export_run as export
 
@@ -135,42 +129,3 @@ def faces(
     say(faces_text(calibration, saved))
     if out is not None:
         say(f"faces: {out}")
-
-
-@app.command()
-def pairs(
-    run: Run,
-    group: Annotated[str | None, "Show only this group."] = None,
-    everything: Annotated[bool, "Show all pairs; the first ten if not given.", Opt("--all")] = False,
-    out: JsonFile = None,
-) -> None:
-    """Rank the initial pairs, and show which gates each passes: ours, and COLMAP's as set and at its defaults."""
-    from stcal.sfm.interop.gates import PairsFile, initial_pairs, limits_text, pairs_table
-    from stcal.sfm.runs.saved import load_run
-
-    saved = load_run(run)
-    gates_by_group = initial_pairs(saved, group)
-    for name, rows in gates_by_group.items():
-        images = len({image for row in rows for image in (row.score.first, row.score.second)})
-        say(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
-    say(limits_text(saved.options.pairs))
-    write_if(out, lambda: PairsFile.of(gates_by_group), "as JSON")
-
-
-@app.command()
-def doctor(
-    run: Run,
-    images: Annotated[Path | None, "Read the photographs from this folder, if they were moved after the run."] = None,
-    everything: Annotated[bool, "Show all lines; the first forty if not given.", Opt("--all")] = False,
-    out: JsonFile = None,
-    workers: Workers = None,
-) -> None:
-    """Explain why images and circles were left out: the threshold, the value, and what would let each in."""
-    from stcal.sfm.diagnose import findings
-    from stcal.sfm.diagnose.doctor import doctor as diagnosed
-    from stcal.sfm.diagnose.findings import DoctorFile
-
-    with StageProgress() as progress:
-        diagnosis = diagnosed(run, images, workers, progress)
-    say(findings.table(diagnosis, None if everything else findings.MAX_LINES))
-    write_if(out, lambda: DoctorFile.of(diagnosis), "as JSON")

@@ -345,7 +345,7 @@ CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
 @app.command()
 def draw(
     design: Annotated[Path, "Read this target.toml, or this board file of any kind.", Arg("DESIGN")],
-    out: Annotated[Path, "Write this file; its suffix selects the form: .pdf, .svg or .dxf.", WRITES],
+    out: Annotated[Path, "Write this file; its suffix selects the form: .pdf or .svg.", WRITES],
     paper: Annotated[
         str,
         "Print on as many sheets of this paper as needed: A5 … A0, Letter, Legal or Tabloid. With own, a page is as "

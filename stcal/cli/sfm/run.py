@@ -1,4 +1,4 @@
-"""Commands ``stcal-sfm run``, ``detect``, ``verify``, ``report`` and ``budget``: calibration of a target."""
+"""Commands ``stcal-sfm run``, ``detect``, ``report`` and ``budget``: calibration of a target."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -174,18 +174,6 @@ def detect(
     print_each("note", found.notes)
     say(detection_text(found.detection, found.labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
-
-
-@app.command()
-def verify(run: shared.Run, out: shared.JsonFile = None) -> None:
-    """Compare all files of a run's folder with the hashes that the run stored, and its version with this one."""
-    from stcal.sfm.runs.verify import require_whole, verified_text
-    from stcal.sfm.runs.verify import verify as verified
-
-    result = verified(run)
-    say(verified_text(result))
-    write_if(out, lambda: result, "as JSON")
-    require_whole(result)
 
 
 @app.command()

@@ -19,7 +19,7 @@ from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Source, Statement
 from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun
-from stcal.sfm.runs.verify import VerifyFile
+from stcal.sfm.runs.verify import Verified
 
 MICRO = 1e3
 MILLIDEGREES = 1e3 * float(np.degrees(1.0))
@@ -218,7 +218,7 @@ class BudgetFile(ResultFile):
 
     @classmethod
     def of(
-        cls, budget: Budget, run: SavedRun, verified: VerifyFile, tests: Sequence[LengthTest] = (), *others: SavedRun
+        cls, budget: Budget, run: SavedRun, verified: Verified, tests: Sequence[LengthTest] = (), *others: SavedRun
     ) -> "BudgetFile":
         """Returns the file of a run's budget.
 
@@ -229,7 +229,7 @@ class BudgetFile(ResultFile):
         return cls.model_validate(_content(budget, run, verified) | {"length_tests": parts})
 
 
-def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, Any]:
+def _content(budget: Budget, run: SavedRun, verified: Verified) -> dict[str, Any]:
     stated, conditions, refused = budget.statement, budget.conditions, is_refused(run)
     without_lengths = refused or not conditions.size_known
     return {
@@ -419,7 +419,7 @@ def _unusual(statement: Statement) -> list[str]:
     return asked
 
 
-def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
+def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     unknown = [source.title for source in budget.sources if source.origin == "not stated"]
     notes = []
@@ -459,7 +459,7 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
             "both (one_thermometer of the statement), U is too large"
         )
     notes += _unusual(budget.statement)
-    notes += verified.said()
+    notes += verified.notes()
     notes.append(
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
         "the frame is in the poses of the other faces"

@@ -41,12 +41,10 @@ rejects printed grids of equal discs."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceReading:
-    """One face in one image: ``index`` : (n circles,) into the candidates, −1 if missing; ``homography`` : from the
-    face plane (mm) to normalised coordinates."""
+    """One face in one image: ``index`` : (n circles,) into the candidates, −1 if missing."""
 
     face: FaceDesign
     index: np.ndarray
-    homography: np.ndarray
 
     def count(self) -> int:
         """Returns the number of circles found."""
@@ -62,27 +60,12 @@ class FaceReading:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefusedReading:
-    """Candidates that were not named: ``readings`` that fit them, and the ``value`` that failed the ``limit`` of
-    ``gate``."""
-
-    readings: tuple[FaceReading, ...]
-    gate: str
-    value: float
-    limit: float
-
-    def used(self) -> np.ndarray:
-        """Returns the indices of the candidates of any reading."""
-        return np.unique(np.concatenate([each.used() for each in self.readings]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
     """Faces in one image: ``faces`` : unambiguously named; a face in view twice has two readings; ``refused`` :
-    patterns without a name, and why."""
+    readings of each pattern without a name."""
 
     faces: tuple[FaceReading, ...]
-    refused: tuple[RefusedReading, ...]
+    refused: tuple[tuple[FaceReading, ...], ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +221,7 @@ class FaceFinder:
             match, number = grown[rank], int(starts.face[rank])
             face = self.target.faces[number]
             if match is not None and _seen_from_outside(match[1], face):
-                readings.append(FaceReading(face, _of_one_size(candidates, face, *match), match[1]))
+                readings.append(FaceReading(face, _of_one_size(candidates, face, *match)))
                 is_open[starts.agree(number, readings[-1].index)] = False
         return _decide(readings, self.target)
 
@@ -351,7 +334,7 @@ def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
     readings = [r for r in readings if r.count() >= needed_circles(r.face)]
     readings.sort(key=lambda r: -r.count())
     named: list[FaceReading] = []
-    refused: list[RefusedReading] = []
+    refused: list[tuple[FaceReading, ...]] = []
     settled: set[int] = set()
     for reading in readings:
         used = set(reading.used())
@@ -367,7 +350,7 @@ def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
             and not (r.face is reading.face and (r.index == reading.index).all())
         ]
         if ambiguous or not is_named(reading.face, reading.index >= 0, target):
-            refused.append(RefusedReading((reading, *ambiguous), "face_readings", max(len(ambiguous), 1), 0))
+            refused.append((reading, *ambiguous))
         else:
             named.append(reading)
     return FaceFinding(tuple(named), tuple(refused))

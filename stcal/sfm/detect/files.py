@@ -42,7 +42,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 9
+CACHE_VERSION = 10
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 PHOTOGRAPHS = "the photographs"

@@ -206,9 +206,9 @@ def _detect_circles(
     of_board = board.polarity if board else target.polarity
     free, found = reading.free, reading.found[of_board]
     patterns = [_Pattern(target.polarity, free.select(face.used()), face.labels()) for face in named]
-    for nameless in refused:
-        used = nameless.used()
-        patterns.append(_Pattern(target.polarity, free.select(used), [NAMELESS] * len(used)))
+    used = [np.unique(np.concatenate([reading.used() for reading in nameless])) for nameless in refused]
+    for candidates in used:
+        patterns.append(_Pattern(target.polarity, free.select(candidates), [NAMELESS] * len(candidates)))
     for grid in boards:
         patterns.append(_Pattern(of_board, found.select(grid.candidates), [DOT] * len(grid.candidates)))
     measured = _measured(grey, camera, patterns, reading.found)
@@ -221,10 +221,10 @@ def _detect_circles(
     faces, open_faces, board_sightings = [], [], []
     for face, (ok, rows) in zip(named, measured_rows[:first], strict=True):
         faces.append(FaceSighting(face.face.id, rows, np.flatnonzero(face.index >= 0)[ok]))
-    for nameless, (ok, rows) in zip(refused, measured_rows[first:second], strict=True):
+    for nameless, candidates, (ok, rows) in zip(refused, used, measured_rows[first:second], strict=True):
         row = np.full(len(reading.free), -1)
-        row[nameless.used()[ok]] = rows
-        open_faces.append(tuple(_sighting(face, row) for face in nameless.readings))
+        row[candidates[ok]] = rows
+        open_faces.append(tuple(_sighting(face, row) for face in nameless))
     for grid, (ok, rows) in zip(boards, measured_rows[second:], strict=True):
         board_sightings.append(BoardSighting(rows, grid.numberings[:, ok], grid.unlikely[:, ok]))
     return ImageDetection(

@@ -444,18 +444,13 @@ def _once(view: PlaneView, readings: list[Readings]) -> bool:
     return sum(each[0].plane == view.plane for each in readings if each[0].named) == 1
 
 
-OF_A_BOARD, OF_A_FACE = ("a board of ", "board of "), ("a pattern ",)
-"""Beginnings of notes on a whole board or face that is left out of an image."""
+OF_A_BOARD = ("a board of ", "board of ")
+"""Beginnings of notes on a whole board that is left out of an image."""
 
 
 def leaves_a_board_out(note: str) -> bool:
     """Returns whether a note concerns a whole board, not single dots."""
     return note.startswith(OF_A_BOARD)
-
-
-def leaves_a_pattern_out(note: str) -> bool:
-    """Returns whether a note concerns a whole face or board, not single circles or the image."""
-    return note.startswith(OF_A_BOARD + OF_A_FACE)
 
 
 def _contradiction(views: Readings) -> str:

@@ -35,6 +35,19 @@ MAX_SIGMA_PX = 0.5
 """Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0
 """Smallest contrast, in σ of a pixel's noise around the rim. A single pixel of clutter or noise has less."""
+REMEDIES = {
+    "small": "come closer, use a longer lens, or give a smaller --min-diameter",
+    "large": "step back, use a shorter lens, or give a larger --max-diameter",
+    "rim": "partly hidden, reflecting or disturbed: uncover it, or cover what is bright beside it",
+    "contrast": "hidden or dark: uncover it, light it, expose longer, or cover what is brighter",
+    "sigma": "light it, expose longer, or come closer",
+    "blur": "focus on it, close the aperture, or hold the camera still",
+    "place": "something else is there, or a part of the circle: uncover it; is its place in the target file right?",
+    "shape": "something else is there, or a part of the circle: uncover it; is its radius in the target file right?",
+    "face": "show one whole with the white about it, less obliquely, sharper, closer, evenly lit; cover other dots",
+    "board": "show more of its dots and those between them, sharper, evenly lit; cover what is like a dot",
+}
+"""What to change in the scene, by what stops a circle, or all of a face or of the board, from being found."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +142,7 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
             stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])
-            reason = _disagreement(predicted.shape_px[predicted_rows[k]], 0.0, stretch, blur)
+            _, reason = _disagreement(predicted.shape_px[predicted_rows[k]], 0.0, stretch, blur)
             if reason:
                 reasons[observed.labels[rows[k]]] = reason
     return reasons
@@ -141,20 +154,23 @@ def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera
     return singular_values(np.linalg.solve(shape_px, local @ shape))
 
 
-def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], blur_px: float) -> str:
-    """Returns the reason why a measured ellipse is not the expected one of ``shape_px``; empty if it is.
+def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], blur_px: float) -> tuple[str, str]:
+    """Returns why a measured ellipse is not the expected one of ``shape_px``: the key of its remedy, and the reason;
+    both empty if it is the expected one.
 
     ``off_px`` : distance from the expected place; ``stretch`` : largest and smallest ratio of its size to the expected
     one; ``blur_px`` : standard deviation of the blur of its rim.
     """
     largest, smallest = singular_values(shape_px)
     if blur_px > MAX_BLUR * smallest:
-        return f"blurred by {blur_px:.2g} px, {MAX_BLUR * float(smallest):.2g} px allowed by its smaller radius"
+        return "blur", f"blurred by {blur_px:.2g} px, {MAX_BLUR * float(smallest):.2g} px allowed by its smaller radius"
     allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
     if off_px > allowed:
-        return f"{off_px:.3g} px from its place, {allowed:.3g} allowed"
+        return "place", f"{off_px:.3g} px from its place, {allowed:.3g} allowed"
     most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
-    return f"{most:.3g} times its size along one direction, {limit:.3g} allowed" if most > limit else ""
+    if most > limit:
+        return "shape", f"{most:.3g} times its size along one direction, {limit:.3g} allowed"
+    return "", ""
 
 
 def measure_predicted(
@@ -167,7 +183,8 @@ def measure_predicted(
     low, high = options.min_diameter_px or MIN_DIAMETER_PX, options.max_diameter_px
     diameter = 2 * everything.radius_px()
     missed = {
-        predicted.labels[i]: f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for"
+        predicted.labels[i]: f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for; "
+        + REMEDIES["small" if diameter[i] < low else "large"]
         for i in wanted
         if not low <= diameter[i] <= high
     }
@@ -197,22 +214,23 @@ def _needed(found: Centres) -> np.ndarray:
 
 
 def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
-    """Returns by fit why it is not the expected circle; empty if it is."""
+    """Returns by fit why it is not the expected circle, with the remedy; empty if it is."""
     contrast, needed = _signed(found, polarity), _needed(found)
     off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
     widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
     reasons = []
     for k in range(len(found)):
         if not found.ok[k]:
+            kind = "rim"
             reason = f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
         elif contrast[k] < needed[k]:
-            reason = f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
+            kind, reason = "contrast", f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
         else:
             stretch, blur = (widest[k], narrowest[k]), float(found.blur_px[k])
-            reason = _disagreement(expected.shape_px[k], float(off[k]), stretch, blur)
+            kind, reason = _disagreement(expected.shape_px[k], float(off[k]), stretch, blur)
             if not reason and sigma[k] > MAX_SIGMA_PX:
-                reason = f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
-        reasons.append(reason)
+                kind, reason = "sigma", f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
+        reasons.append(f"{reason}; {REMEDIES[kind]}" if reason else "")
     return reasons
 
 
@@ -226,9 +244,7 @@ def missed_notes(missed: dict[Label, str]) -> list[str]:
         place = "board" if plane == BOARD else f"face {plane}"
         first, reason = rows[0]
         others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-        notes.append(
-            f"{place}: {first}{others} should be in view and not measured; {first}: {reason}; hidden or unclear"
-        )
+        notes.append(f"{place}: {first}{others} should be in view and not measured; {first}: {reason}")
     return notes
 
 

@@ -237,7 +237,7 @@ def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptio
             rows.append((x, y, d1 + 1, d2 + 1, angle_deg))  # a contour runs through the outermost pixels' centres
     centre, shape = distinct(np.array(rows).reshape(-1, 5))
     contrast = contrast_of(grey, polarity, centre, shape)
-    keep = contrast > contrast_threshold(grey, options)[0]
+    keep = contrast > contrast_threshold(grey, options)
     return Ellipses(centre[keep], shape[keep], contrast[keep])
 
 

@@ -1,1 +1,1 @@
-"""Exchange with other programs: databases and models of every COLMAP version, the native mapper, its gates."""
+"""Exchange with other programs: databases and models of every COLMAP version, the native mapper."""

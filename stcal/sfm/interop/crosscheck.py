@@ -19,7 +19,6 @@ from stcal.sfm.adjust.refine import refine
 from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported, copy_database
 from stcal.sfm.interop.export_model import ExportedModel
-from stcal.sfm.interop.gates import MIN_INLIERS
 from stcal.sfm.interop.native import NativeColmap, faces_from_models, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
@@ -50,6 +49,9 @@ from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, saved_run
 from stcal.sfm.runs.transaction import added_results
 
 MICRO = 1e3
+MIN_INLIERS = pycolmap.TwoViewGeometryOptions().min_num_inliers
+"""Least number of inliers of an initial pair, whatever `init_min_num_inliers` says: COLMAP estimates the pair with this
+default."""
 TOLERANCES = Tolerances()
 FACE_FLOOR = np.array([1e-7] * 3 + [1e-4] * 3)
 """Negligible differences in rad and mm: 6 µdeg and 0.1 µm. Circles that carry the frame have no σ."""
@@ -198,7 +200,7 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
         raise MappingError(
             "E-COLMAP-NO-MODEL",
             f"group {group}: native COLMAP {native.version} makes no model from the run's initial pair; "
-            "see `stcal-sfm pairs` for the gate that stops it",
+            "the pair may share too few labels, or be too near to each other; add images from further apart",
         ) from error
     try:
         path = max(models, key=lambda model: open_model(model).num_reg_images())
@@ -488,10 +490,10 @@ def database_text(written: Exported) -> str:
 
 def model_text(written: ExportedModel, kind: str) -> str:
     """Returns a text on the contents of the model, and on the ideal camera if the format needs one."""
-    contents = f"{written.images} images and {written.points} points"
-    if kind == "ply":
-        contents = f"{written.points} points, not the cameras of the {written.images} images, which other formats hold"
-    lines = [f"{contents}; mm, target frame: {written.path}", f"labels: {written.labels}"]
+    lines = [
+        f"{written.images} images and {written.points} points; mm, target frame: {written.path}",
+        f"labels: {written.labels}",
+    ]
     if written.focal_px is not None and written.centre_px is not None:
         x, y = written.centre_px
         lines.append(
@@ -513,7 +515,7 @@ def export_text(written: ExportedRun) -> str:
         lines.append(f"no σ: the run was solved by {content.run.faces.solve}, which states none; run it with joint")
     if lost := FORMS[written.form].lost:
         lines.append(f"not in it: {lost}")
-    return "\n".join([*lines, *written.notes])
+    return "\n".join(lines)
 
 
 def faces_text(calibration: Calibration, run: SavedRun) -> str:

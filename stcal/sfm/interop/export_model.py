@@ -1,4 +1,4 @@
-"""Export of the final model for other programs: COLMAP's two forms, PLY, NVM and Bundler, checked against the run."""
+"""Export of the final model for other programs: COLMAP's two forms, NVM and Bundler, checked against the run."""
 
 import csv
 import io
@@ -131,7 +131,7 @@ def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel
             )
 
 
-ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
+ModelFormat = Literal["colmap-bin", "colmap-txt", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")
 """Formats of several files, for which OUT is a folder. The others are a file, with ``OUT.labels.csv`` beside it."""
 TARGET_MODEL = "target_model"
@@ -186,8 +186,8 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     run : str, Path, SavedRun or RunResult
         The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : str or Path
-        New file for ``ply`` and ``nvm``, new or empty folder for the others; missing parent folders are made.
-    form : {"colmap-bin", "colmap-txt", "ply", "nvm", "bundler"}
+        New file for ``nvm``, new or empty folder for the others; missing parent folders are made.
+    form : {"colmap-bin", "colmap-txt", "nvm", "bundler"}
         The format.
 
     Returns
@@ -232,8 +232,6 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
             match kind:
                 case "colmap-bin" | "colmap-txt":
                     write_reconstruction(reconstruction, partial, text=kind == "colmap-txt")
-                case "ply":
-                    partial.write_text(_ply(points), encoding="utf-8")
                 case "nvm":
                     partial.write_text(_nvm(reconstruction, points, saved, focal_px), encoding="utf-8")
                 case "bundler":
@@ -334,22 +332,6 @@ def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
         name = point.id if kind.startswith("colmap") else place
         writer.writerow([name, point.group, point.label, *map(repr, point.xyz), *sigma])
     return stream.getvalue()
-
-
-def _ply(points: Sequence[_Point]) -> str:
-    """Returns text PLY in double precision.
-
-    pycolmap's own PLY has single precision, and an order of points that is not documented.
-    """
-    header = [
-        "ply",
-        "format ascii 1.0",
-        "comment mm, target frame; points only, no cameras",
-        f"element vertex {len(points)}",
-    ]
-    header += [f"property double {axis}" for axis in "xyz"]
-    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    return "\n".join([*header, "end_header", *(_numbers(*p.xyz, *p.rgb) for p in points), ""])
 
 
 def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float) -> str:

@@ -216,7 +216,7 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
         require_pdf()
     complete_interrupted(run)
     try:
-        notes = tuple(verify(run).said(but=("report.html", REPORT_PDF)))
+        notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
     except InputError as error:
         if error.code != "E-RUN-UNFINISHED":  # without hashes nothing can be compared
             raise

@@ -295,7 +295,8 @@ def _left_out(result: RunResult) -> dict:
             {
                 "image": o.image,
                 "label": o.label,
-                "reason": f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the other images",
+                "reason": f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the others; "
+                "look for glare, dirt, a part hidden, or something that moved",
                 "gate": "residual",
                 "value": o.residual_px,
                 "limit": o.limit_px,
@@ -330,7 +331,7 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
         needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
         if len(sightings) == 1:
             gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
-            reason = "seen in one mapped image of its group only; 2 needed"
+            reason = "seen in one mapped image of its group only, 2 needed; photograph it from another place too"
         else:
             gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
             reason = (

@@ -304,7 +304,7 @@ class ReportFile(ResultFile):
     )
     left_out: LeftOut = Field(
         description="`files` and `images`: `name`, `reason`; `circles`: `image`, `label`, `reason`, `unit`; all with "
-        "`gate`, `value`, `limit` as [`doctor`](exports.md#out-what-doctor-writes) has them; `notes`: `image`, `note`"
+        "`gate` that stopped it, `value` measured and `limit`, null without a number; `notes`: `image`, `note`"
     )
     notes: list[str] = Field(
         description="faces of a group that got no frame, and why; rows and columns of the board that no image shows; a "

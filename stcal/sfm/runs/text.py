@@ -15,6 +15,7 @@ from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.predict import REMEDIES
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import applies, images_left_out
 from stcal.sfm.report.sections import NOT_APPLICABLE, count_verdicts
@@ -158,7 +159,8 @@ def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]
 
 
 def found_lines(labelled: Sequence[LabelledImage], blur_px: Mapping[str, float] | None = None) -> Iterator[str]:
-    """Yields faces and dots of each image, its blur if that is known, and what was left out in it."""
+    """Yields faces and dots of each image, its blur if that is known, and what was left out in it and helps."""
+    board_seen = any(isinstance(label, DotLabel) for each in labelled for label in each.observations.labels)
     for labelled_image in labelled:
         image = labelled_image.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
@@ -166,6 +168,10 @@ def found_lines(labelled: Sequence[LabelledImage], blur_px: Mapping[str, float] 
         blur = f", edges blurred by {blur_px[image.name]:.2f} px" if blur_px and image.name in blur_px else ""
         yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots{blur}"
         yield from (f"  {note}" for note in labelled_image.notes)
+        if not image.face_ids():
+            yield f"  no face is read: {REMEDIES['face']}"
+        if board_seen and not dots:
+            yield f"  the board is not read: {REMEDIES['board']}"
 
 
 def so_far_text(result: RunResult) -> str:

@@ -11,7 +11,7 @@ from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import _second, labelled_image
-from stcal.sfm.detect.predict import PredictedCircles, SecondLook, contradictions, measure_predicted
+from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, SecondLook, contradictions, measure_predicted
 from tests.sfm.detect.test_centres import sheet
 
 CAMERA = Camera(1600, 1200, [2500.0, 2400.0], [799.5, 599.5], [-0.12, 0.08, 1e-3, -5e-4, 0, 0, 0, 0])
@@ -228,7 +228,9 @@ def test_circles_of_other_sizes_than_the_options_ask_for_are_not_measured():
         )
     shape = circles.shape.copy()
     shape[0] = 2 * np.eye(2)
-    assert circles.look(shape_px=shape).missed == {"1:1": "4.0 px across, 4.5 to 450 px asked for"}
+    assert circles.look(shape_px=shape).missed == {
+        "1:1": f"4.0 px across, 4.5 to 450 px asked for; {REMEDIES['small']}"
+    }
 
 
 def centres(n):

@@ -2,12 +2,8 @@
 
 import base64
 import csv
-import errno
 import importlib
 import json
-import re
-import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 
 import cv2
@@ -15,14 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.poses.programs import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
 from stcal.labels import parse_label
 from stcal.sfm.interop.export import FORMS, export_run
-from stcal.sfm.interop.export.content import content_of
-from stcal.sfm.interop.export.viewers import EDGES
-from stcal.sfm.runs.saved import load_run
 from tests.outcome import fails_with
 
 AGAIN_MM = 1e-9
@@ -139,53 +131,6 @@ def test_table(files, faces):
     assert [row["kind"] for row in rows].count("circle") == len(faces["circles"])
 
 
-@pytest.mark.slow
-def test_ply(files, faces, small_run):
-    trimesh = importlib.import_module("trimesh")
-    mesh = trimesh.load(files["ply"], process=False)
-    lines = files["ply"].read_text(encoding="utf-8").splitlines()
-    named = {line.split()[2].rstrip(":"): line.split()[-1] for line in lines if ": centre of " in line}
-    assert sorted(named.values()) == sorted(faces["circles"])
-    for vertex, label in named.items():
-        own = mesh.vertices[int(vertex) : int(vertex) + EDGES + 1]
-        np.testing.assert_allclose(own[0], faces["circles"][label], atol=AGAIN_MM)
-        reach = np.linalg.norm(own[1:] - own[0], axis=1)
-        np.testing.assert_allclose(reach, faces["radius_mm"][label])
-        normal = np.array(faces["target_from_face"][parse_label(label).face])[:3, 2]
-        seen = np.cross(own[1] - own[0], own[2] - own[0])
-        assert np.dot(seen / np.linalg.norm(seen), normal) == pytest.approx(1)
-    cameras = [line for line in lines if " projection centre of " in line]
-    scene = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["scene"]["cameras"]
-    for line, camera in zip(cameras, scene, strict=True):
-        vertex = int(line.split()[2].rstrip(":"))
-        np.testing.assert_allclose(mesh.vertices[vertex], camera["position_mm"])
-        middle = mesh.vertices[vertex + 1 : vertex + 5].mean(axis=0) - mesh.vertices[vertex]
-        assert np.dot(middle / np.linalg.norm(middle), camera["axes"][2]) > 0.99  # the way it looks
-    assert "nan" not in files["ply"].read_text(encoding="utf-8")
-
-
-def test_dxf(files, faces):
-    ezdxf = importlib.import_module("ezdxf")
-    drawing = ezdxf.readfile(files["dxf"])
-    assert not drawing.audit().errors
-    assert drawing.header["$INSUNITS"] == ezdxf.units.MM
-    space = drawing.modelspace()
-    seen = set()
-    for circle, point in zip(space.query("CIRCLE"), space.query("POINT"), strict=True):
-        label = circle.get_xdata("STCAL")[0].value
-        centre = circle.ocs().to_wcs(circle.dxf.center)
-        np.testing.assert_allclose(centre, faces["circles"][label], atol=AGAIN_MM)
-        np.testing.assert_allclose(point.dxf.location, faces["circles"][label], atol=AGAIN_MM)
-        assert circle.dxf.radius == faces["radius_mm"][label]
-        normal = np.array(faces["target_from_face"][parse_label(label).face])[:3, 2]
-        np.testing.assert_allclose(circle.dxf.extrusion, normal, atol=1e-12)
-        assert drawing.layers.get(circle.dxf.layer).description == f"face {parse_label(label).face}"
-        sigma = [tag.value for tag in circle.get_xdata("STCAL")[2:5]]
-        np.testing.assert_allclose(sigma, np.sqrt(np.diag(faces["circle_covariance_mm2"][label])))
-        seen.add(label)
-    assert seen == set(faces["circles"])
-
-
 @pytest.mark.parametrize("form", ["gltf", "glb"])
 def test_gltf(files, faces, form, small_run):
     """Circles and cameras at their places in a general viewer; covariances in the nodes' own data."""
@@ -231,79 +176,6 @@ def content_of_gltf(path) -> tuple[dict, bytes]:
     length = int.from_bytes(raw[12:16], "little")
     tree = json.loads(raw[20 : 20 + length])
     return tree, raw[28 + length :]
-
-
-@pytest.mark.slow
-def test_recording(files, faces, small_run):
-    """What the viewer's own program finds in it; its numbers are single."""
-    found = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "print", "-vvv", str(files["rerun"])],
-        capture_output=True,
-        encoding="utf-8",
-        check=True,
-    ).stdout
-    own = {}
-    for part in found.split("\nChunk(")[1:]:
-        path = re.search(r"entity_path: (\S+)", part).group(1)
-        own[path] = own.get(path, "") + part
-    for face, matrix in faces["target_from_face"].items():
-        assert f"/world/box/{face}/circles" in own
-        assert f"/world/box/{face}/sigma" in own
-        place = re.findall(r"\[\[([-+e.\d]+), ([-+e.\d]+), ([-+e.\d]+)\]\]", own[f"/world/box/{face}"])
-        np.testing.assert_allclose(np.array(place, float), [np.array(matrix)[:3, 3]], atol=FLOAT_MM)
-    for camera in json.loads((small_run / "report.json").read_text(encoding="utf-8"))["scene"]["cameras"]:
-        path = "/world/cameras/" + camera["image"].replace("/", "\\/")
-        place = re.findall(r"\[\[([-+e.\d]+), ([-+e.\d]+), ([-+e.\d]+)\]\]", own[path])
-        np.testing.assert_allclose(np.array(place, float), [camera["position_mm"]], atol=FLOAT_MM)
-        assert "EncodedImage:blob" in own[f"{path}/image"]
-        assert "Pinhole:image_from_camera" in own[f"{path}/image"]
-        assert f"{path}/image/circles" in own
-
-
-def test_photographs_that_are_gone_are_said(small_run, tmp_path):
-    saved = load_run(small_run)
-    object.__setattr__(saved, "images", tmp_path / "gone")
-    recording = importlib.import_module("stcal.sfm.interop.export.viewers")
-    notes = recording.write_rrd(content_of(saved, "target"), tmp_path / "run.rrd")
-    assert notes == [
-        f"{len(saved.report['scene']['cameras'])} photographs are no longer in {tmp_path / 'gone'}, "
-        f"{saved.report['scene']['cameras'][0]['image']} first: left out"
-    ]
-
-
-def test_a_recording_that_no_disk_takes_leaves_nothing(small_run, tmp_path, monkeypatch):
-    """The chunk after the first one does not go in; Rerun's own writer would try for ever."""
-
-    def full(_, path) -> list[str]:
-        path.write_bytes(b"RRF2")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("stcal.sfm.interop.export.write_rrd", full)
-    with fails_with("E-OUTPUT-UNWRITABLE … box.rrd … No space left"):
-        export_run(small_run, tmp_path / "box.rrd")
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_a_recording_is_written_by_parts_as_far_as_there_is_room(small_run, tmp_path):
-    """In a process whose files may not grow: Rerun's own writer said nothing, or tried for ever."""
-    code = (
-        "import resource, signal, sys; from stcal.sfm.interop.export import export_run; from pathlib import Path\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (200_000,) * 2)\n"
-        f"export_run(Path({str(small_run)!r}), Path({str(tmp_path / 'box.rrd')!r}))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
-    assert "cannot be written: File too large" in done.stderr.splitlines()[-1]
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("form", "library", "extra"), [("dxf", "ezdxf", "cad"), ("rerun", "rerun", "rerun")])
-def test_a_library_that_is_missing_is_named(small_run, tmp_path, monkeypatch, form, library, extra):
-    monkeypatch.setitem(sys.modules, library, None)
-    path = tmp_path / f"box{FORMS[form].suffix}"
-    with pytest.raises(InputError, match=rf"install stereo-target-calibration\[{extra}\]$"):
-        export_run(small_run, path)
-    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from tests.shared import unsealed_copy
 
 AGAIN_PX = 5e-5
 """The eccentricity, settled group by group in ``labels.csv``, is computed again in the joint adjustment: nanometres."""
-FORMATS = ("colmap-bin", "colmap-txt", "ply", "nvm", "bundler")
+FORMATS = ("colmap-bin", "colmap-txt", "nvm", "bundler")
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +72,6 @@ def xyz_of(row: dict) -> np.ndarray:
 
 
 # --- readers, from the formats' documents -----------------------------------------------------------------------------
-
-
-def read_ply(path):
-    lines = path.read_text(encoding="ascii").splitlines()
-    start = lines.index("end_header") + 1
-    values = np.array([line.split() for line in lines[start:]], float)
-    assert f"element vertex {len(values)}" in lines[:start]
-    return values[:, :3], values[:, 3:].astype(int)
 
 
 def read_nvm(path):
@@ -202,31 +194,16 @@ def test_native_colmap_reads_it(exported, kind, tmp_path):
 # --- the other formats ------------------------------------------------------------------------------------------------
 
 
-def test_ply_by_row_and_by_colmaps_reader(exported, tmp_path):
-    xyz, rgb = read_ply(exported["ply"])
-    rows = labels_of(exported["ply"])
-    assert [int(row["point"]) for row in rows] == list(range(len(xyz)))
-    assert np.abs(xyz - [xyz_of(row) for row in rows]).max() == 0
-    theirs = pycolmap.Reconstruction()
-    theirs.import_PLY(str(exported["ply"]))
-    points = list(theirs.points3D.values())
-    # COLMAP keeps single precision: steps of 6e-5 mm at 512 … 1024 mm.
-    key = np.array([[*p.xyz, *p.color] for p in points])
-    ours = np.column_stack([xyz, rgb])
-    order, theirs_order = (np.lexsort(np.round(values[:, :3], 2).T) for values in (ours, key))
-    np.testing.assert_allclose(key[theirs_order], ours[order], atol=6e-5)
-
-
 def test_faces_and_board_differ_in_colour(exported):
-    _, rgb = read_ply(exported["ply"])
+    rgb = [colour for _, colour, _ in read_nvm(exported["nvm"])[1]]
     by_face = {}
-    for row, colour in zip(labels_of(exported["ply"]), rgb.tolist(), strict=True):
+    for row, colour in zip(labels_of(exported["nvm"]), rgb, strict=True):
         by_face.setdefault(row["label"].split(":")[0], set()).add(tuple(colour))
     assert by_face.keys() == {"board", "1", "2", "4", "5"}
     assert all(len(colours) == 1 for colours in by_face.values())
     assert len(set.union(*by_face.values())) == len(by_face)
     read = pycolmap.Reconstruction(str(exported["colmap-bin"]))
-    for row, colour in zip(labels_of(exported["colmap-bin"]), rgb.tolist(), strict=True):
+    for row, colour in zip(labels_of(exported["colmap-bin"]), rgb, strict=True):
         assert read.point3D(int(row["point"])).color.tolist() == colour
 
 
@@ -319,8 +296,8 @@ def test_a_chained_run_has_no_sigma(small_run, tmp_path):
     faces = json.loads((own / "faces.json").read_text(encoding="utf-8"))
     del faces["circle_covariance_mm2"]
     (own / "faces.json").write_text(json.dumps(faces), encoding="utf-8")
-    export_model(own, tmp_path / "model.ply", "ply")
-    assert {row[f"sigma_{axis}_um"] for row in labels_of(tmp_path / "model.ply") for axis in "xyz"} == {""}
+    export_model(own, tmp_path / "model.nvm", "nvm")
+    assert {row[f"sigma_{axis}_um"] for row in labels_of(tmp_path / "model.nvm") for axis in "xyz"} == {""}
 
 
 def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(small_run, tmp_path):
@@ -350,13 +327,10 @@ def test_the_command(small_run, stcal_sfm, tmp_path):
     camera = read_camera(small_run / "cameras.txt")
     assert f"f = {camera.focal.mean():.4f} px" in out
     assert "(647.5, 431.5)" in out  # 1296 × 864 px, centre of the first pixel at (0, 0)
-    code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "model.ply", "--format", "ply")
-    assert (code, "ideal" in out) == (0, False)
-    assert " points, not the cameras of the 8 images, which other formats hold; mm, target frame: " in out
-    assert "comment mm, target frame; points only, no cameras\n" in (tmp_path / "model.ply").read_text(encoding="utf-8")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "model.ply", "model.ply.labels.csv"]
+    assert stcal_sfm("export-model", small_run, tmp_path / "model.nvm", "--format", "nvm")[0] == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "model.nvm", "model.nvm.labels.csv"]
     code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "new" / "place", "--format", "colmap-txt")
-    assert (code, out.startswith("8 images and ")) == (0, True)
+    assert (code, out.startswith("8 images and "), "ideal" in out) == (0, True, False)
     assert (tmp_path / "new" / "place" / "cameras.txt").exists()
 
 
@@ -378,21 +352,21 @@ def test_a_full_disk_is_one_line_with_the_place(small_run, stcal_sfm, tmp_path, 
         raise OSError(errno.ENOSPC, "No space left on device")  # as a write says it, without a name
 
     monkeypatch.setattr(Path, "write_text", full)
-    code, out, error = stcal_sfm("export-model", small_run, tmp_path / "m.ply", "--format", "ply")
+    code, out, error = stcal_sfm("export-model", small_run, tmp_path / "m.nvm", "--format", "nvm")
     assert (code, out, error.count("\n")) == (2, "", 1)
-    assert f"{tmp_path / 'm.ply'}: No space left on device; check the path" in error
+    assert f"{tmp_path / 'm.nvm'}: No space left on device; check the path" in error
     assert not any(tmp_path.iterdir())
 
 
 def test_labels_are_not_overwritten_either(small_run, stcal_sfm, tmp_path):
-    (tmp_path / "m.ply.labels.csv").write_text("mine", encoding="utf-8")
-    code, _, error = stcal_sfm("export-model", small_run, tmp_path / "m.ply", "--format", "ply")
-    assert (code, "m.ply.labels.csv: exists" in error) == (2, True)
-    assert not (tmp_path / "m.ply").exists()
+    (tmp_path / "m.nvm.labels.csv").write_text("mine", encoding="utf-8")
+    code, _, error = stcal_sfm("export-model", small_run, tmp_path / "m.nvm", "--format", "nvm")
+    assert (code, "m.nvm.labels.csv: exists" in error) == (2, True)
+    assert not (tmp_path / "m.nvm").exists()
 
 
 def test_errors(small_run, stcal_sfm, tmp_path):
-    def refused(run, out, kind="ply"):
+    def refused(run, out, kind="nvm"):
         code, printed, error = stcal_sfm("export-model", run, out, "--format", kind)
         assert (code, printed, error.count("\n")) == (2, "", 1)
         assert not out.exists()

@@ -123,7 +123,7 @@ def test_another_model_than_the_report_s_is_refused(changed, tmp_path, case):
 
 
 def test_the_same_model_written_again_goes_out(changed, tmp_path):
-    assert export_model(changed(lambda _: None), tmp_path / "model.ply", "ply").images == 8
+    assert export_model(changed(lambda _: None), tmp_path / "model.nvm", "nvm").images == 8
 
 
 def test_a_refined_camera_is_that_of_the_report(changed, tmp_path):

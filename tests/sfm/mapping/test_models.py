@@ -723,19 +723,10 @@ def test_the_command_says_what_the_models_say(saved, stcal_sfm, tmp_path):
     assert outcome[0] == 0
 
 
-def test_nothing_is_overwritten(saved, stcal_sfm, tmp_path):
-    (tmp_path / "mine").write_text("mine")
-    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
-    for name in ("mine", "link", "."):
-        out = tmp_path / name
-        outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
-        said = "is a folder; the name of a file needed" if name == "." else "exists; give another name, or --overwrite"
-        assert_error(outcome, INPUT, f"{out}: {said}")
+def test_the_folder_of_the_answer_is_needed(saved, stcal_sfm, tmp_path):
     out = tmp_path / "no" / "f.json"
     outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
     assert_error(outcome, INPUT, "E-OUTPUT-FOLDER", f"{out}", f"{out.parent}", "--out")
-    assert (tmp_path / "mine").read_text() == "mine"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["link", "mine"]
 
 
 def test_no_file_of_half_an_answer(saved, model, stcal_sfm, tmp_path):

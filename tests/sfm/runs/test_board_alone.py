@@ -45,7 +45,7 @@ def test_the_board_alone_gives_scale_and_residuals(hidden, stcal_sfm):
         assert scale["board_rms_um"] == pytest.approx(np.hypot(scale["board_mean_um"], scale["board_spread_um"]))
         assert f"{scale['board_mean_um']:.2f}" in text
     assert "The board alone" in (hidden.out / "report.html").read_text()
-    code, _, error = stcal_sfm("pairs", hidden.out)
+    code, _, error = stcal_sfm("advise", hidden.out)
     assert (code, "no faces.json: of the board alone" in error) == (INPUT, True)
 
 

@@ -128,17 +128,6 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class OutlineVerdict:
-    """The first ``gate`` that an outline fails, with its ``value`` and ``limit``, empty if it passes all;
-    ``ellipse`` : (x, y, full axis 1, full axis 2, angle of axis 1 in degrees), fitted after the first three gates."""
-
-    gate: str
-    value: float
-    limit: float
-    ellipse: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class OutlineGates:
     """Limits for outlines in one mask; px of the level, ``shortest`` and ``longest`` in points."""
 
@@ -150,40 +139,30 @@ class OutlineGates:
     shortest: float
     longest: float
 
-    def check(self, contour: np.ndarray) -> OutlineVerdict:
-        """Fits the ellipse and checks the outline against the limits."""
-        if len(contour) < self.shortest:
-            return OutlineVerdict("short", len(contour), self.shortest)
-        if len(contour) > self.longest:
-            return OutlineVerdict("long", len(contour), self.longest)
+    def ellipse(self, contour: np.ndarray) -> tuple[float, ...] | None:
+        """Returns the ellipse of an outline within the limits, (x, y, full axis 1, full axis 2, angle of axis 1 in
+        degrees), or None."""
+        if not self.shortest <= len(contour) <= self.longest:
+            return None
         x, y, w, h = cv2.boundingRect(contour)
         if x == 0 or y == 0 or x + w == self.width or y + h == self.height:
-            return OutlineVerdict("border", 0.0, 1.0)
+            return None
         (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
         if not np.isfinite(d1 + d2 + cx + cy):
-            return OutlineVerdict("ellipse", np.nan, np.nan)
+            return None
         # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
         d1, d2 = d1 + 1, d2 + 1
-        row = (cx, cy, d1, d2, angle)
-        if min(d1, d2) < self.min_axis_ratio * max(d1, d2):
-            return OutlineVerdict("min_axis_ratio", min(d1, d2) / max(d1, d2), self.min_axis_ratio, row)
-        diameter = np.sqrt(d1 * d2)
-        if not diameter >= self.lowest:
-            return OutlineVerdict("min_diameter", diameter, self.lowest, row)
-        if not diameter <= self.highest:
-            return OutlineVerdict("max_diameter", diameter, self.highest, row)
-        error = abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1)
-        if error > MAX_AREA_ERROR:
-            return OutlineVerdict("outline_area", error, MAX_AREA_ERROR, row)
+        if min(d1, d2) < self.min_axis_ratio * max(d1, d2) or not self.lowest <= np.sqrt(d1 * d2) <= self.highest:
+            return None
+        if abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1) > MAX_AREA_ERROR:
+            return None
         deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
-        if deviation > 1:
-            return OutlineVerdict("outline_deviation", deviation, 1.0, row)
-        return OutlineVerdict("", 0.0, 0.0, row)
+        return None if deviation > 1 else (cx, cy, d1, d2, angle)
 
 
 def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
     """Finds blobs of one polarity with an elliptic outline in an 8-bit grey image; centres are good to about 0.1 px."""
-    threshold, _ = contrast_threshold(image, options)
+    threshold = contrast_threshold(image, options)
     found = [_rows(level, polarity, threshold, options) for level in levels(image, options)]
     centre, shape = distinct(np.concatenate(found))
     contrast = contrast_of(image, polarity, centre, shape)
@@ -191,11 +170,10 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
     return Ellipses(centre[keep], shape[keep], contrast[keep])
 
 
-def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> tuple[float, float]:
-    """Returns the contrast that a circle must exceed, and the image's grey range that defines it; grey values."""
+def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> float:
+    """Returns the contrast that a circle must exceed, grey values."""
     low, high = percentiles(image[::8, ::8], [0.5, 99.9])
-    grey_range = max(high, 1.0) - low
-    return max(MIN_THRESHOLD, options.min_contrast * grey_range), grey_range
+    return max(MIN_THRESHOLD, options.min_contrast * (max(high, 1.0) - low))
 
 
 def diameter_limits_px(pixels: int, options: EllipseOptions) -> tuple[float, float]:
@@ -274,13 +252,12 @@ def outline_area(contour: np.ndarray) -> float:
 
 def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
     """Returns the ellipses of one level, rows as in :meth:`Level.in_full`."""
-    rows = []
-    for mask, gates in masks(level, polarity, threshold, options):
-        for contour in outlines(mask):
-            verdict = gates.check(contour)
-            if not verdict.gate:
-                rows.append(verdict.ellipse)
-    return level.in_full(rows)
+    ellipses = [
+        gates.ellipse(contour)
+        for mask, gates in masks(level, polarity, threshold, options)
+        for contour in outlines(mask)
+    ]
+    return level.in_full([row for row in ellipses if row is not None])
 
 
 def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
@@ -356,48 +333,6 @@ class Candidates:
         return len(self.xy)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PatternFit:
-    """The candidate nearest to each of the m circles of a pattern, and how well it fits the prediction.
-
-    ``index`` : (m,); ``radius`` : (m,) predicted, of equal area; ``distance``, ``max_distance`` : (m,) from the
-    predicted place, and the limit; ``widest``, ``narrowest``, ``max_stretch`` : (m,) extremes over all
-    directions of the ratio between the predicted and the found ellipse, and how far from 1 they may be (by a factor).
-    """
-
-    index: np.ndarray
-    radius: np.ndarray
-    distance: np.ndarray
-    max_distance: np.ndarray
-    widest: np.ndarray
-    narrowest: np.ndarray
-    max_stretch: np.ndarray
-
-    def in_place(self) -> np.ndarray:
-        """Returns the mask of the circles with a candidate at their place."""
-        return self.distance < self.max_distance
-
-    def fits(self) -> np.ndarray:
-        """Returns the mask of the circles with a candidate of their size and shape at their place."""
-        return self.in_place() & (self.widest < self.max_stretch) & (self.narrowest > 1 / self.max_stretch)
-
-
-def fit_pattern(
-    candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
-) -> PatternFit:
-    """Compares a pattern with its nearest candidates; arguments as in :func:`match_pattern`."""
-    predicted = apply_homography(image_from_plane, xy_plane)
-    local = homography_jacobian(image_from_plane, xy_plane) * radius[..., None, None]
-    size = np.sqrt(np.abs(np.linalg.det(local)))
-    distance, index = candidates.tree.query(predicted)
-    index = np.where(np.isfinite(distance), index, 0)
-    max_distance = slack * np.maximum(MAX_POSITION_ERROR * size, MAX_POSITION_ERROR_PX * candidates.px)
-    widest, narrowest = singular_values(np.linalg.solve(candidates.shape[index], local))
-    # Blur and pixels widen small ellipses: half a pixel at each end of the minor axis.
-    max_stretch = MAX_AXIS_RATIO * (1 + candidates.px / np.maximum(singular_values(local)[1], candidates.px))
-    return PatternFit(index, size, distance, max_distance, widest, narrowest, max_stretch)
-
-
 def match_pattern(
     candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
 ) -> np.ndarray:
@@ -413,11 +348,19 @@ def match_pattern(
     -------
     index : (m,) or (k, m) int, −1 if there is none
     """
-    fit = fit_pattern(candidates, image_from_plane, xy_plane, radius, slack)
-    index = np.where(fit.fits(), fit.index, -1)
+    predicted = apply_homography(image_from_plane, xy_plane)
+    local = homography_jacobian(image_from_plane, xy_plane) * radius[..., None, None]
+    size = np.sqrt(np.abs(np.linalg.det(local)))
+    distance, nearest = candidates.tree.query(predicted)
+    nearest = np.where(np.isfinite(distance), nearest, 0)
+    widest, narrowest = singular_values(np.linalg.solve(candidates.shape[nearest], local))
+    # Blur and pixels widen small ellipses: half a pixel at each end of the minor axis.
+    max_stretch = MAX_AXIS_RATIO * (1 + candidates.px / np.maximum(singular_values(local)[1], candidates.px))
+    fits = distance < slack * np.maximum(MAX_POSITION_ERROR * size, MAX_POSITION_ERROR_PX * candidates.px)
+    index = np.where(fits & (widest < max_stretch) & (narrowest > 1 / max_stretch), nearest, -1)
     # A candidate that two circles of a pattern claim goes to the nearer one.
     claimed = index.ravel() + np.arange(index.size) // index.shape[-1] * (len(candidates) + 1)
-    order = np.lexsort((fit.distance.ravel(), claimed))
+    order = np.lexsort((distance.ravel(), claimed))
     again = np.flatnonzero((claimed[order][1:] == claimed[order][:-1]) & (index.ravel()[order][1:] >= 0)) + 1
     index.reshape(-1)[order[again]] = -1
     return index

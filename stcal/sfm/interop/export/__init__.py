@@ -1,4 +1,4 @@
-"""Export of a finished run to files of other programs: robots' software, drawings, viewers, tables."""
+"""Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -8,30 +8,28 @@ from pathlib import Path
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
-from stcal.io.files import save, unwritable
+from stcal.io.files import save
 from stcal.io.poses.programs import Static, read_messages, read_ros1_launch, read_ros2_launch
 from stcal.io.table import require_poses_written
 from stcal.sfm.interop.export import tables, viewers
 from stcal.sfm.interop.export.content import Content, content_of
-from stcal.sfm.interop.export.viewers import write_rrd
 from stcal.sfm.runs.saved import AnyRun, saved_run
 
 ROOT = "target"
 """Default name of the target frame."""
-RERUN = "rerun"
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
     """A form of export.
 
-    ``suffix`` : suffix of its files; ``write`` : returns their content, None if a library writes the file; ``lost`` :
+    ``suffix`` : suffix of its files; ``write`` : returns their content; ``lost`` :
     results among faces, circles, σ and cameras that the files do not hold; ``read`` : returns the transforms of
-    :meth:`Content.statics` from a text, None for drawings and viewers, from which nothing is read.
+    :meth:`Content.statics` from a text, None for viewers, from which nothing is read.
     """
 
     suffix: str
-    write: Callable[[Content], str | bytes] | None
+    write: Callable[[Content], str | bytes]
     lost: str
     read: Callable[[str], Sequence[Static]] | None = None
 
@@ -45,28 +43,24 @@ FORMS = {
     "ros1": Form(".launch", tables.launch_ros1, FRAMES_ONLY, read_ros1_launch),
     "opencv": Form(".yml", tables.opencv, "cameras", tables.read_opencv),
     "csv": Form(".csv", tables.table, "cameras, correlations", tables.read_table),
-    "ply": Form(".ply", viewers.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),
-    "dxf": Form(".dxf", viewers.dxf, "cameras, correlations; σ is in extended data"),
     "gltf": Form(".gltf", viewers.gltf, "the lens's distortion but as numbers in extras"),
     "glb": Form(".glb", viewers.glb, "the lens's distortion but as numbers in extras"),
-    RERUN: Form(".rrd", None, "the lens's distortion; covariances but as ellipsoids"),
 }
 """Forms by the value of ``--form``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedRun:
-    """An export that was written. ``notes`` : on missing parts."""
+    """An export that was written."""
 
     path: Path
     form: str
     content: Content
-    notes: list[str]
 
 
 @require_arguments
 def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
-    """Writes faces and circles to a new file, with σ, cameras and photographs if the form holds them.
+    """Writes faces and circles to a new file, with σ and cameras if the form holds them.
 
     Parameters
     ----------
@@ -74,8 +68,8 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
         The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
     out : str or Path
         New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` and ``.launch`` (ROS 2
-        and 1), ``.yml`` (OpenCV), ``.csv``, ``.ply``, ``.dxf``, ``.gltf``, ``.glb`` or ``.rrd`` (Rerun).
-    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv", "ply", "dxf", "gltf", "glb", "rerun"}, optional
+        and 1), ``.yml`` (OpenCV), ``.csv``, ``.gltf`` or ``.glb``.
+    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv", "gltf", "glb"}, optional
         Form in place of that of the suffix.
     name : str
         Name of the target frame, and prefix of the other frames' names.
@@ -83,12 +77,12 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
     Returns
     -------
     ExportedRun
-        ``path``, ``form``, and ``notes`` on what the file lacks.
+        ``path``, ``form``, and the ``content``.
 
     Raises
     ------
     InputError
-        Not a finished run, the file exists, the form is unknown, a library is not installed, or the name is bad.
+        Not a finished run, the file exists, the form is unknown, or the name is bad.
     """
     path = Path(out)
     form = form or form_of(path)
@@ -99,25 +93,14 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
     if not path.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     content = content_of(saved_run(run), name)
-    write = FORMS[form].write
-    if write is not None:
-        save(path, write(content))
-        if (read := FORMS[form].read) is not None:
-            require_poses_written(
-                path,
-                lambda: Poses.of(static.pose for static in read(path.read_text(encoding="utf-8"))),
-                Poses.of(static.pose for static in content.statics()),
-            )
-        return ExportedRun(path, form, content, [])
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        notes = write_rrd(content, partial)
-        os.replace(partial, path)
-    except OSError as error:
-        raise unwritable(path, error) from error
-    finally:
-        partial.unlink(missing_ok=True)
-    return ExportedRun(path, form, content, notes)
+    save(path, FORMS[form].write(content))
+    if (read := FORMS[form].read) is not None:
+        require_poses_written(
+            path,
+            lambda: Poses.of(static.pose for static in read(path.read_text(encoding="utf-8"))),
+            Poses.of(static.pose for static in content.statics()),
+        )
+    return ExportedRun(path, form, content)
 
 
 def form_of(path: Path) -> str:

@@ -64,8 +64,8 @@ class Content:
     """Content of an export.
 
     ``root`` : name of the target frame; ``camera`` : as the run refined it; ``faces`` : target_from_face;
-    ``covariances`` : of the faces, 6×6, empty if the run states none; ``photographs`` : in the run's order;
-    ``boards`` : dots by group, (n, 3); ``rgb`` : by face.
+    ``covariances`` : of the faces, 6×6, empty if the run states none; ``photographs`` : in the run's order; ``rgb`` :
+    by face.
     """
 
     root: str
@@ -75,7 +75,6 @@ class Content:
     covariances: dict[str, np.ndarray]
     circles: tuple[Circle, ...]
     photographs: tuple[Photograph, ...]
-    boards: dict[str, np.ndarray]
     rgb: dict[str, tuple[int, int, int]]
 
     def of_face(self, face: str) -> list[Circle]:
@@ -157,7 +156,6 @@ def content_of(run: SavedRun, root: str) -> Content:
         covariances={face: np.array(c) for face, c in faces.target_from_face_covariance.items()},
         circles=circles,
         photographs=tuple(photographs),
-        boards={group: np.array(xyz, float).reshape(-1, 3) for group, xyz in scene.boards.items()},
         rgb=colours(run),
     )
     names = [root, *(each.child for each in content.statics())]

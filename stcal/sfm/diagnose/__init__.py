@@ -1,1 +1,0 @@
-"""Search for why something was left out of a finished run."""
