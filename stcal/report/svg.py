@@ -338,7 +338,7 @@ def log_limits(values) -> tuple[float, float]:
 
 def count_ticks(low: float, high: float) -> Ticks:
     """Returns a few whole numbers within limits."""
-    values = [value + 0.0 for value in ticks(low, high, 8)[0] if value == round(value)]
+    values = [value for value in ticks(low, high, 8)[0] if value == round(value)]
     return values, [f"{value:.0f}" for value in values]
 
 
@@ -358,9 +358,9 @@ def ticks(low: float, high: float, most: int = 5) -> Ticks:
     power = int(np.floor(np.log10(apart)))
     step = next(s for s in (1, 2, 5, 10) if s * 10.0**power >= apart * (1 - 1e-9)) * 10.0**power
     first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    values = (np.arange(first, last + 1) * step).tolist()
+    values = (np.arange(first, last + 1) * step + 0.0).tolist()
     digits = max(0, -int(np.floor(np.log10(step * (1 + 1e-9)))))
-    return values, [f"{value + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for value in values]
+    return values, [f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") for value in values]
 
 
 def mixed(share: np.ndarray, ramp: str) -> np.ndarray:
