@@ -1,4 +1,4 @@
-"""Folders that can be seen at a glance, and names that stand for one thing. Who may import whom is in pyproject.toml."""
+"""Folders that can be seen at a glance, and names that stand for one thing. pyproject.toml says who imports whom."""
 
 import importlib
 from collections import Counter

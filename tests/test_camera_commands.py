@@ -111,10 +111,10 @@ def test_what_is_shown_is_the_cameras(folder):
     """Field of view of a lens without distortion: 2 atan(640 / 900) across."""
     plain = Camera(1280, 960, [900.0, 900.0], [639.5, 479.5], np.zeros(8))
     write_cameras_txt(folder / "p.txt", Camera.of(plain, "PINHOLE"))
-    said = call("show", folder / "p.txt", "--plot", folder / "p.png")
+    said = call("show", folder / "p.txt", "--plot", folder / "p.svg")
     assert f"field of view: {2 * np.degrees(np.arctan(640 / 900)):.2f}° across" in said
     assert "moves points by up to 0.00 px" in said
-    assert (folder / "p.png").stat().st_size > 5000
+    assert (folder / "p.svg").stat().st_size > 5000
     assert re.search(r"cx +640\.0000 +0\.2000", call("show", folder / "a.txt"))
 
 

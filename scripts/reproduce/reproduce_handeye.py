@@ -1,6 +1,6 @@
 """The experiment of Jin et al. (hand-eye calibration by differential evolution) in simulation, by all methods.
 
-.venv/bin/python scripts/reproduce/reproduce_handeye.py [--seeds 100] [--plot FOLDER]
+.venv/bin/python scripts/reproduce/reproduce_handeye.py [--seeds 100]
 
 A camera of 1280×1024 px on the flange of an arm of a UR10's reach sees a chessboard of 8×7 squares of 25 mm from 25
 poses: 24 motions A_N, B_N from each pose to the next, 18 to solve with and 6 held out. Corners err by 0.1 px, the arm
@@ -12,13 +12,10 @@ the flange about zero; what a drawing tells, the truth but for 10° and 30 mm; a
 Prints, as Markdown, over all seeds: the objective that evolution reaches over its minimum, from each of the bounds,
 without and with polishing; what λ = 1 means with lengths in m, cm and mm; the errors of the predicted
 Â_N = X B_N X⁻¹ of the six motions (the paper's measure, eqs. 24–26), and of X itself against the truth.
-Draws the paper's figures 4 and 5: translation and rotation error of each held-out motion.
 """
 
 import argparse
-from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from stcal.errors import StcalError
@@ -28,7 +25,6 @@ from stcal.handeye.data.pairs import Loop, Motions
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.solve import UNIT_MM, handeye
 from stcal.parallel import one_thread
-from stcal.report.svg import save
 from stcal.workflows.cluster import executor_of
 from tests.support.handeye import Truth, simulated_views
 
@@ -41,15 +37,6 @@ ABOUT_CLOSED_FORM = (10.0, 20.0)
 """Half widths of the bounds, degrees and mm."""
 UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}
 """Lengths, mm, that weigh like one radian with λ = 1."""
-STYLES = {
-    "de": ("o-", "#d55e00"),
-    "zhao": ("s-", "#b8559a"),
-    "de-polished": ("o-", "#c98a00"),
-    "park-martin": ("^-", "#555555"),
-    "pose": ("d-", "#3d9bd1"),
-    "reprojection": ("d-", "#0072b2"),
-}
-"""Methods of the figures; the others lie on one of these."""
 
 
 def trial(seed: int) -> dict:
@@ -136,49 +123,17 @@ def print_tables(trials: list[dict]) -> None:
         print(f"| {method} | {cells} | {len(trials) - len(good)} |")
 
 
-def draw(trials: list[dict], path: Path, part: int) -> None:
-    """The paper's figure 4 (``part`` 0, translation) or 5 (1, rotation): median and quartiles of each motion."""
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
-    numbers = np.arange(FITTED + 1, POSES)
-    for shift, (method, (style, colour)) in zip(np.linspace(-0.25, 0.25, len(STYLES)), STYLES.items(), strict=True):
-        values = np.array([each[method][0][:, part] for each in trials if not isinstance(each[method], str)])
-        values = np.degrees(values) if part else values
-        low, middle, high = np.quantile(values, [0.25, 0.5, 0.75], axis=0)
-        bars = [middle - low, high - middle]
-        name = {"de": "DE (the paper's)", "zhao": "Zhao (convex)", "de-polished": "DE, polished"}.get(method, method)
-        axes.errorbar(numbers + shift, middle, bars, fmt=style, color=colour, ms=4, lw=1, elinewidth=0.8, label=name)
-    axes.set(xlabel="held-out motion N", xticks=numbers, yscale="log")
-    axes.set_ylabel("rotation error of Â, °" if part else "translation error of Â, mm")
-    axes.set_title(f"Simulated: median and quartiles of {len(trials)} seeds", fontsize=10)
-    axes.legend(frameon=False, fontsize=8, ncols=3, loc="upper center")
-    axes.set_ylim(top=axes.get_ylim()[1] * 2.2)
-    axes.grid(axis="y", which="both", color="#d5d9de", lw=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.yaxis.set_major_formatter("{x:g}")
-    save(figure, path)
-    plt.close(figure)
-
-
 @one_thread()
 def main() -> None:
-    """Run the seeds; print and draw."""
+    """Run the seeds; print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument(
-        "--plot", type=Path, metavar="FOLDER", help="draw handeye_translation.svg and …_rotation.svg here"
-    )
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     arguments = parser.parse_args()
     with executor_of(arguments.scheduler) as pool:
         trials = list(pool.map(trial, range(arguments.seeds)))
     print(f"{arguments.seeds} seeds, simulated; {FITTED} motions to solve with, {POSES - 1 - FITTED} held out")
     print_tables(trials)
-    if arguments.plot:
-        draw(trials, arguments.plot / "handeye_translation.svg", 0)
-        draw(trials, arguments.plot / "handeye_rotation.svg", 1)
 
 
 if __name__ == "__main__":

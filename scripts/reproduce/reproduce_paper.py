@@ -1,6 +1,6 @@
 """The experiments of Zhang & Wei (2017) in simulation: five trials on the board (Table 1) and five faces (Table 2).
 
-.venv/bin/python scripts/reproduce/reproduce_paper.py [--trials 5] [--width 5184] [--keep FOLDER] [--plot FILE.svg]
+.venv/bin/python scripts/reproduce/reproduce_paper.py [--trials 5] [--width 5184] [--keep FOLDER]
 
 Every trial renders a scene of its own (target, board, camera, noise): four groups of ten photographs. It is solved as
 published (``--solve paper``: detection by the paper's rules, contours' centres alike in weight, no eccentricity, scale
@@ -16,14 +16,12 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.labels import dot_cells
 from stcal.parallel import one_thread
-from stcal.report.svg import save
 from stcal.sfm import run
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.runs.options import RunOptions
@@ -37,8 +35,7 @@ PUBLISHED_SPREAD_UM = (12.645, 12.979, 16.310, 11.595, 14.374)
 can only be the lengths' standard deviation about it."""
 PAPER, OURS = AS_PUBLISHED, "ours"
 """As answered: frames by planes, all groups together."""
-COLOURS = {PAPER: "#d55e00"} | dict(zip((f"+ {s}" for s in STEPS), ("#c98a00", "#009e73", "#56b4e9"), strict=False))
-COLOURS[OURS] = "#0072b2"
+METHODS = [PAPER, *(f"+ {step}" for step in STEPS[:3]), OURS]
 GOALS = {"2": (2.0, 1.2), "3": (3.0, None), "4": (2.0, 1.2), "5": (2.0, 1.2)}
 """Position (µm) and rotation (mdeg), RMS."""
 
@@ -106,7 +103,7 @@ def trial(seed: int, width: int, folder: Path) -> dict[str, Errors]:
 
 def print_tables(trials: list[dict[str, Errors]]) -> None:
     """Markdown."""
-    methods, faces = list(COLOURS), list(trials[0][OURS].faces)
+    methods, faces = METHODS, list(trials[0][OURS].faces)
     boards = np.array([[each[m].board_um for m in methods] for each in trials])
     poses = np.array([[[each[m].faces[f] for f in faces] for m in methods] for each in trials])
     predicted = np.array([[each[OURS].predicted_um[f] for f in faces] for each in trials])
@@ -134,47 +131,13 @@ def print_tables(trials: list[dict[str, Errors]]) -> None:
         print(f"| {face} | {um:.2f} ({goal_um:g}) | {sigma:.2f} | {mdeg:.2f} ({goal_mdeg or '–'}) |")
 
 
-def draw(trials: list[dict[str, Errors]], path: Path, width: int) -> None:
-    """Face errors and board residuals of all trials, logarithmic."""
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), width_ratios=(3, 2), layout="constrained")
-    faces, offsets = list(trials[0][OURS].faces), np.linspace(-0.3, 0.3, len(COLOURS))
-    for (method, colour), offset in zip(COLOURS.items(), offsets, strict=True):
-        values = np.array([[each[method].faces[f][0] for f in faces] for each in trials])
-        x, size = np.arange(len(faces)) + offset, 5 if method in (PAPER, OURS) else 8  # they lie under ours
-        left.plot(np.tile(x, (len(trials), 1)), values, "o", color=colour, ms=4, alpha=0.55, mew=0)
-        left.plot(x, values.mean(0), "_", color=colour, ms=12, mew=2.5, label=method)
-        board = [each[method].board_um[0] for each in trials]
-        right.plot(np.arange(1, len(trials) + 1), board, "o-", color=colour, ms=size, label=method)
-    board = [each[OURS].board_um[1] for each in trials]
-    right.plot(np.arange(1, len(trials) + 1), board, "o:", color=COLOURS[OURS], mfc="w", label="ours, to true dots")
-    left.set(yscale="log", ylabel="position error, µm", xticks=range(len(faces)), title="Faces (Table 2)")
-    left.set_xticklabels([f"face {f}" for f in faces])
-    left.legend(frameon=False, fontsize=9, loc="lower center", ncols=3, columnspacing=1, handletextpad=0.3)
-    left.set_ylim(bottom=left.get_ylim()[0] / 2.2)
-    shown = PUBLISHED_UM[: len(trials)]
-    right.plot(np.arange(1, len(shown) + 1), shown, "s--", color="#333333", ms=5, label="published (measured)")
-    right.set(ylabel="mean board residual, µm", xlabel="trial", xticks=range(1, len(trials) + 1), ylim=(0, 70))
-    right.set_title("Board against its design (Table 1)")
-    right.legend(frameon=False, fontsize=9, loc="upper right")
-    for axes in (left, right):
-        axes.grid(axis="y", which="both", color="#d5d9de", lw=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.yaxis.set_major_formatter("{x:g}")
-    figure.suptitle(f"Simulated photographs, {width} px wide, 10 a group, {len(trials)} trials", fontsize=11)
-    save(figure, path)
-
-
 @one_thread()
 def main() -> None:
-    """Run the trials; print and draw."""
+    """Run the trials; print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--width", type=int, default=5184, help="of the images, px")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep photographs and runs here, or use those")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
     arguments = parser.parse_args()
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -185,8 +148,6 @@ def main() -> None:
             print(f"trial {seed} of {arguments.trials} done", flush=True)
     print(f"\nSimulated photographs, {arguments.width} px wide, 10 a group, board σ 5 µm")
     print_tables(trials)
-    if arguments.plot:
-        draw(trials, arguments.plot, arguments.width)
 
 
 if __name__ == "__main__":

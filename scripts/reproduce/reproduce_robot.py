@@ -1,6 +1,6 @@
 """The robot experiment of Zhang & Wei (2017) in simulation: an arm calibrated by a camera that looks at its target.
 
-.venv/bin/python scripts/reproduce/reproduce_robot.py [--draws 100] [--seed 0] [--plot FILE.svg]
+.venv/bin/python scripts/reproduce/reproduce_robot.py [--draws 100] [--seed 0]
 
 Every draw makes an arm of the size of the MH80 with errors of its own, a target bolted to its flange with the errors of
 a calibration, and photographs of it by one camera that stands still. Then the published chain: single-joint sweeps give
@@ -14,15 +14,12 @@ import argparse
 import time
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
-from stcal.report.svg import save
 from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.identification.adjustment import jacobian as jacobian_of
 from stcal.robot.identification.adjustment import observed, residuals
@@ -73,7 +70,6 @@ MARGIN_RAD, REGULAR = np.radians(2), 0.05
 metres) over this, so that errors of milliradians do not put them out of reach."""
 NOMINAL, AXES, CMMK = "nominal", "axis method", "axis method, CMMK"
 REACH, TRUE, CAMERA = f"{FAR}, true", f"{NEAR}, true", f"{NEAR}, as it measures"
-COLOURS = {NOMINAL: "#d55e00", AXES: "#c98a00", CMMK: "#0072b2"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,43 +329,15 @@ def print_table(draws: list[Draw]) -> None:
             print(f"| {kind} | {model} | {' | '.join(cells)} | {spread} | {gain[:, 2].mean():.1f} % |")
 
 
-def draw_figure(draws: list[Draw], path: Path) -> None:
-    """Every position of the first draw, and the means of all draws in order."""
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.2), sharey=True, layout="constrained")
-    share = 100 * (np.arange(len(draws)) + 0.5) / len(draws)
-    for model, colour in COLOURS.items():
-        error = np.abs(draws[0].sets[REACH][model].error_mm)
-        left.plot(np.arange(2, len(error) + 2), error, "o-", ms=3, lw=0.7, color=colour, label=model)
-        right.plot(share, np.sort(figures(draws, REACH, model)[:, 0]), color=colour, lw=1.8)
-    for value in PUBLISHED["mean"]:
-        right.axhline(value, color="#333333", lw=0.8, ls="--")
-    before, after = PUBLISHED["mean"]
-    right.text(1, 1.05 * before, f"published: {before:.2f} → {after:.2f}", va="bottom", fontsize=8)
-    left.set(xlabel="position", ylabel="error of the distance, mm", yscale="log", title="first arm, each position")
-    right.set(xlabel="share of the arms, %", xlim=(0, 100), title=f"mean of each of {len(draws)} arms, in order")
-    for axes in (left, right):
-        axes.title.set_fontsize(10)
-        axes.grid(color="#d5d9de", lw=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.yaxis.set_major_formatter("{x:g}")
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle("Simulated: distances of 50 positions from the first, all over the reach", fontsize=11)
-    save(figure, path)
-
-
 @one_thread()
 def main() -> None:
-    """Print the table; draw."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=100, help="arms")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--gears", type=float, default=0.0, metavar="MRAD", help="σ of the joints' periodic errors, which no model has"
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     given = parser.parse_args()
     start = time.perf_counter()
@@ -394,8 +362,6 @@ def main() -> None:
         f"\nParameters of the minimal model, eᵀC⁻¹e over their number, expected 1: {told:.2f} ± {spread:.2f}; "
         f"with the poses taken as independent {untold:.1f}."
     )
-    if given.plot:
-        draw_figure(draws, given.plot)
     print(f"\n{time.perf_counter() - start:.0f} s")
 
 

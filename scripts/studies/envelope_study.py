@@ -1,7 +1,7 @@
 """Where the program's envelope ends: rendered sets degraded as photographs are, at five strengths of each kind.
 
 .venv/bin/python scripts/studies/envelope_study.py [--sets FOLDER …] [--only KIND] [--strengths 1,3,5] [--bin FOLDER]
-    [--json FILE] [--compare FILE] [--picture FILE.svg]
+    [--json FILE] [--compare FILE]
 
 Where circles, faces and board lie in the photographs is taken from ``truth.json`` alone. Each degraded set goes through
 `stcal-sfm run` of this or another version (`--bin`: the folder that holds its `stcal-sfm`), one after another. With
@@ -708,54 +708,6 @@ def summary(rows: list[dict]) -> str:
     )
 
 
-def picture(rows: list[dict], before: list[dict], path: Path) -> None:
-    """Recall, the least of circles and dots in all sets, by kind and strength; before beside after."""
-    from stcal.report.svg import INK, SMALL, new_figure, save
-
-    panels = [("before", before), ("after", rows)] if before else [("", rows)]
-    kinds = [kind for kind in KINDS if any(r["kind"] == kind.name for r in rows)]
-    strengths = sorted({r["strength"] for r in rows})
-    figure = new_figure(2.7 + 0.95 * len(strengths) * len(panels), 0.6 + 0.29 * len(kinds))
-    all_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-    for axes, (title, own) in zip(all_axes, panels, strict=True):
-        for i, kind in enumerate(kinds):
-            for j, strength in enumerate(strengths):
-                if hit := [r for r in own if r["kind"] == kind.name and r["strength"] == strength]:
-                    _cell(axes, hit, i, j)
-        axes.set_xlim(-0.5, len(strengths) - 0.5)
-        axes.set_ylim(len(kinds) - 0.5, -0.5)
-        named = [f"{title}, {k}" if title else f"strength {k}" for k in strengths]
-        axes.set_xticks(range(len(strengths)), named, fontsize=SMALL, color=INK)
-        units = [f"{kind.name}, {kind.unit}" if kind.unit else kind.name for kind in kinds]
-        axes.set_yticks(range(len(kinds)), units, fontsize=SMALL, color=INK)
-        axes.tick_params(length=0, labelleft=axes is all_axes[0])
-        axes.xaxis.tick_top()
-        for side in axes.spines.values():
-            side.set_visible(False)
-    figure.tight_layout()
-    save(figure, path)
-
-
-def _cell(axes, hit: list[dict], i: int, j: int) -> None:
-    """One box: the strength with the recall, and below what went wrong."""
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.patches import Rectangle
-
-    colours = LinearSegmentedColormap.from_list("recall", ["#b5473c", "#e9b98a", "#f4efe0", "#bcd7e6", "#6fa8cf"])
-    recall = [r[a] / r[b] for r in hit for a, b in (("found", "must"), ("dots", "must_dots")) if r[b]]
-    colour = colours(min(recall)) if recall else "#eeeeee"
-    axes.add_patch(Rectangle((j - 0.48, i - 0.45), 0.96, 0.9, facecolor=colour, edgecolor="none"))
-    ended, quiet, wrong = any(r["exit"] for r in hit), any(silent(r) for r in hit), sum(r["wrong"] for r in hit)
-    lost = any(not r["exit"] and r["faces"] < r["faces_of"] for r in hit)
-    said = [word for word, true in (("ended", ended), ("silent", quiet), ("faces lost", lost)) if true]
-    said += [f"{wrong} wrong"] if wrong else []
-    ink = "#ffffff" if recall and min(recall) < 0.2 else "#222222"
-    text = f"{hit[0]['value']}: " + (f"{100 * min(recall):.0f} %" if recall else "–")
-    style = {"ha": "center", "va": "center", "color": ink}
-    axes.text(j, i - (0.19 if said else 0), text, fontsize=6, **style)
-    axes.text(j, i + 0.21, ", ".join(said), fontsize=5.5, fontweight="bold", **style)
-
-
 def rows_of(path: Path | None) -> dict[tuple, dict]:
     """Rows of a file by set, kind and strength."""
     rows = json.loads(path.read_text()) if path and path.exists() else []
@@ -771,7 +723,6 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="processes of each run")
     parser.add_argument("--json", type=Path, help="keep rows here, and take those that it has")
     parser.add_argument("--compare", type=Path, help="an earlier file of --json")
-    parser.add_argument("--picture", type=Path, help="draw recall by kind and strength")
     parser.add_argument("--look", type=Path, help="write the first photograph of each case here, and run nothing")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # folders are removed then
@@ -805,8 +756,6 @@ def main() -> None:
         )
         print("\nafter", end="")
     print(f"\n{summary(rows)}\n* beyond the goals")
-    if given.picture:
-        picture(rows, list(before.values()), given.picture)
 
 
 def look(kind: Kind, strength: int, data: RenderedSet, folder: Path) -> None:

@@ -1,6 +1,6 @@
 """Error of the faces against noise, number of views, their spread and the circles' radius, with the Cramér–Rao bound.
 
-.venv/bin/python scripts/studies/noise_study.py [--seeds 20] [--plot FILE.svg]
+.venv/bin/python scripts/studies/noise_study.py [--seeds 20]
 
 Labels are simulated, no pixels: 5184×3456 px, groups and designs as in Zhang & Wei (2017), from the true model. One
 quantity at a time departs from the base (0.01 px, 10 images a group, 40°, the reference radii). σ of a centre falls
@@ -12,15 +12,12 @@ was put in, σ₀ = 1), and the position error of the uncorrected control (no ec
 import argparse
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
-from stcal.report.svg import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
@@ -46,8 +43,6 @@ PANELS = {
     "spread_deg": ("spread of the views, ±°", (15.0, 25.0, 40.0, 55.0)),
     "radius": ("radius over the reference", (0.5, 0.75, 1.0, 1.5)),
 }
-ERROR, BOUND, CONTROL = "joint adjustment", "Cramér–Rao bound", "uncorrected control"
-STYLES = {ERROR: ("o", "#0072b2"), BOUND: ("-", "#333333"), CONTROL: ("s--", "#d55e00")}
 
 
 def designs(radius: float) -> tuple[TargetDesign, BoardDesign]:
@@ -119,48 +114,16 @@ def print_table(found: dict[Point, np.ndarray]) -> None:
             )
 
 
-def draw(found: dict[Point, np.ndarray], seeds: int, path: Path) -> None:
-    """A panel for each quantity, both axes logarithmic."""
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, grid = plt.subplots(2, 2, figsize=(9, 6.6), sharey=True, layout="constrained")
-    for axes, (name, (title, values)) in zip(grid.flat, PANELS.items(), strict=True):
-        rows = np.array([found[Point(**{name: value})] for value in values])
-        for label, column in ((CONTROL, 3), (BOUND, 2), (ERROR, 0)):
-            style, colour = STYLES[label]
-            axes.plot(values, rows[:, column], style, color=colour, ms=5, label=label)
-        axes.set(xscale="log", yscale="log", xlabel=title)
-        axes.set_xticks(values, [f"{value:g}" for value in values])
-        _tidy(axes)
-    for axes in grid[:, 0]:
-        axes.set_ylabel("position error of a face, µm")
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle(f"Simulated labels, 5184×3456 px, RMS over {seeds} seeds and four faces", fontsize=11)
-    save(figure, path)
-
-
-def _tidy(axes) -> None:
-    axes.minorticks_off()
-    axes.grid(color="#d5d9de", lw=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.yaxis.set_major_formatter("{x:g}")
-
-
 @one_thread()
 def main() -> None:
-    """Print the table; draw."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20, help="runs at each point")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw into FILE.svg or .png")
     parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
     given = parser.parse_args()
     found = study(given.seeds, given.scheduler)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")
     print_table(found)
-    if given.plot:
-        draw(found, given.seeds, given.plot)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ NameOption = Annotated[
     str, "Choose this camera from a file of several, such as cam1 or 2; it is also the name that is written."
 ]
 SizeOption = Annotated[str, "Take images to have this size, px, if the file states none.", Opt(metavar="WxH")]
-PlotFile = Annotated[Path | None, "Draw a picture into this file (PNG or SVG).", WRITES]
+PlotFile = Annotated[Path | None, "Draw a picture into this file (.svg).", WRITES]
 
 
 @app.command()

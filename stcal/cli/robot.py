@@ -312,7 +312,7 @@ def verify(
     measured: Annotated[
         Path | None, "Read commanded_x_mm …, measured x_mm … and set (before or after) from this file (CSV).", Arg()
     ] = None,
-    plot: Annotated[Path | None, "Draw the error of each pose and set to this file (.png or .svg).", WRITES] = None,
+    plot: Annotated[Path | None, "Draw the error of each pose and set to this file (.svg).", WRITES] = None,
     first: shared.FirstTable = None,
     seconds: Annotated[
         list[Path] | None,
@@ -330,8 +330,6 @@ def verify(
     from stcal.robot.use import verification
     from stcal.robot.use.report import verification_report
 
-    if plot and plot.suffix.lower() not in (".png", ".svg"):
-        raise InputError("E-OUTPUT-SUFFIX", f"--plot {plot}: a name ending in .png or .svg needed")
     tables = shared.several_tables(
         measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns, columns_a=columns_a
     )
@@ -343,9 +341,11 @@ def verify(
     print_each("note", result.notes)
     print_each("warning", result.warnings())
     if plot:
-        from stcal.robot.use.report import figure_bytes, verification_figure
+        from stcal.report.svg import save
+        from stcal.robot.use.report import verification_figure
 
-        write(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
+        save(verification_figure(result), plot)
+        say(f"written: {plot}")
     write_if(json_file, lambda: verification.verification_file(result))
     write_if(report, document.page)
 

@@ -1,7 +1,6 @@
-"""Sheets in mm as SVG, and as PDF through matplotlib."""
+"""Sheets in mm as SVG and as PDF."""
 
 import io
-import warnings
 from collections.abc import Sequence
 from html import escape
 
@@ -72,72 +71,81 @@ def _number(value: float) -> str:
     return f"{value:.6f}".rstrip("0").rstrip(".")
 
 
-INCH_MM = 25.4
-POINT_MM = INCH_MM / 72
-PDF_DASH = (0, (20, 10))
-"""Dash pattern, in widths of the line."""
-ANCHORS = {"start": "left", "middle": "center", "end": "right"}
+POINT_MM = 25.4 / 72
+FONT = "Helvetica"
+"""One of the fonts that every reader of PDF has. Greek letters and signs that it lacks come from Symbol."""
+DASH_WIDTHS = (20, 10)
+"""Lengths of a dash and of the gap after it in PDF, in widths of the line."""
 
 
 def pdf(sheets: Sequence[Sheet]) -> bytes:
     """Return the bytes of the file; equal sheets give equal bytes."""
-    import matplotlib
-    from matplotlib.backends.backend_pdf import PdfPages
+    from reportlab.pdfgen.canvas import Canvas
 
     stream = io.BytesIO()
-    metadata = {"CreationDate": None, "Creator": None, "Producer": None, "Title": sheets[0].title}
-    with warnings.catch_warnings(), matplotlib.rc_context({"pdf.fonttype": 42, "path.simplify": False}):
-        warnings.filterwarnings("ignore", "Glyph")  # a face may be named in any script
-        with PdfPages(stream, metadata=metadata) as pages:
-            for sheet in sheets:
-                pages.savefig(figure_of(sheet))
+    canvas = Canvas(stream, invariant=True)
+    canvas.setTitle(sheets[0].title)
+    for sheet in sheets:
+        canvas.setPageSize((sheet.width / POINT_MM, sheet.height / POINT_MM))
+        canvas.scale(1 / POINT_MM, 1 / POINT_MM)  # from here on lengths are in mm, upwards from the lower left corner
+        for placed in sheet.placed:
+            canvas.saveState()
+            if placed.clip is not None:
+                canvas.clipPath(_outline(canvas, [_corners(placed.clip)]), stroke=0)
+            for layer in LAYERS:
+                for shape in (layer_shape for layer_shape in placed.shapes if layer_shape.layer == layer):
+                    _add(canvas, shape)
+            canvas.restoreState()
+        canvas.showPage()
+    canvas.save()
     return stream.getvalue()
 
 
-def figure_of(sheet: Sheet):
-    """Return the page as a figure of its size; a millimetre in data is a millimetre on paper."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(sheet.width / INCH_MM, sheet.height / INCH_MM), facecolor="white")
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set_axis_off()
-    axes.set_xlim(0, sheet.width)
-    axes.set_ylim(0, sheet.height)
-    for placed in sheet.placed:
-        for layer in LAYERS:
-            for shape in (layer_shape for layer_shape in placed.shapes if layer_shape.layer == layer):
-                _add(axes, shape, placed.clip)
-    return figure
-
-
-def _add(axes, shape: Shape, clip: np.ndarray | None) -> None:
-    from matplotlib.patches import Circle, PathPatch, Rectangle
-    from matplotlib.path import Path
-    from matplotlib.transforms import Bbox, TransformedBbox
-
+def _add(canvas, shape: Shape) -> None:
     colour = COLOURS[shape.ink]
+    canvas.setFillColor(colour)
     if isinstance(shape, Text):
-        size = shape.height / CAPITAL_SHARE / POINT_MM
-        options = {"ha": ANCHORS[shape.anchor], "va": "baseline", "rotation": 90 if shape.turned else 0}
-        artist = axes.text(
-            *(shape.x, shape.y, shape.words.replace("$", r"\$")),
-            fontsize=size, color=colour, rotation_mode="anchor", clip_on=clip is not None, **options,
-        )  # fmt: skip
+        canvas.saveState()
+        canvas.translate(shape.x, shape.y)
+        canvas.rotate(90 if shape.turned else 0)
+        canvas.setFont(FONT, shape.height / CAPITAL_SHARE)
+        draw = {"start": canvas.drawString, "middle": canvas.drawCentredString, "end": canvas.drawRightString}
+        draw[shape.anchor](0, 0, shape.words)
+        canvas.restoreState()
     elif isinstance(shape, Disc):
-        artist = axes.add_patch(Circle((shape.x, shape.y), shape.radius, facecolor=colour, linewidth=0))
+        canvas.drawPath(_circle(canvas, shape), stroke=0, fill=1)
     elif isinstance(shape, Area):
-        paths = [Path(np.vstack([line, line[:1]]), closed=True) for line in shape.lines]
-        artist = axes.add_patch(PathPatch(Path.make_compound_path(*paths), facecolor=colour, linewidth=0))
+        canvas.drawPath(_outline(canvas, shape.lines), stroke=0, fill=1, fillMode=0)  # even-odd
     else:
-        points = np.vstack([shape.points, shape.points[:1]]) if shape.closed else shape.points
-        options = {"linestyle": PDF_DASH} if shape.dashed else {}
-        line = Path(points, closed=shape.closed)
-        width = shape.width / POINT_MM
-        artist = axes.add_patch(
-            PathPatch(line, fill=False, edgecolor=colour, linewidth=width, capstyle="butt", **options)
-        )
-    if clip is not None:
-        (x, y), (right, top) = clip.tolist()
-        artist.set_clip_path(Rectangle((x, y), right - x, top - y, transform=axes.transData))
-        if isinstance(shape, Text):
-            artist.set_clip_box(TransformedBbox(Bbox(clip), axes.transData))
+        canvas.setStrokeColor(colour)
+        canvas.setLineWidth(shape.width)
+        canvas.setDash([shape.width * each for each in DASH_WIDTHS] if shape.dashed else [])
+        canvas.drawPath(_outline(canvas, [shape.points], shape.closed))
+
+
+def _outline(canvas, lines: Sequence[np.ndarray], closed: bool = True):
+    path = canvas.beginPath()
+    for line in lines:
+        path.moveTo(*line[0].tolist())
+        for point in line[1:].tolist():
+            path.lineTo(*point)
+        if closed:
+            path.close()
+    return path
+
+
+ARCS = 8
+"""Number of Bézier arcs of a circle: they leave it by less than 5 parts in a million of its radius."""
+
+
+def _circle(canvas, disc: Disc):
+    angle = np.arange(2 * ARCS + 1) * np.pi / ARCS
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)[::2]
+    along = 4 / 3 * np.tan(np.pi / (2 * ARCS)) * np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+    ends, before, after = ([disc.x, disc.y] + disc.radius * each for each in (unit, unit - along, unit + along))
+    path = canvas.beginPath()
+    path.moveTo(*ends[0].tolist())
+    for arc in zip(after[:-1], before[1:], ends[1:], strict=True):
+        path.curveTo(*np.concatenate(arc).tolist())
+    path.close()
+    return path

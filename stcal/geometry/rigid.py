@@ -137,24 +137,6 @@ class Rigid(_ByValue):
             )
         return cls(u @ vt, m[:3, 3])
 
-    @classmethod
-    def from_quaternion(cls, quaternion: ArrayLike, translation: ArrayLike = (0, 0, 0), *, order: Order) -> "Rigid":
-        """Return the transform of a quaternion (4,), unit to 1e-3, and a translation (3,), mm.
-
-        ``order`` : ``xyzw`` as of SciPy and ROS, or ``wxyz`` as of Eigen's constructor, COLMAP and ABB; programs
-        differ, so that it must be given.
-
-        Raises
-        ------
-        InputError
-            Another order, or a quaternion that is not of unit length.
-        """
-        if order not in ("wxyz", "xyzw"):
-            raise InputError("E-OPTION-VALUE", f"quaternion: order {order!r}: not a choice; use wxyz or xyzw")
-        values = frozen(quaternion, (4,), "quaternion")
-        wxyz = values if order == "wxyz" else np.roll(values, 1)
-        return Poses.from_quaternions(wxyz[None], frozen(translation, (3,), "translation")[None])[0]
-
     def as_scipy(self) -> Rotation:
         """Return the rotation as SciPy's, of which quaternions, Euler angles and rotation vectors can be taken."""
         return Rotation.from_matrix(np.array(self.rotation))

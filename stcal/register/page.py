@@ -23,7 +23,20 @@ from stcal.report.document import (
     plot,
     tiles,
 )
-from stcal.report.svg import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
+from stcal.report.svg import (
+    COLOURS,
+    DASH,
+    FAINT,
+    INK,
+    SMALL,
+    YELLOW_RED,
+    Axes,
+    Box,
+    Drawing,
+    limits,
+    round_below,
+    ticks,
+)
 from stcal.report.text import NONE, number
 
 FEW_ROWS = 24
@@ -292,35 +305,19 @@ def space_figure(findings: Findings):
     beyond = np.flatnonzero(~inlier & (cut < 1))
     beyond = beyond[np.argsort(-length[beyond], kind="stable")]
     reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side
-    figure = new_figure(10.2, 3.7)
-    for k, (i, j) in enumerate(VIEWS):
-        axes = figure.add_axes((0.075 + k * 0.325, 0.14, 0.255, 0.82))
+    drawing = Drawing(10.2, 3.7)
+    for box, (i, j) in zip(drawing.panels(3, left=54, top=14, gap=50), VIEWS, strict=True):
+        axes = _axes(drawing, box, "b", i, j, middle, reach)
         for kind, colour in ((True, COLOURS[0]), (False, COLOURS[1])):
             own = inlier == kind
-            if own.any():
-                axes.quiver(
-                    *place[own][:, [i, j]].T,
-                    *arrow[own][:, [i, j]].T,
-                    color=colour,
-                    angles="xy",
-                    scale_units="xy",
-                    scale=1,
-                    width=0.006,
-                    headwidth=3.2,
-                    headlength=4,
-                    headaxislength=3.6,
-                    zorder=2 if kind else 3,
-                )
-                axes.plot(*place[own][:, [i, j]].T, ".", color=colour, ms=2.5, zorder=2)
-        ends = (place + arrow)[:, [i, j]]
-        axes.plot(*ends[beyond].T, "o", mfc="white", mec=COLOURS[1], ms=4, mew=0.8, zorder=4)
-        for row, end in zip(beyond[:MOST_LABELS].tolist(), ends[beyond], strict=False):
-            axes.annotate(
-                f"{length[row]:.2g}", end, (3, 3), textcoords="offset points", fontsize=SMALL - 1, color=INK, zorder=5
-            )
-        _frame(axes, "b", i, j, middle, reach)
-    figure.text(0.99, 0.99, f"{scale:,g} times", ha="right", va="top", fontsize=SMALL + 1, color=INK)
-    return figure
+            axes.arrows(place[own][:, [i, j]], arrow[own][:, [i, j]], 1.1, colour)
+            axes.marks(*place[own][:, [i, j]].T, "dot", 2.5, colour)
+        ends = (place + arrow)[beyond][:, [i, j]]
+        axes.marks(*ends.T, "ring", 4, COLOURS[1])
+        for row, (x, y) in zip(beyond[:MOST_LABELS].tolist(), ends.tolist(), strict=False):
+            axes.words(x, y, f"{length[row]:.2g}", (4, -5), size=SMALL - 1, anchor="start")
+    drawing.words((drawing.width - 6, 7), f"{scale:,g} times", SMALL + 1, "end")
+    return drawing
 
 
 def has_field_figure(findings: Findings, field: Field) -> bool:
@@ -329,7 +326,7 @@ def has_field_figure(findings: Findings, field: Field) -> bool:
     return bool(width.min() >= 1e-3 * width.max())
 
 
-def field_figure(findings: Findings, field: Field):
+def field_figure(findings: Findings, field: Field) -> Drawing:
     """Returns planes through the middle of the points with the expected error."""
     own = findings.xyz_a[field.rows]
     low, high = own.min(0), own.max(0)
@@ -346,51 +343,50 @@ def field_figure(findings: Findings, field: Field):
     most = max(float(size.max()) for _, _, size in planes)
     step = round_below(most / 10)
     levels = np.arange(np.ceil(most / step * (1 - 1e-9)) + 1) * step
-    figure, shown = new_figure(10.2, 3.5), []
-    for k, ((i, j), (u, v, size)) in enumerate(zip(VIEWS, planes, strict=True)):
-        axes = figure.add_axes((0.075 + k * 0.29, 0.15, 0.225, 0.8))
-        shown.append(axes.contourf(u, v, size, levels=levels, cmap="YlOrRd"))
-        axes.contour(u, v, size, levels=levels[1:-1:2], colors=INK, linewidths=0.4, alpha=0.5)
+    drawing = Drawing(10.2, 3.5)
+    boxes = drawing.panels(3, left=54, right=52, gap=50)
+    for box, (i, j), (u, v, size) in zip(boxes, VIEWS, planes, strict=True):
+        axes = _axes(drawing, box, "a", i, j, middle, reach)
+        axes.shade(size, (u[0], v[0], u[-1], v[-1]), 0, levels[-1], YELLOW_RED, len(levels) - 1)
         third = 3 - i - j
         near = np.abs(own[:, third] - middle[third]) < (high - low)[third] / 8
-        axes.plot(*own[near][:, [i, j]].T, ".", color=INK, ms=3)
-        box = np.array([[low[i], low[j]], [high[i], low[j]], [high[i], high[j]], [low[i], high[j]], [low[i], low[j]]])
-        axes.plot(*box.T, color=INK, lw=0.7, ls=(0, (4, 3)))
-        _frame(axes, "a", i, j, middle, reach)
-    bar = figure.colorbar(shown[-1], cax=figure.add_axes((0.918, 0.15, 0.012, 0.8)))
-    bar.set_ticks(levels[:: -(-len(levels) // 8)])
-    bar.ax.tick_params(labelsize=SMALL, length=2)
-    bar.set_label("mm", fontsize=SMALL + 1)
-    return figure
+        axes.marks(*own[near][:, [i, j]].T, "dot", 3, INK)
+        corners = (low[i], high[i], high[i], low[i], low[i]), (low[j], low[j], high[j], high[j], low[j])
+        axes.lines([corners], INK, 0.7, dash=DASH)
+    right, top, bottom = drawing.width - 38, boxes[0][1], boxes[0][3]
+    drawing.scale((right, top + 14, right + 8, bottom), 0, levels[-1], "mm", YELLOW_RED)
+    return drawing
 
 
-def errors_figure(findings: Findings, reach: Cubes):
+def errors_figure(findings: Findings, reach: Cubes) -> Drawing:
     """Returns a figure of each residual against the side of the centred cube on whose surface its point lies."""
     result = findings.registration
     rows = _shown(findings)
     side = 2 * np.abs(findings.xyz_a[rows] - reach.middle).max(1)
     length, inlier = findings.length_mm[rows], result.inliers[rows]
-    figure = new_figure(9, 2.6)
-    axes = figure.add_axes((0.07, 0.2, 0.92, 0.66))
+    drawing = Drawing(9, 2.6)
     top = 1.25 * result.inlier_errors.max_mm
-    for edge in reach.sides_mm:
-        axes.axvline(edge, color=FAINT, lw=0.8)
+    axes = Axes(
+        drawing, drawing.panels(top=24)[0], limits([side.max(initial=0), *reach.sides_mm], low=0), (0, 1.04 * top)
+    )
+    axes.lines([((edge, edge), axes.y) for edge in reach.sides_mm], FAINT, 0.8)
+    key = {}
     for kind, colour, name in ((True, COLOURS[0], "inlier"), (False, COLOURS[1], "outlier")):
         own = inlier == kind
         inside = own & (length <= top)
-        axes.plot(side[inside], length[inside], "o", color=colour, ms=3.2, mew=0, label=name if own.any() else None)
-        axes.plot(side[own & ~inside], np.full((own & ~inside).sum(), top), "^", color=colour, ms=4.5, mew=0)
+        axes.marks(side[inside], length[inside], "dot", 3.2, colour)
+        axes.marks(side[own & ~inside], top, "triangle", 4.5, colour)
+        key |= {name: ("dot", colour)} if own.any() else {}
     held = result.held_out
     if held is not None and len(held.rows) == len(result):
         tried = np.full(len(result), np.nan)
         tried[held.rows] = held.error_mm
         tried = tried[rows]
-        axes.plot(side[tried <= top], tried[tried <= top], "_", color=COLOURS[2], ms=6, mew=1, label="held out")
-    axes.set_ylim(0, 1.04 * top)
-    axes.set_xlim(0, None)
-    calm(axes, "cube about the middle, side in mm (triangles: farther off than shown)", "error, mm")
-    axes.legend(fontsize=SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
-    return figure
+        axes.marks(side[tried <= top], tried[tried <= top], "dash", 6, COLOURS[2])
+        key["held out"] = "dash", COLOURS[2]
+    axes.frame("cube about the middle, side in mm (triangles: farther off than shown)", "error, mm")
+    drawing.key((axes.box[0], 10), key)
+    return drawing
 
 
 def _shown(findings: Findings) -> np.ndarray:
@@ -402,27 +398,24 @@ def _shown(findings: Findings) -> np.ndarray:
     return np.concatenate([good[np.linspace(0, len(good) - 1, MOST_ARROWS - len(bad)).astype(int)], bad])
 
 
-def _frame(axes, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarray) -> None:
-    """Sets limits of equal scale that hold ``middle`` ± ``reach``."""
-    width, height = axes.get_position().size * axes.figure.get_size_inches()
-    per_inch = max(reach[i] / width, reach[j] / height)
-    axes.set_xlim(middle[i] - per_inch * width, middle[i] + per_inch * width)
-    axes.set_ylim(middle[j] - per_inch * height, middle[j] + per_inch * height)
-    axes.xaxis.set_major_locator(locator())
-    axes.yaxis.set_major_locator(locator())
-    calm(axes, f"{'xyz'[i]} of {frame}, mm", f"{'xyz'[j]} of {frame}, mm")
+def _axes(drawing: Drawing, box: Box, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarray) -> Axes:
+    """Returns axes of equal scale that hold ``middle`` ± ``reach``."""
+    axes = Axes.equal(drawing, box, np.array([middle - reach, middle + reach])[:, [i, j]], 0)
+    axes.frame(f"{'xyz'[i]} of {frame}, mm", f"{'xyz'[j]} of {frame}, mm")
+    return axes
 
 
-def sample_size_figure(sizes: list[SampleSize], share: float):
+def sample_size_figure(sizes: list[SampleSize], share: float) -> Drawing:
     """Returns a figure of the best and median share of inliers by size of the sample. The requested share is dashed."""
-    figure = new_figure(6.4, 2.9)
-    axes = figure.add_axes((0.1, 0.17, 0.87, 0.78))
+    drawing = Drawing(6.4, 2.9)
     points = [each.points for each in sizes]
-    axes.plot(points, [100 * each.best for each in sizes], "o-", color=COLOURS[0], ms=3.5, lw=1.4, label="best")
-    axes.plot(points, [100 * each.median for each in sizes], "o:", color=COLOURS[0], ms=2.5, lw=1.2, label="median")
-    axes.axhline(100 * share, color=INK, lw=0.8, ls=(0, (4, 3)))
-    axes.set(ylim=(0, 102))
-    axes.legend(frameon=False, fontsize=SMALL + 0.5, loc="lower right")
-    axes.xaxis.set_major_locator(locator(integer=True))
-    calm(axes, "points of a sample", "inliers of the other points, %", "y")
-    return figure
+    axes = Axes(drawing, drawing.panels(top=24)[0], limits(points), (0, 102))
+    axes.frame("points of a sample", "inliers of the other points, %", "y", ticks(*axes.x, len(points)))
+    best, median = [100 * each.best for each in sizes], [100 * each.median for each in sizes]
+    axes.lines([(points, best)], COLOURS[0], 1.4)
+    axes.lines([(points, median)], COLOURS[4], 1.2)
+    axes.marks(points, best, "dot", 3.5, COLOURS[0])
+    axes.marks(points, median, "dot", 2.5, COLOURS[4])
+    axes.level(100 * share, dash=DASH)
+    drawing.key((axes.box[0], 10), {"best": ("dot", COLOURS[0]), "median": ("dot", COLOURS[4])})
+    return drawing

@@ -5,7 +5,7 @@ import numpy as np
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, FittedLens, image_grid, rays
 from stcal.io.cameras.photograph import SIGMA_FOCAL
-from stcal.report.svg import INK, SMALL, calm, new_figure
+from stcal.report.svg import SMALL, VIRIDIS, Axes, Drawing
 from stcal.report.text import NONE, text_table
 
 POOR_PX = 0.05
@@ -95,7 +95,7 @@ def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         return pixels, pixels - ideal.pixel_from_normalised(rays_camera[:, :2]).reshape(pixels.shape)
 
 
-def distortion_figure(camera: Camera):
+def distortion_figure(camera: Camera) -> Drawing:
     """Return a figure of the distortion over the image: its direction and size."""
     pixels, moved = moved_px(camera)
     return _field(pixels, moved, "moved by the lens, px")
@@ -122,26 +122,25 @@ def comparison_text(found: CameraDifference) -> list[str]:
     return lines
 
 
-def comparison_figure(found: CameraDifference):
+def comparison_figure(found: CameraDifference) -> Drawing:
     """Return a figure of the differences between two cameras: their direction and size."""
     return _field(found.pixels, found.apart, "second camera, px apart")
 
 
-def _field(pixels: np.ndarray, moved: np.ndarray, what: str):
+def _field(pixels: np.ndarray, moved: np.ndarray, what: str) -> Drawing:
     """Return a figure of vectors (r, c, 2), px, at ``pixels``: lengths as colours, directions as arrows."""
-    figure = new_figure(7.0, 0.9 + 5.6 * np.ptp(pixels[..., 1]) / np.ptp(pixels[..., 0]))
-    axes = figure.add_subplot()
+    (x0, y0), (x1, y1) = pixels[0, 0], pixels[-1, -1]
+    drawing = Drawing(7.0, 0.6 + 5.7 * (y1 - y0) / (x1 - x0))
+    box = drawing.panels(top=20, right=60)[0]
+    axes = Axes(drawing, box, (x0, x1), (y1, y0))
     length = np.linalg.norm(moved, axis=2)
-    shades = axes.pcolormesh(pixels[0, :, 0], pixels[:, 0, 1], length, cmap="viridis", shading="gouraud", vmin=0)
+    most = float(np.nanmax(length, initial=0)) or 1.0
+    axes.shade(length, (x0, y0, x1, y1), 0, most, VIRIDIS)
     every = (slice(1, None, 3), slice(1, None, 3))
-    x, y = pixels[every].reshape(-1, 2).T
-    u, v = (moved[every] / np.maximum(length[every], 1e-12)[..., None]).reshape(-1, 2).T
-    axes.quiver(x, y, u, v, angles="xy", color="white", alpha=0.8, width=0.0022, scale=38)
-    axes.set(xlim=(pixels[0, 0, 0], pixels[0, -1, 0]), ylim=(pixels[-1, 0, 1], pixels[0, 0, 1]), aspect="equal")
-    axes.set_xlabel("x, px", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel("y, px", fontsize=SMALL + 1, color=INK)
-    bar = figure.colorbar(shades, ax=axes, shrink=0.85)
-    bar.set_label(what, fontsize=SMALL + 1, color=INK)
-    bar.ax.tick_params(labelsize=SMALL)
-    calm(axes)
-    return figure
+    known = np.isfinite(length[every])
+    unit = moved[every][known] / np.maximum(length[every][known], 1e-12)[:, None]
+    axes.arrows(pixels[every][known], 0.026 * (x1 - x0) * unit, 1.1, "#ffffff", 0.8)
+    axes.frame("x, px", "y, px")
+    drawing.scale((box[2] + 14, box[1] + 16, box[2] + 24, box[3] - 16), 0, most, "px", VIRIDIS)
+    drawing.words(((box[0] + box[2]) / 2, 9), what, SMALL + 1)
+    return drawing

@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 
 from stcal.errors import InputError
 from stcal.parallel import one_thread
-from stcal.report.svg import uri
+from stcal.report.svg import Drawing
 from stcal.report.text import NONE, join, number, text_table
 
 MACROS = "report/templates/macros.html.jinja"
@@ -332,17 +332,9 @@ def fold(summary: str, *blocks: Block) -> Html | None:
     return Html(lambda: _macro("fold", summary, html(*blocks))) if any(blocks) else None
 
 
-def plot(draw: Callable[[], Any], alt: str, caption: str = "", css: str = "wide") -> Html:
-    """Return a figure with its caption.
-
-    ``draw`` : returns the figure, of matplotlib or as a data URI, when the page is written
-    """
-
-    def picture() -> str:
-        figure = draw()
-        return _macro("plot", figure if isinstance(figure, str) else uri(figure), alt, caption or alt, css)
-
-    return Html(picture)
+def plot(draw: Callable[[], Drawing], alt: str, caption: str = "", css: str = "wide") -> Html:
+    """Return a figure with its caption, drawn when the page is written."""
+    return Html(lambda: _macro("plot", draw().uri(), alt, caption or alt, css))
 
 
 def plots(*figures: Html | None) -> Html | None:

@@ -1,22 +1,18 @@
-"""Figures for pages, as SVG data URIs or files: equal figures give equal bytes.
-
-Plain plots are written directly. matplotlib takes half a second to load and a tenth of a second for each figure, so
-only figures that need it load it.
-"""
+"""Figures for pages and files, written directly as SVG."""
 
 import base64
 import io
 import re
-import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import product
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+from PIL import Image
 
+from stcal.errors import InputError
 from stcal.io import files
 
 # The palette of Okabe & Ito (2008), darkened where it would be faint on white; then shades for many groups.
@@ -34,80 +30,37 @@ def round_below(value: float) -> float:
     return float(max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))
 
 
-def locator(integer: bool = False):
-    """Return a locator of few ticks at round values."""
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(5, steps=[1, 2, 5, 10], integer=integer)
-
-
-def new_figure(width: float, height: float):
-    """Return an empty figure; width and height in inches."""
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), facecolor="none")
-    FigureCanvasSVG(figure)
-    return figure
-
-
-def calm(axes, x: str = "", y: str = "", grid: Literal["", "x", "y", "both"] = "") -> None:
-    """Remove the frame of axes, and make ticks and remaining lines inconspicuous; set labels and a faint grid."""
-    axes.tick_params(labelsize=SMALL, length=2, color="#9aa0a8")
-    axes.set_facecolor("none")
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color("#9aa0a8")
-    for text, label in ((x, axes.set_xlabel), (y, axes.set_ylabel)):
-        if text:
-            label(text, fontsize=SMALL + 1, color=INK)
-    if grid:
-        axes.grid(axis=grid, color=FAINT, lw=0.6)
-        axes.set_axisbelow(True)
-
-
-def plane(axes, x: str, y: str, margin: float) -> None:
-    """Prepare the axes of a map: equal scales, a faint grid, and a ``margin`` as a share of the extent."""
-    axes.set_aspect("equal", "datalim")
-    axes.margins(margin)
-    axes.xaxis.set_major_locator(locator())
-    axes.yaxis.set_major_locator(locator())
-    calm(axes, x, y, "both")
-
-
-def uri(figure) -> str:
-    """Return the figure as an SVG data URI; equal figures give equal bytes."""
-    import matplotlib
-
-    stream = io.BytesIO()
-    with warnings.catch_warnings(), matplotlib.rc_context({"svg.fonttype": "path", "svg.hashsalt": "stcal"}):
-        warnings.filterwarnings("ignore", "Glyph")  # a face may be named in any script
-        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode()
-
-
-def save(figure, path: Path) -> None:
-    """Save a figure as PNG or SVG, by the file's suffix, and make its folder; all of it, or nothing.
-
-    In SVG, text stays text: files are small, and changes of them are readable.
-    """
-    import matplotlib
-
-    stream, kind = io.BytesIO(), path.suffix[1:]
-    with matplotlib.rc_context({"svg.hashsalt": "stcal", "svg.fonttype": "none"}):
-        figure.savefig(stream, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else None)
-    files.save(path, stream.getvalue())
-
-
 AXIS, PANE, PANE_EDGE = "#9aa0a8", "#f4f6f8", "#e1e5e9"
 FONTS = "system-ui, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 RED_BLUE = "#053061 #2166ac #4393c3 #92c5de #d1e5f0 #f7f7f7 #fddbc7 #f4a582 #d6604d #b2182b #67001f"
-"""The diverging scale RdBu of ColorBrewer (Harrower & Brewer 2003), from blue to red."""
+"""The diverging ramp RdBu of ColorBrewer (Harrower & Brewer 2003), from blue to red."""
+YELLOW_RED = "#ffffcc #ffeda0 #fed976 #feb24c #fd8d3c #fc4e2a #e31a1c #bd0026 #800026"
+"""The ramp YlOrRd of ColorBrewer, light to dark."""
+VIRIDIS = "#440154 #472d7b #3b528b #2c728e #21918c #28ae80 #5ec962 #addc30 #fde725"
+"""The ramp viridis (van der Walt & Smith 2015), dark to light."""
+DASH = "5 4"
+LETTER = 0.55
+"""Mean width of a letter as a share of the font's size."""
+MARKS = {
+    "dot": "h0",
+    "ring": "m-{1:.1f} 0a{1:.1f} {1:.1f} 0 1 0 {0:.1f} 0a{1:.1f} {1:.1f} 0 1 0 -{0:.1f} 0",
+    "dash": "m-{1:.1f} 0h{0:.1f}",
+    "bar": "m0 -{1:.1f}v{0:.1f}",
+    "triangle": "m0 -{1:.1f}l{1:.1f} {0:.1f}h-{0:.1f}z",
+    "square": "m-{1:.1f} -{1:.1f}h{0:.1f}v{0:.1f}h-{0:.1f}z",
+    "diamond": "m0 -{1:.1f}l{1:.1f} {1:.1f}l-{1:.1f} {1:.1f}l-{1:.1f} -{1:.1f}z",
+}
+"""Path of each mark from its middle; {0} is its size, {1} half of it, pt."""
+Ticks = tuple[Sequence[float], Sequence[str]]
+"""Values of an axis, and their words."""
 UNWRITABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 """Characters that no XML file may contain."""
 MARGIN_PT = 34.0
 """Space around a view in space for ticks and names of its axes."""
+
+
+Box = tuple[float, float, float, float]
+"""Left, top, right and bottom in a drawing, pt."""
 
 
 class Drawing:
@@ -117,6 +70,22 @@ class Drawing:
         self.width, self.height = 72 * width, 72 * height
         self._parts: list[str] = []
 
+    def panels(
+        self,
+        across: int = 1,
+        down: int = 1,
+        left: float = 46.0,
+        top: float = 10.0,
+        right: float = 8.0,
+        bottom: float = 32.0,
+        gap: float = 48.0,
+    ) -> list[Box]:
+        """Returns boxes of equal size for axes, row by row, with margins around them and a gap between them."""
+        width = (self.width - left - right - (across - 1) * gap) / across
+        height = (self.height - top - bottom - (down - 1) * gap) / down
+        corners = [(left + k * (width + gap), top + i * (height + gap)) for i in range(down) for k in range(across)]
+        return [(x, y, x + width, y + height) for x, y in corners]
+
     def lines(
         self,
         lines: Iterable[np.ndarray],
@@ -124,19 +93,36 @@ class Drawing:
         width: float = 1.0,
         fill: str = "",
         opacity: float = 1.0,
+        dash: str = "",
     ) -> None:
         """Draws lines, (k, 2) each; closed and filled areas if ``fill`` is given."""
         end, area = ("z", f'fill="{fill}" fill-opacity="{opacity:g}"') if fill else ("", 'fill="none"')
+        dashes = f' stroke-dasharray="{dash}"' if dash else ""
         path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in line.tolist()) + end for line in lines)
         if path:
-            self._parts.append(f'<path d="{path}" {area} stroke="{colour}" stroke-width="{width:g}"/>')
+            self._parts.append(f'<path d="{path}" {area} stroke="{colour}" stroke-width="{width:g}"{dashes}/>')
 
-    def dots(self, xy: np.ndarray, diameter: float, colour: str) -> None:
-        """Draws round dots at places (n, 2)."""
-        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in xy.tolist())
-        self._parts.append(f'<path d="{path}" stroke="{colour}" stroke-width="{diameter:g}" stroke-linecap="round"/>')
+    def marks(self, xy: np.ndarray, kind: str, size: float, colour: str, opacity: float = 1.0) -> None:
+        """Draws a mark at each place (n, 2): dot, ring, dash, bar, triangle, square or diamond."""
+        path = "".join(f"M{x:.1f} {y:.1f}" + MARKS[kind].format(size, size / 2) for x, y in xy.tolist())
+        if kind == "dot":
+            look = f'stroke="{colour}" stroke-opacity="{opacity:g}" stroke-width="{size:g}" stroke-linecap="round"'
+        elif kind in ("ring", "dash", "bar"):
+            look = f'fill="none" stroke="{colour}" stroke-width="{1.0 if kind == "ring" else 1.4:g}"'
+        else:
+            look = f'fill="{colour}"'
+        if path:
+            self._parts.append(f'<path d="{path}" {look}/>')
 
-    def discs(self, xy: np.ndarray, radius: float, fills: Sequence[str], edge: str) -> None:
+    def key(self, at: Sequence[float], entries: dict[str, tuple[str, str]]) -> None:
+        """Draws a legend to the right of a place: by its words, the kind of mark and the colour of each entry."""
+        x, y = at
+        for text, (kind, colour) in entries.items():
+            self.marks(np.array([[x + 4, y]]), kind, 6.0 if kind in ("ring", "dash", "bar") else 4.5, colour)
+            self.words((x + 12, y), text, anchor="start")
+            x += 28 + LETTER * SMALL * len(text)
+
+    def discs(self, xy: np.ndarray, radius: float, fills: Sequence[str], edge: str = "none") -> None:
         """Draws discs at places (n, 2) in colours of their own."""
         discs = "".join(
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{fill}"/>'
@@ -163,75 +149,208 @@ class Drawing:
             f'text-anchor="{anchor}"{turn}>{written}</text>'
         )
 
-    def scale(self, box: tuple[float, float, float, float], end: float, title: str) -> None:
-        """Draws the scale of :func:`red_blue` from −end to end into a box (left, top, right, bottom)."""
+    def scale(self, box: Box, low: float, high: float, title: str, ramp: str) -> None:
+        """Draws the colours of a ramp from the value low (below) to high into a box."""
         left, top, right, bottom = box
-        stops = "".join(f'<stop offset="{i / 10:g}" stop-color="{c}"/>' for i, c in enumerate(RED_BLUE.split()[::-1]))
+        colours = ramp.split()[::-1]
+        stops = "".join(f'<stop offset="{i / (len(colours) - 1):g}" stop-color="{c}"/>' for i, c in enumerate(colours))
         self._parts.append(
             f'<linearGradient id="scale" x1="0" y1="0" x2="0" y2="1">{stops}</linearGradient><rect x="{left:.1f}" '
             f'y="{top:.1f}" width="{right - left:.1f}" height="{bottom - top:.1f}" fill="url(#scale)"/>'
         )
-        axes = Axes(box, (0, 1), (-end, end))
-        for value, text in zip(*ticks(-end, end), strict=True):
+        axes = Axes(self, box, (0, 1), (low, high))
+        for value, text in zip(*ticks(low, high), strict=True):
             y = axes.at(1, value)[0, 1]
             self.lines([np.array([[right, y], [right + 2, y]])], AXIS, 0.8)
             self.words((right + 4, y), text, SMALL - 1, "start")
         self.words(((left + right) / 2, top - 8), title)
 
-    def uri(self) -> str:
-        """Returns the drawing as a data URI."""
-        svg = (
+    def picture(self, box: Box, rgba: np.ndarray) -> None:
+        """Draws an image (rows, columns, 4), 8 bit, into a box."""
+        stream = io.BytesIO()
+        Image.fromarray(rgba).save(stream, "PNG")
+        left, top, right, bottom = box
+        self._parts.append(
+            f'<image x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{bottom - top:.1f}" '
+            f'preserveAspectRatio="none" href="data:image/png;base64,{base64.b64encode(stream.getvalue()).decode()}"/>'
+        )
+
+    def svg(self) -> str:
+        """Returns the text of the drawing; equal drawings give equal text."""
+        return (
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{self.width:g}pt" height="{self.height:g}pt" '
             f'viewBox="0 0 {self.width:g} {self.height:g}" font-family="{FONTS}">{"".join(self._parts)}</svg>'
         )
-        return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
+
+    def uri(self) -> str:
+        """Returns the drawing as a data URI."""
+        return "data:image/svg+xml;base64," + base64.b64encode(self.svg().encode()).decode()
+
+
+def save(drawing: Drawing, path: Path) -> None:
+    """Saves a drawing on white, all of it or nothing, and makes its folder.
+
+    Raises InputError: the file's name does not end in ``.svg``.
+    """
+    if path.suffix.lower() != ".svg":
+        raise InputError("E-OUTPUT-SUFFIX", f"--plot {path}: a name ending in .svg needed")
+    files.save(path, drawing.svg().replace(">", ' style="background:#fff">', 1).encode())
 
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """Plane axes in a ``box`` of a drawing (left, top, right, bottom), with limits of ``x`` (at the left and right end)
-    and ``y`` (at the bottom and top end)."""
+    """Plane axes in a ``box`` of a drawing, with limits of ``x`` (at the left and right end) and ``y`` (at the bottom
+    and top end). ``log`` : the axes that are logarithmic, such as ``y``."""
 
-    box: tuple[float, float, float, float]
+    drawing: Drawing
+    box: Box
     x: tuple[float, float]
     y: tuple[float, float]
+    log: str = ""
+
+    @classmethod
+    def equal(cls, drawing: Drawing, box: Box, xy: np.ndarray, margin: float = 0.05, down: bool = False) -> "Axes":
+        """Returns axes with the same scale for x and y that hold points (n, 2) and a margin, a share of their extent.
+
+        ``down`` : whether y grows downwards
+        """
+        low, high = (xy.min(0), xy.max(0)) if len(xy) else (np.zeros(2), np.ones(2))
+        room = np.array([box[2] - box[0], box[3] - box[1]])
+        extent = np.maximum((1 + 2 * margin) * (high - low), 1e-9)
+        half = room * (extent / room).max() / 2
+        (left, bottom), (right, top) = ((low + high) / 2 + sign * half for sign in (-1, 1))
+        return cls(drawing, box, (left, right), (top, bottom) if down else (bottom, top))
 
     def at(self, x, y) -> np.ndarray:
         """Returns the places (n, 2) in the drawing of coordinates (n,) each, or of one place."""
         left, top, right, bottom = self.box
-        across = left + (np.asarray(x, float) - self.x[0]) / (self.x[1] - self.x[0]) * (right - left)
-        down = bottom + (np.asarray(y, float) - self.y[0]) / (self.y[1] - self.y[0]) * (top - bottom)
+        across = left + self._share("x", x) * (right - left)
+        down = bottom + self._share("y", y) * (top - bottom)
         return np.stack(np.broadcast_arrays(across, down), axis=-1).reshape(-1, 2)
 
-    def draw(
+    def _share(self, axis: str, values) -> np.ndarray:
+        ends, values = np.asarray(self.x if axis == "x" else self.y, float), np.asarray(values, float)
+        if axis in self.log:
+            ends, values = np.log(ends), np.log(np.maximum(values, ends[0]))
+        return (values - ends[0]) / (ends[1] - ends[0])
+
+    def lines(self, lines: Iterable[Sequence], colour: str = "none", width: float = 1.0, **look) -> None:
+        """Draws lines, each given by its x (k,) and y (k,)."""
+        self.drawing.lines([self.at(*line) for line in lines], colour, width, **look)
+
+    def level(self, y: float, colour: str = INK, width: float = 0.7, dash: str = "") -> None:
+        """Draws a line across at a value."""
+        self.lines([(self.x, (y, y))], colour, width, dash=dash)
+
+    def marks(self, x, y, kind: str, size: float, colour: str, opacity: float = 1.0) -> None:
+        """Draws a mark at each place that has finite coordinates; see :meth:`Drawing.marks`."""
+        xy = self.at(x, y)
+        self.drawing.marks(xy[np.isfinite(xy).all(1)], kind, size, colour, opacity)
+
+    def words(self, x: float, y: float, text: str, shift: Sequence[float] = (0, 0), **look) -> None:
+        """Writes words beside a place, ``shift`` in pt right and down from it."""
+        self.drawing.words(self.at(x, y)[0] + shift, text, **look)
+
+    def arrows(self, xy: np.ndarray, along: np.ndarray, width: float, colour: str, opacity: float = 1.0) -> None:
+        """Draws arrows from places (n, 2) along vectors (n, 2), in coordinates of the axes."""
+        start = self.at(*xy.T)
+        outlines = arrows(start, self.at(*(xy + along).T) - start, width)
+        self.drawing.lines(outlines, fill=colour, opacity=opacity)
+
+    def shade(
+        self, values: np.ndarray, extent: Box, low: float, high: float, ramp: str, bands: int = 0, smooth: bool = True
+    ) -> None:
+        """Shades values (rows, columns) in colours of a ramp from low to high; nan stays empty.
+
+        ``extent`` : x and y of the first value, x and y of the last one; ``bands`` : number of steps of the colours, 0
+        for none; ``smooth`` : whether values are interpolated
+        """
+        from scipy.ndimage import zoom
+
+        share = (values - low) / ((high - low) or 1.0)
+        share = zoom(share, max(1, 240 // max(share.shape)), order=1) if smooth else share
+        known = np.isfinite(share)
+        share = np.clip(np.where(known, share, 0), 0, 1)
+        if bands:
+            share = np.minimum(np.floor(share * bands), bands - 1) / max(bands - 1, 1)
+        rgba = np.dstack([mixed(share, ramp), np.where(known, 255, 0)]).astype(np.uint8)
+        (x0, y0), (x1, y1) = self.at(extent[::2], extent[1::2])
+        self.drawing.picture((x0, min(y0, y1), x1, max(y0, y1)), rgba if y0 < y1 else rgba[::-1])
+
+    def frame(
         self,
-        drawing: Drawing,
-        x_ticks: tuple[Sequence[float], Sequence[str]],
-        y_ticks: tuple[Sequence[float], Sequence[str]],
-        x: str,
-        y: str,
-        grid: bool = False,
+        x: str = "",
+        y: str = "",
+        grid: str = "",
+        x_ticks: Ticks | None = None,
+        y_ticks: Ticks | None = None,
         size: float = SMALL + 1,
     ) -> None:
-        """Draws left and lower line with ticks (values and words) and the names of the axes, and lines of a ``grid``
-        across."""
-        left, top, right, bottom = self.box
-        rows, columns = self.at(self.x[0], y_ticks[0]), self.at(x_ticks[0], self.y[0])
-        if grid:
+        """Draws left and lower line with ticks (values and words) and the names of the axes.
+
+        ``grid`` : the axes whose ticks get lines across
+        """
+        drawing, (left, top, right, bottom) = self.drawing, self.box
+        x_values, x_texts = self._ticks("x", (right - left) / 45) if x_ticks is None else x_ticks
+        y_values, y_texts = self._ticks("y", (bottom - top) / 22) if y_ticks is None else y_ticks
+        rows, columns = self.at(self.x[0], y_values), self.at(x_values, self.y[0])
+        if "y" in grid:
             drawing.lines([np.array([[left, row], [right, row]]) for row in rows[:, 1]], FAINT, 0.6)
+        if "x" in grid:
+            drawing.lines([np.array([[column, top], [column, bottom]]) for column in columns[:, 0]], FAINT, 0.6)
         marks = [np.array([[left, row], [left - 2, row]]) for row in rows[:, 1]]
         marks += [np.array([[column, bottom], [column, bottom + 2]]) for column in columns[:, 0]]
         drawing.lines([np.array([[left, top], [left, bottom], [right, bottom]]), *marks], AXIS, 0.8)
-        for (_, row), text in zip(rows, y_ticks[1], strict=True):
+        for (_, row), text in zip(rows, y_texts, strict=True):
             drawing.words((left - 4.5, row), text, anchor="end")
-        for (column, _), text in zip(columns, x_ticks[1], strict=True):
+        for (column, _), text in zip(columns, x_texts, strict=True):
             drawing.words((column, bottom + 9), text)
-        widest = max(map(len, y_ticks[1]), default=0)
-        drawing.words(((left + right) / 2, bottom + 21), x, size)
-        drawing.words((left - 13 - 0.55 * SMALL * widest, (top + bottom) / 2), y, size, turned_deg=-90)
+        widest = max(map(len, y_texts), default=0)
+        if x:
+            drawing.words(((left + right) / 2, bottom + 21), x, size)
+        if y:
+            drawing.words((left - 13 - LETTER * SMALL * widest, (top + bottom) / 2), y, size, turned_deg=-90)
+
+    def _ticks(self, axis: str, most: float) -> Ticks:
+        low, high = sorted(self.x if axis == "x" else self.y)
+        return log_ticks(low, high) if axis in self.log else ticks(low, high, int(np.clip(most, 3, 8)))
 
 
-def ticks(low: float, high: float, most: int = 5) -> tuple[list[float], list[str]]:
+def limits(values, margin: float = 0.05, low: float | None = None) -> tuple[float, float]:
+    """Returns limits of an axis that hold all finite values and a margin, a share of their extent.
+
+    ``low`` : the lower limit, if it is given
+    """
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    first, last = (values.min(), values.max()) if len(values) else (0.0, 1.0)
+    first = first if low is None else low
+    room = margin * (last - first) if last > first else 0.5 * abs(last) or 0.5
+    return float(first - room if low is None else low), float(last + room)
+
+
+def log_limits(values) -> tuple[float, float]:
+    """Returns limits of a logarithmic axis that hold all positive values."""
+    values = np.asarray(values, float)
+    ends = limits(np.log(values[values > 0]))
+    return float(np.exp(ends[0])), float(np.exp(ends[1]))
+
+
+def count_ticks(low: float, high: float) -> Ticks:
+    """Returns a few whole numbers within limits."""
+    values = [value for value in ticks(low, high, 8)[0] if value == round(value)]
+    return values, [f"{value:.0f}" for value in values]
+
+
+def log_ticks(low: float, high: float) -> Ticks:
+    """Returns powers of ten within limits, or, over less than two decades, also twice and five times these."""
+    steps = (1,) if high > 100 * low else (1, 2, 5)
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    values = [value for power in powers for step in steps if low <= (value := step * 10.0**power) <= high]
+    return values, [f"{value:g}" for value in values]
+
+
+def ticks(low: float, high: float, most: int = 5) -> Ticks:
     """Returns round values within limits, at most one more than ``most``, and their words."""
     apart = (high - low) / most
     if not np.isfinite(apart) or apart <= 0:
@@ -239,17 +358,21 @@ def ticks(low: float, high: float, most: int = 5) -> tuple[list[float], list[str
     power = int(np.floor(np.log10(apart)))
     step = next(s for s in (1, 2, 5, 10) if s * 10.0**power >= apart * (1 - 1e-9)) * 10.0**power
     first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    values = (np.arange(first, last + 1) * step).tolist()
+    values = (np.arange(first, last + 1) * step + 0.0).tolist()
     digits = max(0, -int(np.floor(np.log10(step * (1 + 1e-9)))))
-    return values, [f"{value + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}") for value in values]
+    return values, [f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}") for value in values]
 
 
-def red_blue(share: np.ndarray) -> list[str]:
-    """Returns colours between blue (−1), white (0) and red (1) for values (n,)."""
-    stops = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in RED_BLUE.split()], float)
-    place = (np.clip(share, -1, 1) + 1) * (len(stops) - 1) / 2
-    mixed = np.stack([np.interp(place, np.arange(len(stops)), stops[:, i]) for i in range(3)], axis=1)
-    return ["#{:02x}{:02x}{:02x}".format(*rgb) for rgb in np.rint(mixed).astype(int).tolist()]
+def mixed(share: np.ndarray, ramp: str) -> np.ndarray:
+    """Returns colours (…, 3), 0 to 255, between the first (0) and the last (1) colour of a ramp."""
+    stops = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in ramp.split()], float)
+    place = np.clip(share, 0, 1) * (len(stops) - 1)
+    return np.rint(np.stack([np.interp(place, np.arange(len(stops)), stops[:, i]) for i in range(3)], axis=-1))
+
+
+def mixed_names(share: np.ndarray, ramp: str) -> list[str]:
+    """Returns the colours of :func:`mixed` for values (n,) as SVG has them."""
+    return ["#{:02x}{:02x}{:02x}".format(*rgb) for rgb in mixed(share, ramp).astype(int).tolist()]
 
 
 def arrows(start: np.ndarray, along: np.ndarray, width: float) -> list[np.ndarray]:

@@ -26,7 +26,7 @@ from stcal.io.table import POSE, Table, read_table
 from stcal.parallel import Progress
 from stcal.report.document import Block, Document, Section, bullets, links, listed, plot, tiles
 from stcal.report.document import Table as ShownTable
-from stcal.report.svg import COLOURS, calm, new_figure
+from stcal.report.svg import COLOURS, Axes, Drawing, log_limits
 from stcal.report.text import number
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.report import axes_file, axes_report
@@ -266,21 +266,20 @@ def _target_rows(result: FromPhotos) -> list[list[str]]:
     ]
 
 
-def _figure(result: FromPhotos):
+def _figure(result: FromPhotos) -> Drawing:
     """Returns a figure of median, RMS and largest error of each model, on a logarithmic scale."""
-    figure = new_figure(8, 0.5 * len(result.errors) + 0.9)
-    axes = figure.add_subplot()
-    for place, figures in enumerate(result.errors.values()):
-        axes.plot([figures.median, figures.max], [place, place], color=COLOURS[0], lw=1.2)
-        axes.plot([figures.rms], [place], "o", color=COLOURS[0], ms=6, label="RMS" if not place else None)
-        axes.plot([figures.max], [place], "|", color=COLOURS[1], ms=10, mew=2, label="largest" if not place else None)
-    axes.set_yticks(range(len(result.errors)), list(result.errors), fontsize=8)
-    axes.set_ylim(len(result.errors) - 0.5, -0.5)
-    axes.set_xscale("log")
-    axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
-    calm(axes, "position error of a row, mm")
-    figure.subplots_adjust(left=0.3, right=0.97, bottom=0.5 / (0.5 * len(result.errors) + 0.9), top=0.86)
-    return figure
+    names, figures = list(result.errors), list(result.errors.values())
+    rows = list(range(len(names)))
+    median, rms, largest = ([getattr(each, name) for each in figures] for name in ("median", "rms", "max"))
+    drawing = Drawing(8, 0.5 * len(names) + 0.9)
+    box = drawing.panels(left=160, top=22)[0]
+    axes = Axes(drawing, box, log_limits([*median, *rms, *largest]), (len(names) - 0.5, -0.5), "x")
+    axes.frame("position error of a row, mm", y_ticks=(rows, names))
+    axes.lines([(ends, (row, row)) for row, *ends in zip(rows, median, largest, strict=True)], COLOURS[0], 1.2)
+    axes.marks(rms, rows, "dot", 6, COLOURS[0])
+    axes.marks(largest, rows, "bar", 10, COLOURS[1])
+    drawing.key((box[0], 10), {"RMS": ("dot", COLOURS[0]), "largest": ("bar", COLOURS[1])})
+    return drawing
 
 
 POSES = "poses.csv"

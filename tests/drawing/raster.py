@@ -1,13 +1,10 @@
 """Drawings as a camera sees them: pages as images, and seen obliquely."""
 
-import shutil
-import subprocess
-
 import cv2
 import numpy as np
-import pytest
+from pypdfium2 import PdfDocument
 
-from stcal.drawing.formats import INCH_MM, figure_of
+from stcal.drawing.formats import POINT_MM, pdf
 from stcal.geometry.camera import COEFFICIENTS, Camera
 
 PER_MM = 4
@@ -20,30 +17,20 @@ def shapes_of(sheet) -> list:
     return [shape for item in sheet.placed for shape in item.shapes]
 
 
-def page_image(sheet, per_mm: int = PER_MM) -> np.ndarray:
-    """The page, grey, as matplotlib fills it: pixels ``per_mm`` a millimetre."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = figure_of(sheet)
-    figure.set_dpi(INCH_MM * per_mm)
-    for patch in figure.axes[0].patches:
-        patch.set_snap(False)  # not to whole pixels
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., 1].copy()
+def page_image(sheet) -> np.ndarray:
+    """The page, grey, as it is printed: pixels ``PER_MM`` a millimetre."""
+    return pages_of(pdf([sheet]))[0]
 
 
-def pdf_pages(path, folder, per_mm: int = PER_MM) -> list[np.ndarray]:
+def pages_of(content: bytes) -> list[np.ndarray]:
     """Pages of a PDF as another program draws them, grey."""
-    if shutil.which("pdftoppm") is None:
-        pytest.skip("pdftoppm is not installed")
-    subprocess.run(["pdftoppm", "-gray", "-r", str(INCH_MM * per_mm), str(path), str(folder / "page")], check=True)
-    return [cv2.imread(str(page), cv2.IMREAD_GRAYSCALE) for page in sorted(folder.glob("page-*.pgm"))]
+    document = PdfDocument(content)
+    return [page.render(scale=PER_MM * POINT_MM, grayscale=True).to_numpy().copy() for page in document]
 
 
-def pixel_from_page(image: np.ndarray, xy_mm: np.ndarray, per_mm: int = PER_MM) -> np.ndarray:
+def pixel_from_page(image: np.ndarray, xy_mm: np.ndarray) -> np.ndarray:
     """Places on a page in its image; centres of pixels are integers."""
-    return per_mm * np.asarray(xy_mm) * [1, -1] + [0, len(image)] - 0.5
+    return PER_MM * np.asarray(xy_mm) * [1, -1] + [0, len(image)] - 0.5
 
 
 def camera_of(image: np.ndarray) -> Camera:

@@ -15,7 +15,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_images, label_single  # noqa: F401
 from stcal.synthetic.designs import second_design
-from tests.drawing.raster import camera_of, obliquely, page_image, pdf_pages, pixel_from_page, shapes_of
+from tests.drawing.raster import camera_of, obliquely, page_image, pages_of, pixel_from_page, shapes_of
 
 CIRCLE_PX, CORNER_PX = 0.1, 0.3
 """How well centres and corners are found again in an image without noise, blurred a little: edges of 8-bit pixels, and
@@ -52,7 +52,7 @@ def test_faces_are_read_back(target: TargetDesign, tmp_path):
     """Every page of the PDF, drawn by another program: all circles of its face named, at their places."""
     (tmp_path / "target.toml").write_text(target_toml(target))
     drawn = draw(tmp_path / "target.toml", tmp_path / "target.pdf")
-    pages = pdf_pages(drawn.path, tmp_path)
+    pages = pages_of(drawn.path.read_bytes())
     assert len(pages) == len(target.faces)
     for sheet, page in zip(drawn.sheets, pages, strict=True):
         for image, rims, camera in seen_ways(page, rims_px(sheet, page)):

@@ -1,12 +1,14 @@
 """Drawings that are written directly as SVG."""
 
 import base64
+import io
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from stcal.report.svg import Axes, Drawing, Space, arrows, red_blue, ticks
+from stcal.report.svg import RED_BLUE, Axes, Drawing, Space, arrows, limits, log_ticks, mixed_names, ticks
 
 
 def written(drawing: Drawing) -> ElementTree.Element:
@@ -44,12 +46,59 @@ def test_ticks_are_round(low, high, texts):
 
 
 def test_data_lie_between_the_ends_of_their_axes():
-    axes = Axes((10, 20, 110, 70), (0, 4), (5, -5))  # downwards
+    axes = Axes(Drawing(2, 2), (10, 20, 110, 70), (0, 4), (5, -5))  # downwards
     np.testing.assert_allclose(axes.at([0, 4, 1], [5, -5, 0]), [[10, 70], [110, 20], [35, 45]])
+    axes = Axes(Drawing(2, 2), (10, 20, 110, 70), (1, 100), (0, 1), log="x")
+    np.testing.assert_allclose(axes.at([1, 10, 100, -1], 0), [[10, 70], [60, 70], [110, 70], [10, 70]])
+
+
+def test_equal_axes_hold_all_points_on_one_scale():
+    xy = np.array([[0.0, 0.0], [300.0, 10.0]])
+    axes = Axes.equal(Drawing(3, 3), (10, 20, 110, 70), xy, 0.0, down=True)
+    np.testing.assert_allclose(axes.at(*xy.T), [[10, 45 - 5 / 3], [110, 45 + 5 / 3]])
+
+
+def test_limits_hold_what_is_finite():
+    assert limits([1.0, np.nan, 11.0], 0.1) == (0.0, 12.0)
+    assert limits([1.0, 10.0], 0.1, low=0) == (0.0, 11.0)
+    for nothing in ([], [np.nan], [3.0]):
+        low, high = limits(nothing)
+        assert low < high
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "texts"),
+    [(0.02, 1.1, ["0.02", "0.05", "0.1", "0.2", "0.5", "1"]), (0.003, 40, ["0.01", "0.1", "1", "10"])],
+)
+def test_logarithmic_ticks_are_round(low, high, texts):
+    values, words = log_ticks(low, high)
+    assert words == texts
+    np.testing.assert_allclose(values, np.array(texts, float))
+
+
+@pytest.mark.parametrize("kind", ["dot", "ring", "dash", "bar", "triangle", "square", "diamond"])
+def test_marks_are_at_their_places(kind):
+    drawing = Drawing(2, 2)
+    Axes(drawing, (0, 0, 100, 100), (0, 10), (0, 10)).marks([2, np.nan], [9, 1], kind, 6, "#123456")
+    (path,) = written(drawing)
+    assert path.get("d").startswith("M20.0 10.0")
+    assert path.get("d").count("M") == 1
+
+
+def test_shades_are_where_their_values_are():
+    """The largest value, last in both directions, is at the upper right; nan is empty."""
+    drawing = Drawing(2, 2)
+    axes = Axes(drawing, (0, 0, 100, 100), (0, 10), (0, 10))
+    axes.shade(np.array([[0.0, 1.0], [np.nan, 2.0]]), (0, 0, 10, 10), 0, 2, "#000000 #ffffff", smooth=False)
+    (picture,) = written(drawing)
+    png = base64.b64decode(picture.get("href").partition(",")[2])
+    rgba = np.asarray(Image.open(io.BytesIO(png)))
+    np.testing.assert_array_equal(rgba[..., 0], [[0, 255], [0, 128]])
+    np.testing.assert_array_equal(rgba[..., 3], [[0, 255], [255, 255]])
 
 
 def test_red_is_above_and_blue_below():
-    assert red_blue(np.array([-2.0, -1, 0, 1])) == ["#053061", "#053061", "#f7f7f7", "#67001f"]
+    assert mixed_names(np.array([-0.5, 0, 0.5, 1]), RED_BLUE) == ["#053061", "#053061", "#f7f7f7", "#67001f"]
 
 
 def test_an_arrow_ends_where_its_vector_does():

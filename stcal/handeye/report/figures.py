@@ -17,7 +17,20 @@ from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.result import HandEye
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode, grey_8bit, thumbnail
-from stcal.report.svg import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
+from stcal.report.svg import (
+    COLOURS,
+    FAINT,
+    INK,
+    SMALL,
+    VIRIDIS,
+    Axes,
+    Drawing,
+    count_ticks,
+    limits,
+    mixed_names,
+    round_below,
+    ticks,
+)
 from stcal.report.text import number, telling_names
 
 CELLS = 60
@@ -107,6 +120,8 @@ def rms_px(predicted: np.ndarray, seen: np.ndarray) -> float:
 
 
 GOOD, BAD = COLOURS[0], COLOURS[1]
+BLUES = "#f7fbff #c6dbef #6baed6 #2171b5 #08306b"
+"""The ramp Blues of ColorBrewer, light to dark."""
 MOST_NAMED = 40
 """Largest number of pose names below the chart. Of more poses, every second, third, … is named."""
 MOST_VECTORS = 1500
@@ -157,13 +172,14 @@ def pose_bars(result: HandEye) -> PoseBars:
     for k, (label, values, digits, unit) in enumerate(rows):
         top = 20 + k * (HIGH + GAP)
         largest = float(np.nanmax(values, initial=0)) or 1.0
-        ticks = [t for t in locator().tick_values(0, largest) if 0 <= t <= 1.001 * largest]
         bars = []
         for x, value, name, bad in zip(centres, values, result.names, result.outliers, strict=True):
             title = f"{name}: {number(value, digits)}{unit}{', left out' if bad else ''}"
             height = HIGH * float(np.nan_to_num(value)) / largest
             bars.append((x, top + HIGH - height, height, BAD if bad else GOOD, title))
-        panels.append(Panel(label, top, [(top + HIGH * (1 - t / largest), f"{t:g}") for t in ticks], bars))
+        panels.append(
+            Panel(label, top, [(top + HIGH * (1 - t / largest), f"{t:g}") for t in ticks(0, largest)[0]], bars)
+        )
     every = int(np.ceil(len(centres) / MOST_NAMED))
     short = telling_names(result.names)
     slope = max(map(len, short)) * 7.5 > every * step
@@ -175,49 +191,38 @@ def pose_bars(result: HandEye) -> PoseBars:
     )
 
 
-def corner_figure(found: Reprojection):
+def corner_figure(found: Reprojection) -> Drawing:
     """Draws the residuals of the corners, and the circle that holds 95 % of them."""
-    figure = new_figure(4.4, 4.0)
-    axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
+    drawing = Drawing(4.4, 4.0)
     residuals = found.residuals_px[_some(len(found.residuals_px))]
-    axes.plot(*residuals.T, ".", color=GOOD, ms=2.2, alpha=0.6)
-    radius = float(np.quantile(np.linalg.norm(found.residuals_px, axis=1), 0.95))
+    circle = _circle(float(np.quantile(np.linalg.norm(found.residuals_px, axis=1), 0.95)))
+    axes = Axes.equal(drawing, drawing.panels()[0], np.vstack([residuals, circle]), down=True)
+    axes.frame("x, px", "y, px (down)", "y")
+    axes.marks(*residuals.T, "dot", 2.2, GOOD, 0.6)
+    axes.lines([circle.T], INK, 0.8)
+    return drawing
+
+
+def _circle(radius: float) -> np.ndarray:
     turn = np.linspace(0, 2 * np.pi, 100)
-    axes.plot(radius * np.cos(turn), radius * np.sin(turn), color=INK, lw=0.8)
-    axes.set_aspect("equal", adjustable="datalim")
-    calm(axes, "x, px", "y, px (down)", "y")
-    axes.invert_yaxis()
-    return figure
+    return radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
-def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray, off: np.ndarray):
-    """Draws where the board was in the image, and enlarged residuals ``off`` (n, 2) of the corners ``seen`` (n, 2)."""
-    from matplotlib.collections import LineCollection
-
+def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray, off: np.ndarray) -> Drawing:
+    """Draws how often the board covered the image, and enlarged residuals ``off`` (n, 2) of corners ``seen`` (n, 2)."""
     width, height = size
-    figure = new_figure(6.0, 6.0 * height / width * 0.92 + 0.4)
-    axes = figure.add_axes((0.09, 0.11, 0.89, 0.87))
-    shade = np.minimum(covered.counts / max(covered.counts.max(), 1), 1.0)
-    axes.imshow(
-        np.where(covered.counts > 0, 0.25 + 0.75 * shade, 0.0),
-        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
-        cmap="Blues",
-        vmin=0,
-        vmax=2.6,
-        interpolation="nearest",
-        aspect="equal",
-    )
-    factor = enlargement(off, width)
+    drawing = Drawing(6.0, 5.25 * height / width + 0.6)
+    axes = Axes(drawing, drawing.panels()[0], (-0.5, width - 0.5), (height - 0.5, -0.5))
+    shown = np.where(covered.counts > 0, covered.counts, np.nan)
+    most = max(int(covered.counts.max()), 1)
+    axes.shade(shown, (-0.5, -0.5, width - 0.5, height - 0.5), -most / 3, 2.5 * most, BLUES, smooth=False)
     sample = _some(len(seen))
-    seen, off = seen[sample], off[sample]
-    axes.add_collection(LineCollection(np.stack([seen, seen + factor * off], axis=1).tolist(), colors=BAD, lw=0.8))
-    axes.plot(*seen.T, ".", color=INK, ms=1.6)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.xaxis.set_major_locator(locator())
-    axes.yaxis.set_major_locator(locator())
-    calm(axes, "x, px", "y, px")
-    return figure
+    seen, off = seen[sample], enlargement(off, width) * off[sample]
+    known = np.isfinite(off).all(1)
+    axes.lines(np.stack([seen, seen + off], axis=2)[known], BAD, 0.8)
+    axes.marks(*seen.T, "dot", 1.6, INK)
+    axes.frame("x, px", "y, px")
+    return drawing
 
 
 def enlargement(off: np.ndarray, width: float) -> float:
@@ -227,44 +232,38 @@ def enlargement(off: np.ndarray, width: float) -> float:
     return max(1.0, round_below(LONGEST * width / usual)) if usual else 1.0
 
 
-def turns_figure(turns: np.ndarray, observability: Observability | None):
+def turns_figure(turns: np.ndarray, observability: Observability | None) -> Drawing:
     """Draws the axes of the turns (n, 3) between poses on the half sphere, and a histogram of their angles."""
-    figure = new_figure(9.4, 4.1)
-    axes = figure.add_axes((0.01, 0.03, 0.44, 0.94))
-    angle = np.linalg.norm(turns, axis=1)
-    large = angle > LEAST_TURN
-    around = np.linspace(0, 2 * np.pi, 200)
+    drawing = Drawing(9.4, 4.1)
+    axes = Axes(drawing, (8.0, 8.0, 294.0, 287.0), (-1.16, 1.16), (-1.13, 1.13))
     for tilt in (30, 60, 90):
         radius = np.sqrt(2) * np.sin(np.radians(tilt) / 2)
-        axes.plot(radius * np.cos(around), radius * np.sin(around), color=INK if tilt == 90 else FAINT, lw=0.8)
+        axes.lines([_circle(radius).T], INK if tilt == 90 else FAINT, 0.8)
         if tilt < 90:
-            axes.text(0, -radius, f"{tilt}°", fontsize=SMALL - 1, color="#556270", ha="center", va="bottom")
-    for text, x, y in (("+X", 1.07, 0), ("−X", -1.07, 0), ("+Y", 0, 1.05), ("−Y", 0, -1.05)):
-        axes.text(x, y, text, fontsize=SMALL + 0.5, ha="center", va="center", color=INK)
-    axes.plot(0, 0, "+", color="#9aa0a8", ms=6)
-    axes.text(0.03, 0.03, "Z", fontsize=SMALL + 0.5, color=INK)
-    points = equal_area(turns[large] / angle[large, None])
-    dots = axes.scatter(
-        *points.T, c=np.degrees(angle[large]), s=11, cmap="viridis_r", vmin=0, lw=0, alpha=0.85, zorder=2
-    )
+            axes.words(0, -radius, f"{tilt}°", (0, -5), size=SMALL - 1, colour="#556270")
+    for text, x, y in (("+X", 1.08, 0), ("−X", -1.08, 0), ("+Y", 0, 1.06), ("−Y", 0, -1.06), ("Z", 0.04, 0.04)):
+        axes.words(x, y, text, size=SMALL + 0.5)
+    axes.marks(0, 0, "dash", 6, "#9aa0a8")
+    axes.marks(0, 0, "bar", 6, "#9aa0a8")
+    angle = np.linalg.norm(turns, axis=1)
+    large = angle > LEAST_TURN
+    most = float(np.degrees(angle.max(initial=0)))
+    colours = mixed_names(1 - np.degrees(angle[large]) / max(most, 1e-9), VIRIDIS)
+    drawing.discs(axes.at(*equal_area(turns[large] / angle[large, None]).T), 1.7, colours)
     if observability is not None:
         for k, axis in enumerate(np.where(observability.axes[:, 2:] < 0, -observability.axes, observability.axes), 1):
             x, y = equal_area(axis[None])[0]
-            axes.plot(x, y, "o", mfc="none", mec=BAD, ms=11, mew=1.6, zorder=3)
-            axes.text(x + 0.07, y, str(k), fontsize=SMALL + 1.5, color=BAD, weight="bold", va="center", zorder=3)
-    axes.set(xlim=(-1.16, 1.16), ylim=(-1.12, 1.12), aspect="equal")
-    axes.axis("off")
+            axes.marks(x, y, "ring", 11, BAD)
+            axes.words(x, y, str(k), (11, 0), size=SMALL + 1.5, colour=BAD, weight="bold")
     if large.any():
-        bar = figure.colorbar(dots, cax=figure.add_axes((0.465, 0.2, 0.014, 0.6)))
-        bar.ax.tick_params(labelsize=SMALL - 1, length=2)
-        bar.outline.set_visible(False)
-        bar.ax.set_title("turn, °", fontsize=SMALL)
-    counts = figure.add_axes((0.60, 0.13, 0.385, 0.82))
-    largest = max(10.0, 10.0 * np.ceil(np.degrees(angle.max(initial=0)) / 10))
-    counts.hist(np.degrees(angle), bins=np.linspace(0, largest, 19).tolist(), color=GOOD)
-    calm(counts, "turn between two poses, °", "pairs of poses", "y")
-    counts.yaxis.set_major_locator(locator(integer=True))
-    return figure
+        drawing.scale((312, 60, 320, 235), 0, most, "turn, °", " ".join(VIRIDIS.split()[::-1]))
+    edges = np.linspace(0, max(10.0, 10.0 * np.ceil(most / 10)), 19)
+    counts = np.histogram(np.degrees(angle), edges)[0]
+    bars = Axes(drawing, (405.0, 12.0, 668.0, 258.0), (0, edges[-1]), limits(counts, low=0))
+    bars.frame("turn between two poses, °", "pairs of poses", "y", y_ticks=count_ticks(*bars.y))
+    boxes = zip(edges[:-1], edges[1:], counts, strict=True)
+    bars.lines([((a, a, b, b), (0, n, n, 0)) for a, b, n in boxes], fill=GOOD)
+    return drawing
 
 
 def _some(count: int) -> np.ndarray:

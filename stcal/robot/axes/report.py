@@ -10,7 +10,7 @@ import stcal
 from stcal.geometry.arrays import rms
 from stcal.io.json import ByName, Matrix, Part, Pose, ResultFile, Vector3
 from stcal.report.document import Document, Section, Table, bullets, legend, page_only, plot
-from stcal.report.svg import AXIS_COLOURS, INK, calm, new_figure
+from stcal.report.svg import AXIS_COLOURS, Axes, Drawing, limits
 from stcal.report.text import number
 from stcal.robot.axes.checks import Pair
 from stcal.robot.axes.fit import AxisFit
@@ -341,15 +341,16 @@ def axes_report(result: AxesResult, where: str) -> Document:
     )
 
 
-def _residuals(result: AxesResult):
-    figure = new_figure(7.5, 2.9)
-    axes = figure.add_axes((0.09, 0.17, 0.89, 0.78))
-    for fit in result.fits:
-        used = fit.residuals[fit.weights > 0]
-        beside = np.linspace(-0.3, 0.3, len(used)) if len(used) > 1 else np.zeros(1)
+def _residuals(result: AxesResult) -> Drawing:
+    drawing = Drawing(7.5, 2.9)
+    shown = {fit.joint + 1: fit.residuals[fit.weights > 0] for fit in result.fits}
+    values = np.concatenate([used[:, :2].ravel() for used in shown.values()])
+    joints = list(range(1, len(result.fits) + 1))
+    axes = Axes(drawing, drawing.panels()[0], (0.5, len(joints) + 0.5), limits([0, *values]))
+    axes.frame("joint", "residual, mm", "y", (joints, list(map(str, joints))))
+    axes.level(0)
+    for joint, used in shown.items():
+        at = joint + (np.linspace(-0.3, 0.3, len(used)) if len(used) > 1 else np.zeros(1))
         for k in range(2):
-            axes.plot(fit.joint + 1 + beside, used[:, k], "o", ms=2.4, color=AXIS_COLOURS[2 * k], mew=0)
-    axes.set_xticks(range(1, len(result.fits) + 1))
-    axes.axhline(0, color=INK, lw=0.6)
-    calm(axes, "joint", "residual, mm", "y")
-    return figure
+            axes.marks(at, used[:, k], "dot", 2.4, AXIS_COLOURS[2 * k])
+    return drawing

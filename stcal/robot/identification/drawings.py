@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.report.document import Html, plot
-from stcal.report.svg import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
+from stcal.report.svg import COLOURS, INK, SMALL, Axes, Drawing, limits, round_below
 from stcal.robot.identification.adjustment import Observed, State, as_seen, tips_of
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.forward import joint_frames
@@ -49,14 +49,9 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
     errors = shown.residuals[:, -3:]
     across = min(n, 3)
     down = -(-n // across)
-    height = 0.35 + 1.75 * down
-    figure = new_figure(9, height)
-    grid = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
     turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
-    for i, axes in enumerate(grid):
-        if i >= n:
-            axes.set_visible(False)
-            continue
+    points = []
+    for i in range(n):
         z, sliding = turned[i][:, :, 2], chain.prismatic[i]
         twist = [z * 0, z] if sliding else [z, np.cross(z, tip.translation - origins[i])]
         twist = np.hstack(twist) * carries[i, :, None]
@@ -65,16 +60,20 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
         moves = shown.good & (size > LEAST_MOTION * max(size.max(), 1e-300))
         along = np.einsum("rw,rw->r", motion[moves], errors[moves]) / size[moves]
         at = values[observations.first[moves], i] * (1 if sliding else np.degrees(1))
-        axes.axhline(0, color="#9aa0a8", lw=0.7)
-        axes.plot(at, along, "o", color=shown.colour, ms=3 if len(at) <= FEW else 1.4, mew=0)
+        points.append((at, along, "mm" if sliding else "deg"))
+    y = limits(np.concatenate([along for _, along, _ in points]))
+    drawing = Drawing(9, 0.35 + 1.75 * down)
+    boxes = drawing.panels(across, down, gap=34)
+    for i, (box, (at, along, unit)) in enumerate(zip(boxes, points, strict=False)):
+        axes = Axes(drawing, box, limits(at), y)
+        axes.frame(f"joint {i + 1}, {unit}", "" if i % across else "along its motion, mm")
+        axes.level(0, "#9aa0a8")
+        axes.marks(at, along, "dot", 3 if len(at) <= FEW else 1.4, shown.colour)
         if turns_of.get(i + 1) and len(at) > 3:
             fitted = np.linalg.lstsq(_wave(at, turns_of[i + 1]), along, rcond=None)[0]
             x = np.linspace(at.min(), at.max(), 100)
-            axes.plot(x, _wave(x, turns_of[i + 1]) @ fitted, color=INK, lw=1.2)
-        unit = "mm" if sliding else "deg"
-        calm(axes, f"joint {i + 1}, {unit}", "" if i % across else "along its motion, mm")
-    figure.subplots_adjust(left=0.08, right=0.99, bottom=0.42 / height, top=0.97, hspace=0.5, wspace=0.08)
-    return figure
+            axes.lines([(x, _wave(x, turns_of[i + 1]) @ fitted)], INK, 1.2)
+    return drawing
 
 
 def _wave(degrees: np.ndarray, turns: int) -> np.ndarray:
@@ -107,27 +106,18 @@ def space_figure(shown: Drawn):
     cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
     ends = place + scale * errors * cut[:, None]
     bar = round_below(1.5 * ARROW_SHARE * crowded * side / scale)
-    figure = new_figure(9, 4.4)
-    for k, (i, j) in enumerate(((0, 1), (0, 2))):
-        axes = figure.add_axes((0.075 + 0.5 * k, 0.12, 0.42, 0.85))
+    drawing = Drawing(9, 4.4)
+    for box, (i, j) in zip(drawing.panels(2, left=54, top=18, gap=54), ((0, 1), (0, 2)), strict=True):
         every = np.concatenate([place, ends])[:, [i, j]]
         low = every.min(0) - 0.08 * side
-        axes.plot(*np.vstack([every, low]).T, " ")  # invisible points: the limits include everything
+        axes = Axes.equal(drawing, box, np.vstack([every, low]), 0.04)
+        axes.frame(f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", "xy")
         for mask, arrow_colour in ((good, colour), (~good, COLOURS[1] if colour != COLOURS[1] else COLOURS[0])):
-            start, arrow = place[mask][:, [i, j]], (ends - place)[mask][:, [i, j]]
-            style = {
-                "angles": "xy",
-                "scale_units": "xy",
-                "scale": 1,
-                "width": 0.004 * crowded,
-                "headwidth": 3.5,
-                "headlength": 4,
-            }
-            axes.quiver(*start.T, *arrow.T, color=arrow_colour, **style)
-            axes.plot(*start.T, ".", color=arrow_colour, ms=3)
-        plane(axes, f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", 0.04)
-        axes.plot([low[0], low[0] + scale * bar], [low[1], low[1]], color=INK, lw=2, solid_capstyle="butt")
-        axes.annotate(f"{bar:g} mm", low, (0, 4), textcoords="offset points", fontsize=SMALL, color=INK)
+            start = place[mask][:, [i, j]]
+            axes.arrows(start, ends[mask][:, [i, j]] - start, 1.3 * crowded, arrow_colour)
+            axes.marks(*start.T, "dot", 2, arrow_colour)
+        axes.lines([((low[0], low[0] + scale * bar), (low[1], low[1]))], INK, 2)
+        axes.words(*low, f"{bar:g} mm", (0, -7), anchor="start")
     cut_off = f"; cut, as they are too long: {(cut < 1).sum()}" if (cut < 1).any() else ""
-    figure.suptitle(f"{scale:g} times{cut_off}", x=0.99, y=0.99, ha="right", fontsize=SMALL + 1, color=INK)
-    return figure
+    drawing.words((drawing.width - 6, 8), f"{scale:g} times{cut_off}", SMALL + 1, "end")
+    return drawing

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from stcal.io.json import Matrix, Part, ResultFile
 from stcal.report.document import Block, Document, Notes, Section, Table, fold, listed, page_only, plot, subheading
-from stcal.report.svg import COLOURS, calm, new_figure
+from stcal.report.svg import COLOURS, Axes, Drawing, limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
@@ -449,20 +449,21 @@ def _dh_tables(result: Identified, nominal: Robot) -> list[Table]:
     return tables
 
 
-def _figure(result: Identified):
-    figure = new_figure(9, 2.6)
-    axes = figure.add_subplot()
+def _figure(result: Identified) -> Drawing:
+    drawing = Drawing(9, 2.6)
     rows = np.arange(1, len(result.seen) + 1)
     size = 4 if len(rows) <= 200 else 1.5
-    axes.plot(rows, result.fitted_mm, "o", color=COLOURS[0], ms=size, mew=0, label="identified")
-    if result.held_out is not None:
-        errors = _by_row(result.held_out.position_mm)
-        axes.plot(rows, errors, "_", color=COLOURS[1], ms=size * 2, mew=1.6, label="held out")
-    axes.set_ylim(bottom=0)
-    axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="upper right", bbox_to_anchor=(1, 1.15))
-    calm(axes, "observation", "error, mm")
-    figure.subplots_adjust(left=0.07, right=0.99, bottom=0.18, top=0.92)
-    return figure
+    held_out = None if result.held_out is None else _by_row(result.held_out.position_mm)
+    highest = np.append(result.fitted_mm, [] if held_out is None else held_out)
+    axes = Axes(drawing, drawing.panels(top=24)[0], (0, len(rows) + 1), limits(highest, low=0))
+    axes.frame("observation", "error, mm")
+    axes.marks(rows, result.fitted_mm, "dot", size, COLOURS[0])
+    key = {"identified": ("dot", COLOURS[0])}
+    if held_out is not None:
+        axes.marks(rows, held_out, "dash", 2 * size, COLOURS[1])
+        key["held out"] = "dash", COLOURS[1]
+    drawing.key((axes.box[0], 10), key)
+    return drawing
 
 
 def _by_row(values: np.ndarray) -> np.ndarray:

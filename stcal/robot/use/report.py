@@ -15,7 +15,7 @@ from stcal.io.files import require_written
 from stcal.io.quaternions import COLUMNS
 from stcal.io.table import read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
-from stcal.report.svg import COLOURS, INK, SMALL, calm, locator, new_figure, plane
+from stcal.report.svg import COLOURS, DASH, INK, Axes, Box, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import tips_of
 from stcal.robot.identification.drawings import Drawn, residual_plots
@@ -30,36 +30,25 @@ from stcal.robot.use.evaluation import Evaluated, Evaluation, EvaluationFile, Fi
 from stcal.robot.use.verification import Verification
 
 
-def verification_figure(result: Verification):
+def verification_figure(result: Verification) -> Drawing:
     """Returns a plot of the absolute distance error of each pose, with its mean, a line for each set.
 
     It is figure 8 of Zhang & Wei (2017).
     """
-    figure = new_figure(7.5, 3.4)
-    axes = figure.add_axes((0.09, 0.16, 0.89, 0.7))
+    drawing = Drawing(7.5, 3.4)
     at = np.arange(2, len(result.poses) + 1)
-    for each, colour in zip(result.sets, _colours(len(result.sets)), strict=True):
-        few = len(at) <= 120
-        label = f"{each.name}: mean {each.mean_mm:.3f}, max {each.max_mm:.3f} mm"
-        size = np.abs(each.error_mm)
-        axes.plot(at, size, color=colour, lw=1.1, marker="o" if few else None, ms=2.6, label=label, clip_on=False)
-        axes.axhline(each.mean_mm, color=colour, lw=0.9, ls=(0, (5, 4)), alpha=0.8)
-    _pose_by_pose(axes, (1, at[-1] + 0.02 * len(at) + 0.5), "|distance error|, mm")
-    if len(result.sets) <= 4:
-        place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "ncols": 2, "borderaxespad": 0.2}
-        axes.legend(fontsize=SMALL + 0.5, frameon=False, **place)
-    return figure
-
-
-def figure_bytes(figure, kind: str) -> bytes:
-    """Returns the figure as ``png`` or ``svg``. Equal figures give equal bytes."""
-    import matplotlib
-
-    stream = io.BytesIO()
-    with matplotlib.rc_context({"svg.fonttype": "path", "svg.hashsalt": "stcal"}):
-        metadata = {"Date": None, "Creator": None} if kind == "svg" else {"Software": None}
-        figure.savefig(stream, format=kind, dpi=160, facecolor="white", metadata=metadata)
-    return stream.getvalue()
+    sizes = [np.abs(each.error_mm) for each in result.sets]
+    box = drawing.panels(top=12 + 14 * -(-len(sizes) // 2))[0]
+    x, y = (1, at[-1] + 0.02 * len(at) + 0.5), limits(np.concatenate(sizes), low=0)
+    axes = _pose_by_pose(Axes(drawing, box, x, y), "|distance error|, mm")
+    for k, (each, size, colour) in enumerate(zip(result.sets, sizes, _colours(len(sizes)), strict=True)):
+        axes.lines([(at, size)], colour, 1.1)
+        axes.marks(at, size, "dot", 2.6 if len(at) <= 120 else 1.1, colour)
+        axes.level(each.mean_mm, colour, 0.9, DASH)
+        if len(sizes) <= 4:
+            label = f"{each.name}: mean {each.mean_mm:.3f}, max {each.max_mm:.3f} mm"
+            drawing.key((box[0] + 240 * (k % 2), 10 + 14 * (k // 2)), {label: ("dot", colour)})
+    return drawing
 
 
 def verification_report(result: Verification) -> Document:
@@ -129,21 +118,21 @@ def compensation_report(result: Compensated, robot: Robot) -> Document:
     )
 
 
-def _before_figure(result: Compensated):
-    figure = new_figure(7.5, 2.8)
-    axes = figure.add_axes((0.09, 0.18, 0.89, 0.76))
+def _before_figure(result: Compensated) -> Drawing:
+    drawing = Drawing(7.5, 2.8)
     rows = np.flatnonzero(result.compared())
-    axes.vlines(rows + 1, 0, result.before_mm[rows], color=COLOURS[1], lw=max(0.5, min(3, 300 / len(result))))
-    _pose_by_pose(axes, (0.2, len(result) + 0.8), "position error, mm")
-    return figure
+    size = result.before_mm[rows]
+    axes = Axes(drawing, drawing.panels()[0], (0.2, len(result) + 0.8), limits(size, low=0))
+    _pose_by_pose(axes, "position error, mm")
+    bars = [((row + 1, row + 1), (0, each)) for row, each in zip(rows, size, strict=True)]
+    axes.lines(bars, COLOURS[1], max(0.5, min(3, 300 / len(result))))
+    return drawing
 
 
-def _pose_by_pose(axes, limits: tuple[float, float], what: str) -> None:
-    """Sets up the axes for an error of each pose."""
-    axes.set_xlim(*limits)
-    axes.set_ylim(0, None)
-    axes.xaxis.set_major_locator(locator(integer=True))
-    calm(axes, "pose, in order of the file", what, "y")
+def _pose_by_pose(axes: Axes, what: str) -> Axes:
+    """Draws the frame of an error of each pose."""
+    axes.frame("pose, in order of the file", what, "y", count_ticks(*axes.x))
+    return axes
 
 
 def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
@@ -253,39 +242,32 @@ def _indices(result: PoseDesign) -> list[list[str]]:
     return rows
 
 
-def _index_figure(result: PoseDesign):
-    figure = new_figure(5, 2.9)
-    axes = figure.add_axes((0.12, 0.12, 0.86, 0.82))
-    chosen, median = result.chosen.values(), result.median()
-    for i, (name, value) in enumerate(chosen.items()):
-        if median[name] <= 0:
-            continue
-        every = np.array([each.values()[name] for each in result.random]) / median[name]
-        axes.plot(i + np.linspace(-0.15, 0.15, len(every)), every, "o", ms=3, color="#9aa0a8", mew=0)
-        axes.plot(i, value / median[name], "D", ms=6, color=COLOURS[0], mew=0, clip_on=False)
-    axes.axhline(1, color=INK, lw=0.6)
-    axes.set_xticks(range(len(chosen)), list(chosen))
-    axes.set_xlim(-0.5, len(chosen) - 0.5)
-    axes.set_ylim(0, None)
-    axes.yaxis.set_major_locator(locator())
-    calm(axes, y="over the median of random sets", grid="y")
-    return figure
+def _index_figure(result: PoseDesign) -> Drawing:
+    drawing = Drawing(5, 2.9)
+    median = result.median()
+    chosen = {name: value / median[name] for name, value in result.chosen.values().items() if median[name] > 0}
+    every = [[each.values()[name] / median[name] for each in result.random] for name in chosen]
+    highest = limits([1, *chosen.values(), *np.ravel(every)], low=0)
+    axes = Axes(drawing, drawing.panels(bottom=20)[0], (-0.5, max(len(chosen), 1) - 0.5), highest)
+    axes.frame("", "over the median of random sets", "y", (range(len(chosen)), list(chosen)))
+    axes.level(1)
+    for i, (values, value) in enumerate(zip(every, chosen.values(), strict=True)):
+        axes.marks(i + np.linspace(-0.15, 0.15, len(values)), values, "dot", 3, "#9aa0a8")
+        axes.marks(i, value, "diamond", 7, COLOURS[0])
+    return drawing
 
 
-def _places(result: PoseDesign, up: int):
+def _places(result: PoseDesign, up: int) -> Drawing:
     """Returns a plot of the tool's positions and z axes: x against the coordinate ``up``."""
     at, z = result.poses.translation[:, [0, up]], result.poses.rotation[:, [0, up], 2]
-    length = 0.12 * float(np.ptp(result.poses.translation, axis=0).max())
-    figure = new_figure(5, 4.2)
-    axes = figure.add_axes((0.15, 0.12, 0.83, 0.86))
-    axes.quiver(
-        *at.T, *(z * length).T, angles="xy", scale_units="xy", scale=1,
-        color=COLOURS[2], width=0.003, headwidth=4, headlength=5, clip_on=False,
-    )  # fmt: skip
-    axes.plot(*at.T, "o", ms=4, color=COLOURS[0], mew=0)
-    axes.plot(0, 0, "s", ms=6, color=INK, mew=0)
-    plane(axes, "x, mm", f"{'xyz'[up]}, mm", 0.16)
-    return figure
+    z = 0.12 * float(np.ptp(result.poses.translation, axis=0).max()) * z
+    drawing = Drawing(5, 4.2)
+    axes = Axes.equal(drawing, drawing.panels()[0], np.vstack([at, at + z, np.zeros((1, 2))]))
+    axes.frame("x, mm", f"{'xyz'[up]}, mm", "xy")
+    axes.arrows(at, z, 1.1, COLOURS[2])
+    axes.marks(*at.T, "dot", 4, COLOURS[0])
+    axes.marks(0, 0, "square", 6, INK)
+    return drawing
 
 
 MOST_NOTES = 500
@@ -551,56 +533,37 @@ def _colour(result: Evaluation, each: Evaluated) -> str:
     return COLOURS[list(result.robots).index(each) % len(COLOURS)]
 
 
-def _errors(axes, result: Evaluation, at: dict[int, np.ndarray], label: str) -> None:
+def _errors(drawing: Drawing, box: Box, result: Evaluation, at: Sequence[np.ndarray], label: str, name: str) -> None:
     """Plots the errors of all robots over ``at``, by row, with unexplained rows ringed, logarithmically if needed."""
     every = np.concatenate([each.errors_mm for each in result.robots])
-    few = len(result.wrong) <= 200
-    for k, each in enumerate(result.robots):
-        axes.plot(at[k], each.errors_mm, "o", color=_colour(result, each), ms=3.6 if few else 1.6, mew=0, alpha=0.85)
-        axes.plot(at[k][result.wrong], each.errors_mm[result.wrong], "o", mfc="none", mec=INK, ms=7, mew=0.8)
     middle = [float(np.median(each.errors_mm)) for each in result.robots]
-    if min(middle) > 0 and (max(middle) > FAR_APART * min(middle) or every.max() > 4 * FAR_APART * max(middle)):
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter("{x:g}")
-    else:
-        axes.set_ylim(bottom=0)
-    calm(axes, label, grid="y")
+    wide = min(middle) > 0 and (max(middle) > FAR_APART * min(middle) or every.max() > 4 * FAR_APART * max(middle))
+    y = log_limits(every) if wide else limits(every, low=0)
+    axes = Axes(drawing, box, limits(np.concatenate(at)), y, "y" if wide else "")
+    axes.frame(label, name, "y")
+    for each, places in zip(result.robots, at, strict=True):
+        axes.marks(places, each.errors_mm, "dot", 3.6 if len(result.wrong) <= 200 else 1.6, _colour(result, each), 0.85)
+        axes.marks(places[result.wrong], each.errors_mm[result.wrong], "ring", 7, INK)
 
 
-def _row_figure(result: Evaluation):
-    figure = new_figure(9, 2.8)
-    axes = figure.add_axes((0.07, 0.18, 0.92, 0.68))
-    at = result.seen.first + 1
-    _errors(axes, result, dict.fromkeys(range(len(result.robots)), at), "row, in order of the file")
-    axes.set_ylabel("error, mm", fontsize=SMALL + 1, color=INK)
-    _legend(figure, result)
-    return figure
+def _row_figure(result: Evaluation) -> Drawing:
+    drawing = Drawing(9, 2.8)
+    rows = [result.seen.first + 1] * len(result.robots)
+    _errors(drawing, drawing.panels(top=24)[0], result, rows, "row, in order of the file", "error, mm")
+    return _with_key(drawing, result)
 
 
-def _legend(figure, result: Evaluation) -> None:
-    from matplotlib.lines import Line2D
-
-    marks = [
-        Line2D([], [], marker="o", ls="", ms=4, color=_colour(result, e), label=e.robot.name) for e in result.robots
-    ]
-    if result.wrong.any():
-        marks.append(Line2D([], [], marker="o", ls="", ms=7, mfc="none", mec=INK, label="no robot explains"))
-    place = {"loc": "upper left", "bbox_to_anchor": (0.06, 1), "ncols": 6}
-    figure.legend(handles=marks, fontsize=SMALL + 0.5, frameon=False, **place)
+def _with_key(drawing: Drawing, result: Evaluation) -> Drawing:
+    entries = {each.robot.name: ("dot", _colour(result, each)) for each in result.robots}
+    drawing.key((46, 10), entries | ({"no robot explains": ("ring", INK)} if result.wrong.any() else {}))
+    return drawing
 
 
-def _place_figure(result: Evaluation):
-    figure = new_figure(9, 2.8)
+def _place_figure(result: Evaluation) -> Drawing:
+    drawing = Drawing(9, 2.8)
+    left, right = drawing.panels(2, top=24)
     places = [_place(result, each) for each in result.robots]
-    for k, (label, of) in enumerate(
-        (
-            ("distance from the base's axis, mm", lambda p: np.linalg.norm(p[:, :2], axis=1)),
-            ("height above the base, mm", lambda p: p[:, 2]),
-        )
-    ):
-        axes = figure.add_axes((0.07 + 0.49 * k, 0.18, 0.43, 0.68))
-        _errors(axes, result, {i: of(place) for i, place in enumerate(places)}, label)
-        if k == 0:
-            axes.set_ylabel("error, mm", fontsize=SMALL + 1, color=INK)
-    _legend(figure, result)
-    return figure
+    away = [np.linalg.norm(place[:, :2], axis=1) for place in places]
+    _errors(drawing, left, result, away, "distance from the base's axis, mm", "error, mm")
+    _errors(drawing, right, result, [place[:, 2] for place in places], "height above the base, mm", "")
+    return _with_key(drawing, result)

@@ -18,11 +18,11 @@ SECOND_ORDER = 0.085
 MIN_VIEWS, MIN_SPREAD = 30, 0.15
 """Smallest number of views of a kind of circle, and of the standard deviation of their tan τ, for a rim."""
 BLUR_SHARE = 0.3
-"""σ of the blur's effect on the radius that is left after its correction, as a share of it (``defocus_study.py``): the
+"""σ of the blur's effect on the radius that is left after its correction, as a share of it: the
 prior of the share that all views of a kind have in common, which the views determine better."""
 BLUR_SHARE_BY_TILT = 0.05
 """σ by which this share grows with the tangent of the tilt, which looks like a rim: it is 0.00 to 0.02 for circles that
-face the camera, 0.05 at 50° and 0.04 to 0.13 at 62° (``defocus_study.py``, circles of 8 px and more)."""
+face the camera, 0.05 at 50° and 0.04 to 0.13 at 62° in rendered scenes (circles of 8 px and more)."""
 LEAST_SIGMA_MM = 0.003
 """Smallest σ of a rim: what light that falls towards the edge of a circle adds."""
 HUBER = 2.0
@@ -62,7 +62,7 @@ def radius_views(
 
     The areas of the circles' images follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3),
     with the estimated planes of the faces. A blur of σ reduces the radius R of a disc's image by σ²/2R, and the
-    fitted radius by about as much (``scripts/studies/defocus_study.py``). The result is corrected for this.
+    fitted radius by about as much. The result is corrected for this.
     """
     focal = float(np.sqrt(camera.focal.prod()))
     rows = model.rows_by_image()

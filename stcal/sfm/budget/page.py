@@ -21,7 +21,7 @@ from stcal.report.document import (
     subheading,
     tiles,
 )
-from stcal.report.svg import COLOURS, calm, new_figure
+from stcal.report.svg import COLOURS, LETTER, SMALL, Axes, Drawing
 from stcal.report.text import NONE, number, significant
 from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncertainty
 
@@ -391,21 +391,22 @@ def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list
     drawn = [row for row in file.sources if shares[row.key].max(initial=0) > LEAST_SHARE]
     colours = {row.key: COLOURS[i % len(COLOURS)] for i, row in enumerate(drawn)}
 
-    def draw():
-        height = 0.6 + 0.24 * len(measurands)
-        figure = new_figure(9.0, height)
-        axes = figure.subplots()
-        names = _measurand_names(file, measurands)
-        left = min(0.4 + 0.075 * max(map(len, names)), 4.0) / 9.0  # as wide as the longest name
-        figure.subplots_adjust(left=max(left, 0.125), top=1 - 0.05 / height, bottom=0.5 / height)
-        so_far, place = np.zeros(len(measurands)), np.arange(len(measurands))[::-1]
+    def draw() -> Drawing:
+        names, place = _measurand_names(file, measurands), np.arange(len(measurands))[::-1]
+        drawing = Drawing(9.0, 0.6 + 0.24 * len(measurands))
+        left = min(20 + LETTER * SMALL * max(map(len, names)), 290)
+        axes = Axes(drawing, drawing.panels(left=left, top=4)[0], (0, 100), (-0.6, len(measurands) - 0.4))
+        so_far = np.zeros(len(measurands))
         for row in drawn:
-            axes.barh(place, 100 * shares[row.key], left=100 * so_far, height=0.7, color=colours[row.key])
-            so_far += shares[row.key]
-        axes.set_yticks(place, names)
-        axes.set_xlim(0, 100)
-        calm(axes, "share of the variance, %")
-        return figure
+            share = 100 * shares[row.key]
+            bars = [
+                ((a, a + b, a + b, a), (y - 0.35, y - 0.35, y + 0.35, y + 0.35))
+                for a, b, y in zip(so_far, share, place, strict=True)
+            ]
+            axes.lines(bars, fill=colours[row.key])
+            so_far += share
+        axes.frame("share of the variance, %", y_ticks=(place.tolist(), names))
+        return drawing
 
     return [
         plot(draw, "shares of the variances", "What each input has in the variance of the results"),

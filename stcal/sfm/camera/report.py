@@ -16,7 +16,7 @@ from stcal.report.document import (
     plots,
     subheading,
 )
-from stcal.report.svg import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
+from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import HEADS, number, transform_rows
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
@@ -140,44 +140,42 @@ def _split_half(result: CameraCalibration) -> list[str]:
     ]
 
 
-def _image_axes(result: CameraCalibration):
+def _image_axes(camera: Camera) -> Axes:
+    drawing = Drawing(5.6, 0.6 + 4.4 * camera.height / camera.width)
+    box = drawing.panels(top=20, right=44)[0]
+    return Axes(drawing, box, (-0.5, camera.width - 0.5), (camera.height - 0.5, -0.5))
+
+
+def _map(result: CameraCalibration, values: np.ndarray, label: str) -> Drawing:
+    """Returns a figure of values (n,) over the image's grid as shades, with the measured dots."""
     camera = result.intrinsics.camera
-    figure = new_figure(5.6, 0.9 + 4.6 * camera.height / camera.width)
-    figure.set_layout_engine("constrained")
-    axes = figure.add_subplot()
-    calm(axes, "x, px", "y, px")
-    axes.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
-    return figure, axes
-
-
-def _map(result: CameraCalibration, values: np.ndarray, label: str):
-    """Returns a figure of values (n,) over the image's grid as filled contours, with the measured dots."""
-    figure, axes = _image_axes(result)
-    grid = result.projection.xy_px.reshape(*GRID[::-1], 2)
+    axes = _image_axes(camera)
     shown = values.reshape(GRID[::-1])
-    contours = axes.contourf(grid[..., 0], grid[..., 1], shown, levels=12, cmap="viridis")
+    step = round_below(float(shown.max()) / 8)
+    bands = max(1, int(np.ceil(shown.max() / step)))
+    axes.shade(shown, (0, 0, camera.width - 1, camera.height - 1), 0, bands * step, VIRIDIS, bands)
     for model in result.intrinsics.models:
-        axes.plot(*model.measured_px.T, ".", color="white", markersize=1.0, alpha=0.5)
-    bar = figure.colorbar(contours, ax=axes, shrink=0.85, pad=0.02)
-    bar.set_label(label, fontsize=SMALL + 0.5, color=INK)
-    bar.ax.tick_params(labelsize=SMALL)
-    return figure
+        axes.marks(*model.measured_px.T, "dot", 0.8, "#ffffff", 0.5)
+    axes.frame("x, px", "y, px")
+    _, top, right, bottom = axes.box
+    axes.drawing.scale((right + 8, top + 16, right + 15, bottom - 10), 0, bands * step, label, VIRIDIS)
+    return axes.drawing
 
 
-def sigma_map(result: CameraCalibration):
-    return _map(result, result.projection.sigma_px, "σ of a projection, px")
+def sigma_map(result: CameraCalibration) -> Drawing:
+    return _map(result, result.projection.sigma_px, "σ, px")
 
 
-def _halves(result: CameraCalibration):
+def _halves(result: CameraCalibration) -> Drawing:
     assert result.split is not None
     moved = projection_jacobian(result.intrinsics.camera, result.intrinsics.colmap_model) @ result.split.difference
-    return _map(result, np.linalg.norm(moved, axis=1), "difference of the halves, px")
+    return _map(result, np.linalg.norm(moved, axis=1), "px")
 
 
-def residual_map(result: CameraCalibration):
+def residual_map(result: CameraCalibration) -> Drawing:
     """Returns a figure of mean residuals over cells of the image. Model errors are alike in neighbouring cells."""
-    figure, axes = _image_axes(result)
     camera = result.intrinsics.camera
+    axes = _image_axes(camera)
     xy = np.concatenate([model.measured_px for model in result.intrinsics.models])
     weight = np.concatenate(result.intrinsics.weights())
     residuals = result.intrinsics.residuals_px()
@@ -191,11 +189,11 @@ def residual_map(result: CameraCalibration):
     middle = (np.stack(np.divmod(np.flatnonzero(enough), CELLS[1]), axis=1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max()) if len(mean) else 0.0
     times = round_below(ARROW_SHARE * size.min() / longest) if longest else 1.0
-    axes.quiver(
-        *middle.T, *(times * mean).T, angles="xy", scale_units="xy", scale=1, color=INK, width=0.003, headwidth=4
-    )
-    axes.set_title(f"enlarged {times:g} times; the longest is {longest:.4f} px", fontsize=SMALL + 1, color=INK)
-    return figure
+    axes.arrows(middle, times * mean, 1.2, INK)
+    axes.frame("x, px", "y, px")
+    said = f"enlarged {times:g} times; the longest is {longest:.4f} px"
+    axes.drawing.words(((axes.box[0] + axes.box[2]) / 2, 10), said, SMALL + 1)
+    return axes.drawing
 
 
 CAMERA_HEADS = (
@@ -208,8 +206,6 @@ CAMERA_HEADS = (
     "σ of a projection px",
     "held out px",
 )
-FRUSTUM_SHARE = 0.15
-"""Length of the drawn fields of view, as a share of the rig's extent."""
 
 
 def _headline(rig: RigCalibration) -> str:
@@ -287,12 +283,6 @@ def rig_report(rig: RigCalibration, where: str) -> Document:
                         "The pose of the first camera in the other. σ are those of rotations about the axes, and of "
                         "translations along the axes, of the frame named first"
                     ),
-                    plot(
-                        lambda: _arrangement(rig),
-                        "cameras from above and from the side",
-                        "Cameras and their fields of view from above and from the side, in the frame of "
-                        f"{rig.names[0]}",
-                    ),
                 ],
                 terminal=True,
             ),
@@ -308,57 +298,9 @@ def rig_report(rig: RigCalibration, where: str) -> Document:
             Section(
                 "Instants",
                 [
-                    plot(
-                        lambda: _by_instant(rig),
-                        "residuals by instant",
-                        "Residuals of each instant; grey: seen by one camera alone",
-                    ),
                     Table(["<instant", "RMS px", *(name.replace("<", "") for name in rig.names)], instants, css="text"),
                 ],
             ),
             Section("Left out", [Table(["<camera", "<image or file", "<reason"], left_out, css="text")], terminal=True),
         ],
     )
-
-
-def _arrangement(rig: RigCalibration):
-    """Returns a figure of the cameras and their fields of view from above (x, z) and from the side (z, y).
-
-    Coordinates are in the frame of the first camera.
-    """
-    inverse = [pose.inverse() for pose in rig.camera_from_first]
-    places = np.array([pose.translation for pose in inverse])
-    length = FRUSTUM_SHARE * max(float(np.ptp(places, axis=0).max()), 1.0) * 3
-    figure = new_figure(7.2, 3.4)
-    figure.set_layout_engine("constrained")
-    for axes, (a, b), labels in zip(
-        figure.subplots(1, 2), ((0, 2), (2, 1)), (("x, mm", "z, mm"), ("z, mm", "y, mm")), strict=True
-    ):
-        for k, (name, pose, calibration) in enumerate(zip(rig.names, inverse, rig.cameras, strict=True)):
-            camera, colour = calibration.intrinsics.camera, COLOURS[k % len(COLOURS)]
-            across = 0 if a == 0 else 1
-            half = 0.5 * (camera.width, camera.height)[across] / camera.focal[across]
-            edge = np.zeros((2, 3))
-            edge[:, across], edge[:, 2] = [-half, half], 1.0
-            ends = pose @ (length * edge / np.hypot(half, 1))
-            fan = np.array([ends[0], pose.translation, ends[1]])
-            axes.plot(fan[:, a], fan[:, b], color=colour, linewidth=1.2)
-            axes.annotate(
-                name, pose.translation[[a, b]], fontsize=SMALL, color=colour, xytext=(4, -8), textcoords="offset points"
-            )
-        plane(axes, *labels, 0.15)
-    figure.axes[1].invert_yaxis()
-    return figure
-
-
-def _by_instant(rig: RigCalibration):
-    """Returns a figure of the residuals by instant. Instants that several cameras saw have their own colour."""
-    figure = new_figure(7.2, 2.2)
-    figure.set_layout_engine("constrained")
-    axes = figure.add_subplot()
-    shared = [len(images) > 1 for images in rig.instants.values()]
-    axes.bar(
-        range(len(shared)), list(rig.rms_px.values()), color=[COLOURS[0] if each else "#9aa0a8" for each in shared]
-    )
-    calm(axes, "instant", "RMS, px")
-    return figure

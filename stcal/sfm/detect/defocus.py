@@ -21,7 +21,7 @@ BY_CHANCE = 1e-6
 RESPONSE, RESPONSE_OF_BLUR2 = 0.54, 9.9
 """Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
 square of the blur over the smaller radius. From circles of scenes that were rendered through points of a pupil and
-corrected as here (``scripts/studies/defocus_study.py``). Half of it is a shift of the edges; the blur that fits show
+corrected as here. Half of it is a shift of the edges; the blur that fits show
 grows by up to a third faster than the variance of the pupil's image."""
 RESPONSE_SIGMA = 0.15
 """σ of this multiple for one circle, as a share of it: the study's scatter of single circles, and what the circles of a

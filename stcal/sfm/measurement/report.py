@@ -25,7 +25,7 @@ from stcal.report.document import (
     plots,
 )
 from stcal.report.document import Table as ShownTable
-from stcal.report.svg import COLOURS, calm, locator, new_figure, plane, round_below
+from stcal.report.svg import COLOURS, Axes, Drawing, count_ticks, limits, round_below
 from stcal.report.text import number, text_table
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import fit_verdict
@@ -428,25 +428,23 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     )
 
 
-def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float):
+def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -> Drawing:
     """Returns a plot of two coordinates of the path, with enlarged ellipses of σ."""
-    from matplotlib.patches import Ellipse
-
-    figure = new_figure(5, 4.4)
-    axes = figure.add_axes((0.15, 0.12, 0.83, 0.86))
-    for rows in _folders(result.images):
-        axes.plot(at[rows, i], at[rows, j], "-", lw=0.7, color="#9aa0a8", zorder=1)
+    drawing = Drawing(5, 4.4)
+    turn = np.linspace(0, 2 * np.pi, 40)
+    circle, ellipses = times * np.stack([np.cos(turn), np.sin(turn)], axis=1), []
     for image, place in zip(result.images, at, strict=True):
         values, directions = np.linalg.eigh(image.pose.covariance[np.ix_([3 + i, 3 + j], [3 + i, 3 + j])])
-        width, height = 2 * times * np.sqrt(values)
-        angle = float(np.degrees(np.arctan2(directions[1, 0], directions[0, 0])))
+        ellipses.append(place[[i, j]] + circle * np.sqrt(values) @ directions.T)
+    # y of a camera points down
+    axes = Axes.equal(drawing, drawing.panels()[0], np.concatenate(ellipses), down=j == 1)
+    axes.frame(f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", "xy")
+    axes.lines([at[rows][:, [i, j]].T for rows in _folders(result.images)], "#9aa0a8", 0.7)
+    for image, place, ellipse in zip(result.images, at, ellipses, strict=True):
         colour = COLOUR_OF[image.pose.status]
-        axes.add_patch(Ellipse(place[[i, j]], width, height, angle=angle, fc=colour, ec=colour, alpha=0.3, lw=0.6))
-        axes.plot(place[i], place[j], "o", ms=3.2, color=colour, mew=0)
-    plane(axes, f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", 0.12)
-    if j == 1:
-        axes.invert_yaxis()  # y of a camera points down
-    return figure
+        axes.lines([ellipse.T], colour, 0.6, fill=colour, opacity=0.3)
+        axes.marks(place[i], place[j], "dot", 3.2, colour)
+    return drawing
 
 
 def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
@@ -457,25 +455,24 @@ def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
     return list(folders.values())
 
 
-def _sigma(result: MeasureResult):
+def _sigma(result: MeasureResult) -> Drawing:
     """Returns a plot of σ along and across the line of sight, and of the rotation, image by image."""
-    figure = new_figure(9, 3)
-    place = figure.add_axes((0.07, 0.17, 0.41, 0.74))
-    turn = figure.add_axes((0.57, 0.17, 0.41, 0.74))
+    drawing = Drawing(9, 3)
     along, across, rotation = (1e3 * np.array(values) for values in zip(*map(_split, result.images), strict=True))
-    rows = np.arange(1, len(result.images) + 1)
-    size = 4 if len(rows) <= 200 else 1.5
-    colours = [COLOUR_OF[image.pose.status] for image in result.images]
-    place.scatter(rows, along, s=size**2, c=colours, lw=0)
-    place.scatter(rows, across, s=size**2, c="none", edgecolors=colours, lw=0.8)
-    turn.scatter(rows, np.degrees(rotation), s=size**2, c=colours, lw=0)
+    turned = np.degrees(rotation)
+    rows, size = np.arange(1, len(along) + 1), 4 if len(along) <= 200 else 1.5
+    status = np.array([image.pose.status for image in result.images])
+    left, right = drawing.panels(2, gap=56)
+    place = Axes(drawing, left, (0.4, len(rows) + 0.6), limits([*along, *across], low=0))
+    turn = Axes(drawing, right, place.x, limits(turned, low=0))
     for axes, label in ((place, "σ position, µm"), (turn, "σ rotation, mdeg")):
-        axes.set_ylim(0, 1.06 * axes.get_ylim()[1])
-        axes.yaxis.set_major_locator(locator())
-        axes.set_xlim(0.4, len(rows) + 0.6)
-        axes.xaxis.set_major_locator(locator())
-        calm(axes, "image, in order of the table", label, "y")
-    return figure
+        axes.frame("image, in order of the table", label, "y", count_ticks(*axes.x))
+    for name, colour in COLOUR_OF.items():
+        own = status == name
+        place.marks(rows[own], along[own], "dot", size, colour)
+        place.marks(rows[own], across[own], "ring", size, colour)
+        turn.marks(rows[own], turned[own], "dot", size, colour)
+    return drawing
 
 
 def _split(each: MeasuredImage) -> tuple[float, float, float]:

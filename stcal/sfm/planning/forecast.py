@@ -126,8 +126,7 @@ PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
 CORNER_SIGMA_PX = 0.02
-"""σ of the corner of a tag or square in a good photograph, as `scripts/studies/tag_corners_study.py` prints it for tags
-whose cells are 6 to 14 px wide."""
+"""σ of the corner of a tag or square in a good photograph, of tags whose cells are 6 to 14 px wide."""
 ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common if the same plate is in all of them."""
 ENOUGH = 10_000

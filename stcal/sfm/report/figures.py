@@ -12,12 +12,13 @@ from stcal.report.svg import (
     AXIS_COLOURS,
     COLOURS,
     INK,
+    RED_BLUE,
     SMALL,
     Axes,
     Drawing,
     Space,
     arrows,
-    red_blue,
+    mixed_names,
     round_below,
     ticks,
 )
@@ -29,7 +30,7 @@ def group_colours(names: list[str]) -> dict[str, str]:
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
-def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> str:
+def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> Drawing:
     """Draws residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
 
     Parameters
@@ -47,33 +48,32 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     last = cells.max(0) if len(cells) else np.zeros(2)
     pitch = min(236 / (last[1] + 2.4), 202 / (last[0] + 3.2))  # pt
     box = (26.0, 10.0, 26 + pitch * (last[1] + 2.4), 10 + pitch * (last[0] + 3.2))
-    axes = Axes(box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
+    axes = Axes(drawing, box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
     marks = [[float(i) for i in range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12))))] for end in last]
     rows, columns = ((values, [f"{value:g}" for value in values]) for values in marks)
-    axes.draw(drawing, columns, rows, "column", "row", size=SMALL)
+    axes.frame("column", "row", "", columns, rows, SMALL)
     places = axes.at(cells[:, 1], cells[:, 0])
-    drawing.discs(places, min(2.75, 0.25 * pitch), red_blue(vectors[:, 2] / height_um), "#777777")
+    colours = mixed_names((1 + vectors[:, 2] / height_um) / 2, RED_BLUE)
+    drawing.discs(places, min(2.75, 0.25 * pitch), colours, "#777777")
     drawing.lines(arrows(places, vectors[:, :2] * pitch / per_cell, 1.4), fill="#000000")
     bar = axes.at([0, bar_um / per_cell], last[0] + 1.45)
     drawing.lines([bar], INK, 2.5)
     drawing.words(bar[1] + [4, 0], f"{bar_um:g} µm", SMALL + 1, "start")
-    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), height_um, "z, µm")
-    return drawing.uri()
+    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), -height_um, height_um, "z, µm", RED_BLUE)
+    return drawing
 
 
-def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
+def image_bars(rows: list[dict], colours: dict[str, str]) -> Drawing:
     """Draws the RMS residual of each image as a bar in its group's colour, and its largest residual as a tick.
 
     The horizontal axis is the number of the image in the table.
     """
     drawing, count = Drawing(10.5, 2.9), max(len(rows), 1)
     top = max((row["max_px"] for row in rows), default=0.0)
-    axes = Axes((43.0, 19.0, 749.0, 176.0), (0.2, count + 0.8), (0.0, 1.05 * top if top > 0 else 1.0))
+    axes = Axes(drawing, (43.0, 19.0, 749.0, 176.0), (0.2, count + 0.8), (0.0, 1.05 * top if top > 0 else 1.0))
     numbers = list(range(1, len(rows) + 1, max(1, int(np.ceil(len(rows) / 40)))))
-    axes.draw(
-        drawing, (numbers, list(map(str, numbers))), ticks(*axes.y, 8), "number of the image in the table below",
-        "residual, px", grid=True,
-    )  # fmt: skip
+    columns = numbers, list(map(str, numbers))
+    axes.frame("number of the image in the table below", "residual, px", "y", columns, ticks(*axes.y, 8))
     groups = [row["group"] for row in rows]
     for group in dict.fromkeys(groups):
         colour = colours.get(group, INK)
@@ -85,7 +85,7 @@ def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
     largest = axes.at(np.arange(1, len(rows) + 1), [row["max_px"] for row in rows])
     half = np.array([min(4.5, 0.4 * (axes.box[2] - axes.box[0]) / (count + 0.6)), 0.0])
     drawing.lines([np.array([at - half, at + half]) for at in largest], INK, 1.4)
-    return drawing.uri()
+    return drawing
 
 
 LEAST_UPRIGHT = 0.5
@@ -123,7 +123,7 @@ def upright(report: dict) -> dict:
     return {**report, "faces": faces, "scene": {**scene, "cameras": cameras, "circles": circles, "boards": boards}}
 
 
-def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> str:
+def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> Drawing:
     """Draws cameras, boards and the target's circles in the target frame."""
     target = np.array(list(scene["circles"].values()), float).reshape(-1, 3)
     positions = np.array([view["position_mm"] for view in scene["cameras"]], float).reshape(-1, 3)
@@ -133,16 +133,16 @@ def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: floa
     drawing = Drawing(5.4, 4.9)
     space = Space(drawing, everything, 22, azimuth)
     for name, xyz in boards.items():
-        drawing.dots(space.at(xyz), 1.8, colours.get(name, INK))
-    drawing.dots(space.at(target), 2.0, "#000000")
+        drawing.marks(space.at(xyz), "dot", 1.8, colours.get(name, INK))
+    drawing.marks(space.at(target), "dot", 2.0, "#000000")
     for name in dict.fromkeys(view["group"] for view in scene["cameras"]):
         views = [view for view in scene["cameras"] if view["group"] == name]
         pyramids = [space.at(line) for view in views for line in frustum(view, camera, depth)]
         drawing.lines(pyramids, colours.get(name, INK), 0.9)
-    return drawing.uri()
+    return drawing
 
 
-def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> str:
+def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> Drawing:
     """Draws the target's circles, and the frame of each face with its name at the end of the normal."""
     parts = _faces(circles, faces)
     xyz = np.array(list(circles.values()), float).reshape(-1, 3)
@@ -152,13 +152,13 @@ def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth
     for part, own in zip(parts, shown, strict=True):
         if part["kind"] == "sheet":
             drawing.lines([space.at(own)], fill=SHEET, opacity=0.16)
-    drawing.dots(space.at(xyz), 3.0, INK)
+    drawing.marks(space.at(xyz), "dot", 3.0, INK)
     for part, own in zip(parts, shown, strict=True):
         if part["kind"] == "line":
             drawing.lines([space.at(own)], part["colour"], 1.6)
         elif part["kind"] == "text":
             drawing.words(space.at(own)[0], part["name"], 11, colour="#000000", weight="bold")
-    return drawing.uri()
+    return drawing
 
 
 def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:

@@ -25,6 +25,7 @@ from stcal.report.document import (
     tiles,
     tone_of,
 )
+from stcal.report.svg import Drawing
 from stcal.report.text import cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
@@ -38,6 +39,9 @@ from stcal.sfm.report.sections import (
     settings,
     trust,
 )
+
+View = tuple[Drawing, Drawing, str]
+"""Cameras, target, and words for the side that they are seen from."""
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
@@ -156,7 +160,7 @@ covariance = faces["target_from_face_covariance"]["{face}"]"""
 """Program that reads the result."""
 
 
-def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, str]], words: Words) -> list[Block]:
+def _answer(report: dict, colours: dict[str, str], views: list[View], words: Words) -> list[Block]:
     """Returns the faces with σ, the target in space, and how to use the result."""
     rows = []
     for name, face in report["faces"].items():
@@ -219,11 +223,8 @@ def _use(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     return [macro("answers", judgement.answers(), tone_of(judgement.verdict)), *checks, tiles(headline(report, words))]
 
 
-def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[tuple[str, str, str]], str]:
-    """Returns the plots: the boards' residuals by group, views from two sides, and bars of the images.
-
-    A view is (cameras, target, words for its side).
-    """
+def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, Drawing], list[View], Drawing]:
+    """Returns the plots: the boards' residuals by group, views from two sides, and bars of the images."""
     scene, faces = report["scene"], report["faces"]
     boards = {name: figures.board_residuals(*board) for name, board in _boards(report).items()}
     views = [
@@ -281,7 +282,7 @@ def _faces_in_detail(report: dict) -> list[Block]:
     ]
 
 
-def _scale(report: dict, boards: dict[str, str], words: Words) -> list[Block]:
+def _scale(report: dict, boards: dict[str, Drawing], words: Words) -> list[Block]:
     """Returns λ and the board's residuals of each group."""
     heads = [
         "<Group",
@@ -355,7 +356,7 @@ def _boards(report: dict) -> dict[str, tuple]:
 # --- residuals, pairs, left out ---------------------------------------------------------------------------------------
 
 
-def _residuals(report: dict, colours: dict[str, str], bars: str) -> list[Block]:
+def _residuals(report: dict, colours: dict[str, str], bars: Drawing) -> list[Block]:
     """Returns the residuals by image; and by label, face by face and board by board."""
     target: dict[str, list] = {}
     board: dict[str, list] = {}

@@ -205,8 +205,8 @@ def test_a_flat_direction_is_no_failure():
 
 @pytest.mark.full
 def test_three_thousand_poses_are_no_trouble():
-    """Ratio of processor time within one run, to one least-squares solution of that size: 40 to 60 measured
-    (`scripts/bench_robot.py`), which are 0.3 s; linear in the number of poses."""
+    """Ratio of processor time within one run, to one least-squares solution of that size: 40 to 60 measured, which are
+    0.3 s; linear in the number of poses."""
     _, data = simulated(9, 3000)
     matrix, right = np.random.default_rng(0).normal(size=(18000, 30)), np.ones(18000)
     plain, own = [], []

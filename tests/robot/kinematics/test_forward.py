@@ -153,7 +153,7 @@ def test_joint_values_of_another_shape_are_refused(q):
 
 @pytest.mark.slow
 def test_forward_kinematics_is_about_as_fast_as_products_of_matrices():
-    """Ratio of processor time within one run: 1.5 measured (`scripts/bench_robot.py`), 10⁶ take 0.5 s; 100 in a
+    """Ratio of processor time within one run: 1.5 measured, 10⁶ take 0.5 s; 100 in a
     loop of Python."""
     rng = np.random.default_rng(0)
     q, step = joint_vectors(mh80(), 100_000, rng), rng.normal(size=(100_000, 4, 4))

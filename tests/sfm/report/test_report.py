@@ -13,7 +13,7 @@ from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from stcal.report.document import environment
-from stcal.report.svg import round_below
+from stcal.report.svg import Drawing, round_below
 from stcal.report.text import number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
@@ -341,7 +341,7 @@ def test_same_report_same_page(joint):
 
 
 def test_odd_names_of_faces_and_groups_are_drawn():
-    """``$`` starts a formula for matplotlib, ``_`` hides a label, and no font has every script."""
+    """No font has every script."""
     report = make()
     report["faces"] = {"$x^{": report["faces"]["1"], "面": report["faces"]["2"]}
     report["groups"][0]["name"] = "_$\\frac"
@@ -469,7 +469,7 @@ def test_the_picture_stands_as_the_cameras_did():
 def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
     """Their numbers are coordinates; only the scene that turns stands as the cameras did."""
     drawn = []
-    monkeypatch.setattr(figures, "target_view", lambda circles, faces, azimuth: drawn.append(circles) or "data:,")
+    monkeypatch.setattr(figures, "target_view", lambda circles, faces, azimuth: drawn.append(circles) or Drawing(1, 1))
     report = make()
     report_html(report, {NASTY: JPEG})
     assert drawn
