@@ -20,10 +20,9 @@ FOLDERS = {
     ("design", "folder"),
     ("simulate", "folder"),
     ("demo", "out"),
-    ("watch", "out"),
     ("from_photos", "out"),
 }
-FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images")}
+FOLDERS |= {("export_model", "out"), ("capture", "out")}
 """New ones, which replace nothing, or those of `tests/sfm/runs/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())
