@@ -1,6 +1,5 @@
-"""Rows of ``bench_run.py`` beside a run: growing runs, advice, boards, hand-eye and a robot."""
+"""Rows of ``bench_run.py`` beside a run: advice, boards, hand-eye and a robot."""
 
-import shutil
 import sys
 import time
 from collections.abc import Callable
@@ -34,31 +33,6 @@ CAMERA = Camera(1280, 1024, [1500.0, 1500.0], [644.0, 507.0], np.zeros(8))
 VIEWS, TILT, ROLL = 19, 0.45, 0.6
 HEAD, ROWS = Rigid.exp([0.0, 0.4, 0.0, 0, 0, 400]), 1000
 TREE = "identify --model elastic, tree of 18 joints, 1000 rows, 6 folds"
-
-
-def timed_growing(data: Path, scratch: Path) -> float:
-    """Seconds of what ``watch`` and ``capture`` do after a photograph has come to those of a set, their libraries
-    loaded."""
-    from stcal.parallel import load_ahead
-    from stcal.workflows.growing import GrowingRun
-
-    images = scratch / "watched"
-    shutil.copytree(data / "images", images)
-    last = sorted(images.glob("*/*"))[-1]
-    kept = last.rename(scratch / last.name)
-    files = data / "target.toml", data / "board.toml"
-    growing = GrowingRun.of(images, data / "cameras.txt", scratch / "watched-run", *files)
-    count = len(list(images.glob("*/*")))
-    load_ahead()
-    growing.update(count, (), ())
-    kept.rename(last)
-    start = time.perf_counter()
-    update = growing.update(count + 1, {last.relative_to(images).as_posix()}, ())
-    seconds = time.perf_counter() - start
-    shutil.rmtree(images)
-    if update.reason:
-        sys.exit(f"error: {update.reason}")
-    return seconds
 
 
 def timed_advice() -> float:

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from bench_rows import ADVISED, GROUPS, TREE, timed_advice, timed_boards, timed_growing, timed_handeye, timed_tree
+from bench_rows import ADVISED, GROUPS, TREE, timed_advice, timed_boards, timed_handeye, timed_tree
 
 from stcal.design import reference_board
 from stcal.io.cameras.read import read_camera
@@ -278,7 +278,6 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     words = ["run", "--no-strict", data / "images", *files_of(data), "--out", scratch / "run"]
     rows["stcal-sfm run"] = {"seconds": timed_program(words, log)[0]}
     rows["run again, a photograph more"] = {"seconds": timed_second_run(data, scratch, log)}
-    rows["watch, capture: after a photograph"] = {"seconds": timed_growing(data, scratch)}
     seconds, found = timed_detection(data, scratch / "cache")
     rows["stcal detection"] = {"seconds": seconds} | boards(found, true)
     rows["joint adjustment alone"] = {"seconds": timed_calibration(scratch / "run")}

@@ -147,13 +147,6 @@ CALLS = (
         f"@rig {_DESIGNS} --rig --model OPENCV --model right=RADIAL --out +calibrated --workers 1 --report >page.html",
         30.0,
     ),
-    Call("sfm watch", f"{_SET} --out ~run --idle 0.4 --interval 0.2", 5.0),
-    Call(
-        "sfm capture",
-        f"+photographs --camera @data/cameras.txt {_DESIGNS} --group 12 --simulate @data/images/12 --every 0 --count 2 "
-        "--out +grown --workers 1",
-        5.0,
-    ),
     Call(
         "sfm measure",
         "@shots --camera @data/cameras.txt --faces @run/faces.json --target @data/target.toml --sequence "

@@ -20,10 +20,9 @@ FOLDERS = {
     ("design", "folder"),
     ("simulate", "folder"),
     ("demo", "out"),
-    ("watch", "out"),
     ("from_photos", "out"),
 }
-FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images")}
+FOLDERS |= {("export_model", "out"), ("capture", "out")}
 """New ones, which replace nothing, or those of `tests/sfm/runs/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())
@@ -106,7 +105,7 @@ def test_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch):
         COMMANDS["sfm measure"](
             **given, target=None, board=None, sigma_factor=None, json_file=None, report=None, joints=None,
             previous=False, sequence=False, scheduler=None, send_images=False, strict=False, serve=True,
-            min_diameter=None, max_diameter=450.0, host="127.0.0.1", port=0, max_megabytes=1.0, workers=1,
+            min_diameter=None, max_diameter=450.0, host="127.0.0.1", port=0, max_megabytes=1.0, workers=None,
         )  # fmt: skip
 
 

@@ -136,8 +136,6 @@ EXAMPLES = {
     "sfm faces": ("model --run result --out faces.json",),
     "sfm plan": ("--camera cameras.txt --target target.toml --board board.toml --images 6",),
     "sfm advise": ("result --count 3",),
-    "sfm watch": ("photos --camera cameras.txt --out result",),
-    "sfm capture": ("photos --camera cameras.txt --out result --group 12",),
     "sfm calibrate-camera": ("photos --board board.toml --out cameras.txt",),
     "sfm measure": ("photos --camera cameras.txt --faces result/faces.json --out poses.csv",),
     "sfm budget": ("result --report budget.html --pdf",),
@@ -174,7 +172,7 @@ GROUPS = {
         "Camera files": ("camera",),
     },
     "sfm": {
-        "Make and photograph a target": ("init", "design", "draw", "plan", "capture", "watch"),
+        "Make and photograph a target": ("init", "design", "draw", "plan"),
         "Calibrate it": ("detect", "run", "report", "budget", "advise", "calibrate-camera"),
         "Use it": ("measure", "export"),
         "COLMAP": ("crosscheck", "faces", "export-model", "export-database"),

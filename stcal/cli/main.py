@@ -29,7 +29,7 @@ MESSAGE_CHARACTERS = 600
 """Largest length of an error's line. Texts from files, which it may quote, can have any length."""
 LIBRARIES = {"pycolmap": "pycolmap", "OpenCV": "cv2", "NumPy": "numpy", "SciPy": "scipy"}
 """Module of each library, by name."""
-RESUMED = {"run", "detect", "watch"}
+RESUMED = {"run", "detect"}
 """Commands that keep finished detections when they are interrupted."""
 # The class is Click's, which newer versions of Typer contain.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")

@@ -423,7 +423,7 @@ def _protected(command: Callable) -> Callable:
     parameters = {name: declared(name, each.annotation) for name, each in signature.parameters.items()}
     words = {name: each.word for name, each in parameters.items()}
     outputs = {name for name, each in parameters.items() if each.writes}
-    reads_images = command.__name__ != "capture" and any(each.reads_images for each in parameters.values())
+    reads_images = any(each.reads_images for each in parameters.values())
 
     @wraps(command)
     def checked(

@@ -1,12 +1,11 @@
 """Image sources: cameras of this machine (V4L2, UVC), streams and videos through OpenCV; simulated cameras."""
 
 import os
-import re
 import threading
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from itertools import chain, repeat
+from itertools import chain
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -38,11 +37,8 @@ class Source(Protocol):
 
     name: str
 
-    def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
-        """Return a grey image (h, w), and the exposure at which it was taken.
-
-        ``exposure`` : in the driver's unit; None leaves it unchanged.
-        """
+    def expose(self, exposure: float, settle_s: float) -> tuple[np.ndarray, float]:
+        """Return a grey image (h, w), and the exposure at which it was taken, in the driver's unit."""
         ...
 
     def close(self) -> None:
@@ -59,8 +55,6 @@ class OpenCVSource:
         Its number, or a path such as ``/dev/video0``.
     gain : float, optional
         Gain in the driver's unit; unchanged if None.
-    by_hand : bool
-        Whether exposures are set; else the camera chooses them.
 
     Raises
     ------
@@ -68,7 +62,7 @@ class OpenCVSource:
         There is no such camera, or its driver accepts no gain.
     """
 
-    def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
+    def __init__(self, device: str, gain: float | None = None):
         self.name = f"camera {device}"
         place = int(device) if device.isdigit() else device
         self._capture = _device(place)
@@ -80,17 +74,16 @@ class OpenCVSource:
             )
         back_end = self._capture.getBackendName()
         manual = MANUAL_V4L2 if back_end == "V4L2" else MANUAL_OTHERS
-        if by_hand:
-            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, manual)
+        self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, manual)
         if gain is not None and not self._capture.set(cv2.CAP_PROP_GAIN, gain):
             self.close()
             raise InputError(
                 "E-DEVICE-SETTING", f"{self.name}: its driver ({back_end}) takes no gain; leave --gain out"
             )
 
-    def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
+    def expose(self, exposure: float, settle_s: float) -> tuple[np.ndarray, float]:
         """Return an image and its exposure, see :class:`Source`; frames during the settle time are dropped."""
-        if exposure is not None and not self._capture.set(cv2.CAP_PROP_EXPOSURE, exposure):
+        if not self._capture.set(cv2.CAP_PROP_EXPOSURE, exposure):
             raise InputError(
                 "E-DEVICE-SETTING",
                 f"{self.name}: its driver takes no exposure {exposure:g}; give exposures in its unit (V4L2: 100 µs), "
@@ -115,12 +108,12 @@ class OpenCVSource:
 
 
 class SimulatedSource:
-    """A simulated camera that shows given images. They belong to exposure 1; brightness is proportional to exposure.
+    """A simulated camera that shows an image. It belongs to exposure 1; brightness is proportional to exposure.
 
     Parameters
     ----------
-    images : str or Path
-        An image that is shown for ever, or a folder whose images are shown one after another, by name.
+    image : str or Path
+        The image.
     gain : float, optional
         Factor on the brightness; 1 if None.
     seed : int
@@ -129,33 +122,26 @@ class SimulatedSource:
     Raises
     ------
     InputError
-        There is no image, or one cannot be read.
+        The image cannot be read.
     """
 
-    def __init__(self, images: str | Path, gain: float | None = None, seed: int = 0):
-        place = Path(images)
-        self.name = f"simulated camera before {place.name}"
-        self._next = iter([file.path for file in find_images(place)[0]] if place.is_dir() else repeat(place))
+    def __init__(self, image: str | Path, gain: float | None = None, seed: int = 0):
+        self._image = Path(image)
+        self.name = f"simulated camera before {self._image.name}"
         self._gain = 1.0 if gain is None else gain
         self._rng = np.random.default_rng(seed)
 
-    def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
-        """Return the next image and its exposure, see :class:`Source`; there is no settle time."""
-        image = next(self._next, None)
-        if image is None:
-            raise InputError(
-                "E-DEVICE-NO-IMAGE", f"{self.name}: has shown all of its images; give more, or a lower --count"
-            )
+    def expose(self, exposure: float, settle_s: float) -> tuple[np.ndarray, float]:
+        """Return the image at an exposure, see :class:`Source`; there is no settle time."""
         try:
-            content = read_bytes(image, IMAGE_BYTES)
+            content = read_bytes(self._image, IMAGE_BYTES)
         except OSError as error:
             raise InputError(
-                "E-IMAGE-UNREADABLE", f"{image}: {error.strerror or error}; an image needed to simulate a camera"
+                "E-IMAGE-UNREADABLE", f"{self._image}: {error.strerror or error}; an image needed to simulate a camera"
             ) from error
-        exposure_set = 1.0 if exposure is None else exposure
-        grey = exposure_set * self._gain * grey_8bit(decode(content, str(image))).astype(float)
+        grey = exposure * self._gain * grey_8bit(decode(content, str(self._image))).astype(float)
         grey += self._rng.normal(0, SIMULATED_NOISE, grey.shape)
-        return np.clip(np.round(grey), 0, FULL_SCALE).astype(np.uint8), exposure_set
+        return np.clip(np.round(grey), 0, FULL_SCALE).astype(np.uint8), exposure
 
     def close(self) -> None:
         """Do nothing: a simulated camera holds no device."""
@@ -164,18 +150,6 @@ class SimulatedSource:
 def png(image: np.ndarray) -> bytes:
     """Return the bytes of a PNG file of a grey image."""
     return cv2.imencode(".png", image)[1].tobytes()
-
-
-def checked_name(name: str, what: str) -> str:
-    """Return ``name`` if it is a valid name of a folder.
-
-    Raises InputError: the name is not valid.
-    """
-    if not re.fullmatch(r"[\w][\w .-]{0,99}", name):
-        raise InputError(
-            "E-DEVICE-NAME", f"{what} {name!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"
-        )
-    return name
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Exposure series: schedules of times, capture, and selection of the usable images."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import stcal
 from stcal.boards.tags import Tags, find_tags
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
-from stcal.io.device import DARK, SATURATED, Source, checked_name, png
+from stcal.io.device import DARK, SATURATED, Source, png
 from stcal.io.files import json_text, real_place, save
 from stcal.io.images import SUFFIXES, TOP_GROUP, USUAL, ImageFile, decode, find_images, grey_8bit, image_file
 from stcal.io.json import Part, ResultFile, require_result_written
@@ -198,7 +199,11 @@ def scene_folder(out: Path, scene: str) -> Path:
 
     Raises InputError: the name is invalid, or the scene exists.
     """
-    folder = out / checked_name(scene, "scene")
+    if not re.fullmatch(r"[\w][\w .-]{0,99}", scene):
+        raise InputError(
+            "E-DEVICE-NAME", f"scene {scene!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"
+        )
+    folder = out / scene
     if folder.exists():
         raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
     return folder

@@ -238,15 +238,13 @@ class Section:
 class Document:
     """A report: its title, a line on what it is about, and its sections, the answer first.
 
-    ``banner`` : blocks between title and contents; ``reload_s`` : time after which an open page loads itself again;
-    ``window`` : title of the browser's window if it is another one
+    ``banner`` : blocks between title and contents; ``window`` : title of the browser's window if it is another one
     """
 
     title: str
     about: str
     sections: Sequence[Section]
     banner: Sequence[Block] = ()
-    reload_s: float | None = None
     window: str = ""
 
     def page(self) -> str:
@@ -262,7 +260,6 @@ class Document:
                     about=self.about,
                     banner=html(*self.banner),
                     sections=[section for section in sections if section[2].strip()],
-                    reload_s=self.reload_s,
                     window=self.window or self.title,
                 )
             )

@@ -97,7 +97,6 @@ def run(
     board: str | Path | BoardDesign | None = None,
     options: RunOptions | None = None,
     progress: Progress | None = None,
-    reload_s: int | None = None,
     checks: Sequence[OwnCheck] = (),
     every: str | int | None = None,
 ) -> RunResult:
@@ -120,8 +119,6 @@ def run(
         Options of the run; the defaults if None.
     progress
         Called with (stage, done, total).
-    reload_s
-        Seconds after which the page of the report reloads itself, for a run that is repeated; never if None.
     checks
         Additional checks: functions of the result that return a :class:`stcal.sfm.Check`, such as
         :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others.
@@ -144,7 +141,7 @@ def run(
         options = replace(options, refine_camera=True)
     if out is None:
         with tempfile.TemporaryDirectory(prefix="stcal-run-") as scratch:
-            result = run(images, camera, scratch, target, board, options, progress, reload_s, checks, every)
+            result = run(images, camera, scratch, target, board, options, progress, checks, every)
             return replace(result, out=None)
     if isinstance(images, str | Path) and Path(images).is_file():
         images = frames_in_run(images, out, every or AUTO)
@@ -155,7 +152,7 @@ def run(
             files, place = files_of_arrays(images, options.exclude), IN_MEMORY
         else:
             files, place = chosen_images(images, options.exclude), images
-    return run_on_files(files, place, camera, out, target, board, options, progress, reload_s, checks)
+    return run_on_files(files, place, camera, out, target, board, options, progress, checks)
 
 
 def frames_in_run(video: str | Path, out: str | Path, every: str | int) -> Path:
@@ -182,7 +179,6 @@ def run_on_files(
     board: str | Path | BoardDesign | None,
     options: RunOptions,
     progress: Progress | None = None,
-    reload_s: int | None = None,
     checks: Sequence[OwnCheck] = (),
 ) -> RunResult:
     """Calibrates a target from some of the photographs in the folder ``images``; see :func:`run`."""
@@ -222,7 +218,7 @@ def run_on_files(
         result = replace(result, checks=run_checks(evidence, progress))
         result = replace(result, calibration=_on_surface(result))
         result = replace(result, checks=(*result.checks, *own_checks(result, checks)))
-        return replace(result, judgement=write_run(result, folder.stage, progress, reload_s))
+        return replace(result, judgement=write_run(result, folder.stage, progress))
 
 
 def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:

@@ -2,10 +2,6 @@ from .board_views import calibration_images as calibration_images
 from .calibrate_camera import calibrate_camera_by_corners as calibrate_camera_by_corners
 from .calibrate_camera import calibrate_rig as calibrate_rig
 from .from_photos import robot_from_photos as robot_from_photos
-from .growing import GrowingRun as GrowingRun
-from .growing import WatchOptions as WatchOptions
-from .growing import capture as capture
-from .growing import watch as watch
 from .handeye.calibrate import calibrate_handeye as calibrate_handeye
 from .handeye.calibrate import plan_handeye as plan_handeye
 from .handeye.inputs import read_handeye as read_handeye

@@ -20,7 +20,7 @@ OF_A_RUN = {
 """Files of a run that later commands of the same program read; COLMAP's are read again by the stage that writes them,
 and the faces are in ``faces.json``."""
 OPTIONS_OF_FIGURES = ("--json", "--report", "--plot")
-ELSEWHERE = {"sfm demo", "sfm draw", "sfm export-model", "sfm export-database", "sfm capture"}
+ELSEWHERE = {"sfm demo", "sfm draw", "sfm export-model", "sfm export-database"}
 """Commands that call others, that draw, and that write COLMAP's models and databases, which are compared by their own
 code (E-EXPORT-READ-BACK, E-OUTPUT-READ-BACK)."""
 NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:e[-+]?\d+)?(?![\w.])")

@@ -23,7 +23,7 @@ MORE = (
 )
 """Commands whose call elsewhere has no camera file."""
 OF_CAMERAS = {each.command: each for each in (*CALLS, *MORE) if "--camera @" in each.words}
-WRITE_PHOTOGRAPHS = {"sfm simulate", "sfm design", "sfm plan", "sfm capture"}
+WRITE_PHOTOGRAPHS = {"sfm simulate", "sfm design", "sfm plan"}
 """``images`` is a number there, or a folder that is written."""
 SOURCES = {"handeye", "handeye plan"}
 """``source`` may be a folder of images there."""

@@ -1,14 +1,15 @@
 """Command ``stcal-sfm measure``: poses of the calibrated target in images."""
 
 import json
-import os
 import re
 import sys
+import threading
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,9 +17,6 @@ from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, verbose, write, write_if, write_out
 from stcal.errors import InputError
-
-if TYPE_CHECKING:
-    from stcal.sfm.measurement.serve import MeasureServer, Setting
 
 app = typer.Typer()
 SAY_EVERY_S = 1.0
@@ -70,7 +68,7 @@ def measure(
     scheduler: shared.Scheduler = None,
     send_images: shared.SendImages = False,
     serve: Annotated[
-        bool, "Answer images that are sent over HTTP, POST /measure, with JSON for each, until Ctrl-C."
+        bool, "Answer images that are sent over HTTP, POST /pose, with JSON for each, until Ctrl-C."
     ] = False,
     live: Annotated[
         bool,
@@ -81,12 +79,15 @@ def measure(
         int, "Take the pictures of --live from the camera with this number.", Opt(min=0, max=99)
     ] = 0,
     host: Annotated[
-        str, "Listen at this address with --serve or --live; with 0.0.0.0, other machines can connect."
+        str,
+        "Listen at this address with --serve or --live; with 0.0.0.0, other machines can connect that know --token.",
     ] = "127.0.0.1",
     port: Annotated[
         int, "Listen at this port with --serve or --live; 0 chooses a free one.", Opt(min=0, max=65535)
     ] = 8765,
-    max_megabytes: Annotated[float, "Accept image files up to this size with --serve.", Opt(min=0.01, max=2000)] = 64.0,
+    max_megabytes: Annotated[
+        float, "Accept image files up to this size with --serve or --live.", Opt(min=0.01, max=2000)
+    ] = 64.0,
     token: Annotated[
         str,
         "Answer with --serve or --live only requests with `Authorization: Bearer` and this word; in a browser, add "
@@ -109,6 +110,7 @@ def measure(
             "--scheduler": scheduler,
             "--send-images": send_images,
             "--strict": strict,
+            "--workers": workers,
         }
         if conflicting := [name for name, value in alone.items() if value]:
             source = "from a camera, as it takes them" if live else "over HTTP, one answer each"
@@ -117,28 +119,22 @@ def measure(
                 f"{mode} and {conflicting[0]}: images come {source}; leave {conflicting[0]} out"
                 + (", or give --json -, a line each" if live and conflicting[0] in ("--json", "--out") else ""),
             )
-        setting = _setting(camera, faces, target, board, sigma_factor, ellipses)
-        listen = host, port, max_megabytes, token
-        if live:
-            _live(setting, camera_index if images is None else _source(images), listen, json_file is not None)
-        else:
-            _serve(setting, listen, workers)
-        return
-    if images is None:
+    elif images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
-    from stcal.io.images import SUFFIXES
+    else:
+        from stcal.io.images import SUFFIXES
 
-    if images.is_file() and images.suffix.lower() not in SUFFIXES:
-        raise InputError(
-            "E-IMAGES-FOLDER",
-            f"{images}: a file, and no image; for the pose in each picture of a video give --live --json -, or give "
-            "the folder of its frames",
-        )
-    if columns is not None and joints is None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of joint values; give it with --joints"
-        )
-    shared.load_ahead(workers)
+        if images.is_file() and images.suffix.lower() not in SUFFIXES:
+            raise InputError(
+                "E-IMAGES-FOLDER",
+                f"{images}: a file, and no image; for the pose in each picture of a video give --live --json -, or "
+                "give the folder of its frames",
+            )
+        if columns is not None and joints is None:
+            raise InputError(
+                "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of joint values; give it with --joints"
+            )
+        shared.load_ahead(workers)
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
@@ -153,6 +149,14 @@ def measure(
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     design = body_of(target)
     circles = read_target(faces, design)
+    if serve or live:
+        source = None if serve else camera_index if images is None else _source(images)
+        model = read_camera(camera)
+        model = replace(model, source=Path(model.source).name)  # answers name no folder of this machine
+        others = load_board(board) if board else None, PoseOptions(sigma_factor=sigma_factor), ellipses
+        limits = {"token": token, "max_megabytes": max_megabytes}
+        _serve((replace(circles, design=design), model, *others), source, host, port, limits, json_file is not None)
+        return
     table = table_of(joints, columns, "joints") if joints else None
     options = work.MeasureOptions(PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, workers)
     told = shared.designs_told(target, board, with_board=False)
@@ -183,85 +187,39 @@ def _design_beside(faces: Path) -> Path | None:
     return own
 
 
-def _setting(camera, faces, target, board, sigma_factor, ellipses) -> "Setting":
-    from stcal.boards.target import body_of
-    from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board
-    from stcal.io.images import stated_mosaic
-    from stcal.sfm.measurement.pose import PoseOptions
-    from stcal.sfm.measurement.service import Setting
-    from stcal.sfm.measurement.target import read_target
+def _serve(setting: tuple, source: int | str | None, host: str, port: int, limits: dict, as_json: bool) -> None:
+    """Answers images until Ctrl-C, or shows the pictures of a source as long as there are any."""
+    from stcal.io.device import pictures_of
+    from stcal.sfm.measurement.live import LiveService, line_of, served
+    from stcal.sfm.measurement.tracker import Tracker
 
-    return Setting(
-        replace(read_target(faces, design := body_of(target)), design=design),
-        read_camera(camera),
-        load_board(board) if board else None,
-        PoseOptions(sigma_factor=sigma_factor),
-        ellipses,
-        stated_mosaic(),
-    )
-
-
-def _say_place(server: "MeasureServer", what: str) -> None:
-    """Prints where the server is reached, with a warning if not from this machine alone."""
-    if not server.local:
-        token = server.options.token
-        who = "that knows the token" if token else f"that reaches {server.options.host}"
-        remedy = "" if token else "; give a --token"
-        print_each(
-            "warning", [f"every machine {who} can send images and see what is shown; nothing is encrypted{remedy}"]
-        )
-    say(what)
-    sys.stdout.flush()
-
-
-def _serve(setting: "Setting", listen, workers) -> None:
-    from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, counts_text, serve
-
-    options = ServeOptions(*listen)
-    workers = workers or os.cpu_count() or 1
-    servers: list[MeasureServer] = []
-
-    def ready(server: MeasureServer) -> None:
-        servers.append(server)
-        limit = f"{workers} processes, files up to {options.max_megabytes:g} MB"
-        _say_place(server, f"answering POST {server.url}/measure, {limit}")
-
-    try:
-        serve(MeasureService(setting, workers), options, ready)
-    finally:
-        for server in servers:
-            say(counts_text(server.counts))
+    service = LiveService(Tracker(*setting), source is not None, **limits)
+    shown = nullcontext(iter(())) if source is None else pictures_of(source)
+    with shown as frames, served(service, host, port) as url:
+        if not url.startswith(("http://127.", "http://[::1]")):
+            who = "every machine that knows the token"
+            print_each("warning", [f"{who} can send images and see what is shown; nothing is encrypted"])
+        if source is None:
+            say(f"answering POST {url}/pose, files up to {limits['max_megabytes']:g} MB")
+        else:
+            say(f"showing {url}/ until {'it ends' if isinstance(source, str) else 'Ctrl-C'}")
+        sys.stdout.flush()
+        if source is None:
+            threading.Event().wait()
+        first = next(frames)
+        target, camera, *others = setting
+        tracker = Tracker(target, camera.of_video(*first.shape[::-1]), *others)
+        said_s = -SAY_EVERY_S
+        for picture in service.follow(chain([first], frames), tracker):
+            if as_json:
+                write_out(f"{json.dumps(picture, ensure_ascii=False, allow_nan=False)}\n")
+            if time.monotonic() - said_s >= SAY_EVERY_S:
+                said_s = time.monotonic()
+                say(line_of(picture))
+                sys.stdout.flush()
+        say(f"ended after {picture['picture']} pictures")
 
 
 def _source(path: Path) -> str:
     """Returns the stream's URL or the file that was given; a path has one slash where a URL has two."""
     return re.sub(r"^([a-z]+):/(?!/)", r"\1://", str(path))
-
-
-def _live(setting: "Setting", source: int | str, listen, as_json: bool) -> None:
-    from stcal.io.device import pictures_of
-    from stcal.sfm.measurement.live import LivePicture, LiveView, follow, line_of
-    from stcal.sfm.measurement.serve import MeasureService, ServeOptions, show_live
-    from stcal.sfm.measurement.tracker import Tracker
-
-    said_s = -SAY_EVERY_S
-
-    def tell(picture: LivePicture) -> None:
-        nonlocal said_s
-        if as_json:
-            write_out(f"{json.dumps(picture.content, ensure_ascii=False, allow_nan=False)}\n")
-        if time.monotonic() - said_s >= SAY_EVERY_S:
-            said_s = time.monotonic()
-            say(line_of(picture))
-            sys.stdout.flush()
-
-    view = LiveView()
-    with pictures_of(source) as frames, show_live(MeasureService(setting, 1), ServeOptions(*listen), view) as server:
-        end = "it ends" if isinstance(source, str) else "Ctrl-C"
-        _say_place(server, f"showing {server.url}/ until {end}")
-        first = next(frames)
-        camera = setting.camera.of_video(*first.shape[::-1])
-        tracker = Tracker(setting.target, camera, setting.board, setting.pose, setting.ellipses)
-        frames = chain([first], frames)
-        say(f"ended after {follow(frames, tracker, view, tell)} pictures")

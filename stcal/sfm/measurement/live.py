@@ -1,15 +1,25 @@
-"""Live view of ``measure --live``: the pose in each picture of a camera, drawn into it, for a browser."""
+"""Live view and HTTP service of ``measure``: poses in a camera's pictures, on a page, and in images that are sent."""
 
+import asyncio
 import json
+import re
+import socket
+import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from base64 import b64encode
+from collections import deque
+from collections.abc import AsyncIterator, Iterable, Iterator
+from contextlib import contextmanager
+from copy import copy
+from hmac import compare_digest
+from ipaddress import ip_address
 
 import cv2
 import numpy as np
 
-from stcal.errors import InputError, StcalError
-from stcal.io.images import Skipped
+from stcal.errors import ConvergenceError, InputError
+from stcal.io.images import Skipped, decode, stated_size
+from stcal.parallel import one_thread
 from stcal.report.document import environment
 from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
@@ -17,110 +27,174 @@ from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.measurement.report import poses_file
 from stcal.sfm.measurement.tracker import Tracker
 
+try:
+    import uvicorn
+    from starlette.applications import Starlette
+    from starlette.exceptions import HTTPException
+    from starlette.requests import Request
+    from starlette.responses import HTMLResponse, JSONResponse, StreamingResponse
+    from starlette.routing import Route
+except ImportError as error:
+    needed = "--live, --serve: need Starlette and uvicorn; install stereo-target-calibration[live]"
+    raise InputError("E-EXTRA-MISSING", needed) from error
+
 WIDEST_PX = 1280
 """Largest width of the picture that is sent."""
 JPEG_QUALITY = 80
 RATE_OVER = 20
 """Number of pictures over which the rate is taken."""
-LOST = "no pose"
+LOOK_S = 0.01
+"""Interval at which a page's connection looks for a newer picture, s."""
+CONNECTIONS = 32
+"""Number of connections at a time; each may hold an image of the largest size."""
+END_S = 2
+"""Time in which pages receive the last picture at the end, s."""
+OWN_HOST = re.compile(r"(localhost|127\.[\d.]+|\[::1\])(:\d+)?")
+"""Host of a request to this machine. Without a token, any other name could be one that a page of another origin has
+pointed to this machine (DNS rebinding)."""
 
 
-@dataclass(frozen=True, slots=True)
-class LivePicture:
-    """One measured picture.
+class LiveService:
+    """App that answers images with poses; if ``live``, also a page with the pictures that :meth:`follow` measures.
 
-    ``number`` : counts from 1; ``jpeg`` : the picture with what was measured; ``content`` : what ``/live.json``
-    answers.
+    ``tracker`` : target and camera; ``token`` : word that each request must carry, as ``Authorization: Bearer`` or as
+    ``?token=``, none if empty; ``max_megabytes`` : largest size of an image that is sent.
     """
 
-    number: int
-    jpeg: bytes
-    content: dict
-
-
-class LiveView:
-    """Newest measured picture, which one thread puts and others take.
-
-    Attributes
-    ----------
-    newest : LivePicture or None
-        None before the first picture.
-    ended : bool
-        Whether no further picture comes.
-    """
-
-    def __init__(self):
-        self.newest: LivePicture | None = None
+    def __init__(self, tracker: Tracker, live: bool = False, token: str = "", max_megabytes: float = 64.0):
+        self.tracker, self.token, self.max_megabytes = tracker, token, max_megabytes
+        self.newest: dict | None = None
         self.ended = False
+        self._measuring = threading.Lock()  # decoders and limits of threads are shared
+        shown = [Route("/", self._page), Route("/events", self._events)] if live else []
+        self.app = Starlette(
+            routes=[Route("/pose", self._pose, methods=["POST"]), *shown], exception_handlers={HTTPException: _refused}
+        )
 
-    @staticmethod
-    def page() -> str:
-        """Returns the page that shows pictures and poses as they come."""
-        return environment().get_template("report/templates/live.html.jinja").render()
+    def follow(self, frames: Iterable[np.ndarray], tracker: Tracker) -> Iterator[dict]:
+        """Measures grey pictures (height, width), uint8, puts each on the page, and yields its content.
 
-    def json(self) -> str:
-        """Returns number, status, pose and rate of the newest picture."""
-        content = self.newest.content if self.newest else {"picture": 0, "status": "waiting", "shown": []}
-        return json.dumps(content | {"ended": self.ended}, ensure_ascii=False, allow_nan=False)
+        Raises InputError: a picture is of another size than the camera's.
+        """
+        times: deque[float] = deque(maxlen=RATE_OVER)
+        for number, frame in enumerate(frames, 1):
+            began = time.monotonic()
+            with self._measuring, one_thread():
+                centres, measured, poses = observed(tracker, frame, f"picture {number}")
+            times.append(time.monotonic())
+            pose = None if isinstance(measured, Skipped) else measured.pose
+            content = {
+                "picture": number,
+                "status": pose.status if pose else "no pose",
+                "reason": measured.reason if isinstance(measured, Skipped) else "",
+                "rate": (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0,
+                "measured_in_s": times[-1] - began,
+                "shown": rows_of(pose) if pose else [],
+                "poses": poses,
+            }
+            picture = drawn(frame, centres, pose, tracker)
+            jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+            self.newest = content | {"jpeg": b64encode(jpeg).decode()}
+            yield content
+        self.ended = True
 
+    def answer(self, data: bytes, name: str) -> tuple[int, dict]:
+        """Returns status code and JSON for one image: the poses file of ``measure``, or the error.
 
-def follow(
-    frames: Iterable[np.ndarray], tracker: Tracker, view: LiveView, tell: Callable[[LivePicture], None] | None = None
-) -> int:
-    """Measures the pictures of a camera until it ends, and puts each into a view.
-
-    Parameters
-    ----------
-    frames : iterable of (height, width) arrays, uint8
-        Grey pictures, as from :func:`stcal.io.device.pictures_of`.
-    tracker : Tracker
-        Target and camera.
-    view : LiveView
-        Receives the pictures.
-    tell : callable, optional
-        Called with each picture.
-
-    Returns
-    -------
-    int
-        Number of pictures.
-
-    Raises
-    ------
-    InputError
-        If a picture is of another size than the camera's.
-    """
-    times: list[float] = []
-    number = 0
-    for number, frame in enumerate(frames, 1):
-        name = f"picture {number}"
-        began = time.monotonic()
-        labelled, pose = None, None
+        200 with a pose; 422 without, and the reason in ``left_out``; 400 if the data are no image of this camera.
+        """
         try:
-            labelled, pose = tracker.observe(frame, name)
-            measured = outcome(name, pose, labelled.notes)
-        except InputError:
-            raise
-        except StcalError as error:
-            measured = Skipped(name, str(error).removeprefix(f"{name}: "), "pose")
-        times = [*times[-RATE_OVER:], time.monotonic()]
-        fit = pose if isinstance(pose, TargetPose) else None
-        centres = labelled.observations.centre_px if labelled else np.zeros((0, 2))
-        result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
-        content = {
-            "picture": number,
-            "status": fit.status if fit else LOST,
-            "reason": measured.reason if isinstance(measured, Skipped) else "",
-            "rate": (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0,
-            "measured_in_s": times[-1] - began,
-            "shown": rows_of(fit) if fit else [],
-            "poses": poses_file(result).content(),
-        }
-        view.newest = LivePicture(number, _jpeg(drawn(frame, centres, fit, tracker)), content)
-        if tell:
-            tell(view.newest)
-    view.ended = True
-    return number
+            stated_size(data, name)  # refuses a small file of a huge image
+            with self._measuring, one_thread():
+                _, measured, poses = observed(copy(self.tracker), decode(data, name), name)
+        except InputError as error:
+            return 400, {"error": str(error), "code": error.code}
+        return 422 if isinstance(measured, Skipped) else 200, poses
+
+    async def _pose(self, request: Request) -> JSONResponse:
+        self._require_allowed(request)
+        data = bytearray()
+        async for part in request.stream():
+            data += part
+            if len(data) > 1e6 * self.max_megabytes:
+                raise HTTPException(413, f"more than {self.max_megabytes:g} MB, see --max-megabytes")
+        code, content = await asyncio.to_thread(self.answer, bytes(data), request.query_params.get("name", "image"))
+        return JSONResponse(content, code)
+
+    async def _page(self, request: Request) -> HTMLResponse:
+        self._require_allowed(request)
+        page = environment().get_template("report/templates/live.html.jinja").render()
+        return HTMLResponse(page, headers={"Content-Security-Policy": "frame-ancestors 'none'"})
+
+    async def _events(self, request: Request) -> StreamingResponse:
+        """Sends picture and pose in one message, the newest that there is, until no further one comes."""
+        self._require_allowed(request)
+
+        async def messages() -> AsyncIterator[str]:
+            sent = 0
+            while True:
+                ended, newest = self.ended, self.newest
+                if newest and newest["picture"] != sent:
+                    sent = newest["picture"]
+                    yield f"data: {json.dumps(newest, allow_nan=False)}\n\n"
+                elif ended:
+                    yield "event: ended\ndata: {}\n\n"
+                    return
+                await asyncio.sleep(LOOK_S)
+
+        return StreamingResponse(messages(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+    def _require_allowed(self, request: Request) -> None:
+        """Refuses pages of other origins, which would read the live picture, and requests without the token."""
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        own = self.token or OWN_HOST.fullmatch(host)
+        if not own or origin not in (None, f"http://{host}"):
+            raise HTTPException(403, f"Host {host}, Origin {origin}: not that of this service")
+        given = request.headers.get("authorization", f"Bearer {request.query_params.get('token', '')}")
+        if self.token and not compare_digest(given.encode(), f"Bearer {self.token}".encode()):
+            raise HTTPException(401, "Authorization: Bearer, or ?token=, with the token of the service needed")
+
+
+def _refused(_, error) -> JSONResponse:
+    return JSONResponse({"error": error.detail, "code": "E-SERVICE-REQUEST"}, error.status_code)
+
+
+@contextmanager
+def served(service: LiveService, host: str = "127.0.0.1", port: int = 8765) -> Iterator[str]:
+    """Answers requests to the port, any free one if 0, within the context, in a thread; returns the URL.
+
+    Raises InputError: it cannot listen on the address, or other machines reach it and there is no token.
+    """
+    try:
+        listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except OSError as error:
+        reason = f"--host {host} --port {port}: cannot be opened: {error.strerror or error}; give another"
+        raise InputError("E-SERVICE-ADDRESS", reason) from error
+    with listening:
+        address, port = listening.getsockname()[:2]
+        if not (ip_address(address.partition("%")[0]).is_loopback or service.token):
+            raise InputError("E-OPTION-NEEDS", f"--host {host}: other machines reach it; give a --token")
+        limits = {"limit_concurrency": CONNECTIONS, "timeout_graceful_shutdown": END_S}
+        config = uvicorn.Config(service.app, lifespan="off", ws="none", log_config=None, log_level="error", **limits)
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, args=([listening],), daemon=True)  # signals come to this one
+        thread.start()
+        try:
+            yield f"http://{f'[{address}]' if ':' in address else address}:{port}"
+        finally:
+            service.ended = server.should_exit = True
+            thread.join()
+
+
+def observed(tracker: Tracker, image: np.ndarray, name: str):
+    """Returns the centres (n, 2) in an image, px, the measured image or why it has no pose, and its poses file."""
+    try:
+        labelled, pose = tracker.observe(image, name)
+        centres, measured = labelled.observations.centre_px, outcome(name, pose, labelled.notes)
+    except ConvergenceError as error:
+        centres, measured = np.zeros((0, 2)), Skipped(name, str(error), "distortion")
+    result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
+    return centres, measured, poses_file(result).content()
 
 
 def rows_of(pose: TargetPose) -> list[list[str]]:
@@ -139,62 +213,47 @@ def rows_of(pose: TargetPose) -> list[list[str]]:
     return [*rows, ["residuals", f"{pose.rms_px():.3f} px RMS"]]
 
 
-def line_of(picture: LivePicture) -> str:
+def line_of(content: dict) -> str:
     """Returns one line for the terminal: number, status, pose and rate of a picture."""
-    content = picture.content
     what = "  ".join(f"{name} {value}" for name, value in content["shown"] if name != "circles") or content["reason"]
-    return f"picture {picture.number}: {content['status']}: {what}  ({content['rate']:.1f} a second)"
+    return f"picture {content['picture']}: {content['status']}: {what}  ({content['rate']:.1f} a second)"
 
 
 def drawn(frame: np.ndarray, centres_px: np.ndarray, pose: TargetPose | None, tracker: Tracker) -> np.ndarray:
-    """Returns a picture, at most ``WIDEST_PX`` wide, in colour, with centres, faces and the target's axes.
-
-    Parameters
-    ----------
-    frame : (height, width) array, uint8
-        The picture as the camera took it.
-    centres_px : (n, 2) array
-        Measured centres.
-    pose : TargetPose or None
-        Pose of the target, if there is one.
-    tracker : Tracker
-        Target and camera.
-    """
+    """Returns a grey picture in colour with centres (n, 2), px, faces, and axes of the target, ≤ ``WIDEST_PX`` wide."""
     scale = min(1.0, WIDEST_PX / frame.shape[1])
     small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else frame
     picture = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
     unit = max(picture.shape[1] / 640, 1.0)
 
-    def place(xy: np.ndarray) -> tuple[int, int]:
-        x, y = (xy + 0.5) * scale - 0.5
-        return round(float(x)), round(float(y))
+    def places(xy_px: np.ndarray) -> np.ndarray:
+        return np.rint((xy_px + 0.5) * scale - 0.5).astype(np.int32)
 
-    camera = tracker.camera
-    if pose is not None and camera is not None:
-        target = tracker.target
-        for k, face in enumerate(pose.faces):
-            of_face = np.array([label in target.place and label.face == face for label in target.labels])
-            xy = camera.project(pose.camera_from_target @ target.xyz[of_face])
-            hull = cv2.convexHull(np.array([place(p) for p in xy], np.int32))
-            cv2.polylines(picture, [hull], True, _bgr(COLOURS[k % len(COLOURS)]), round(1.5 * unit), cv2.LINE_AA)
-            words = ("face " + face, tuple(int(v) for v in hull[:, 0].min(0)), cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit)
-            cv2.putText(picture, *words, (0, 0, 0), round(3 * unit), cv2.LINE_AA)
-            cv2.putText(picture, *words, _bgr(COLOURS[k % len(COLOURS)]), round(unit), cv2.LINE_AA)
+    if pose is not None and tracker.camera is not None:
+        target, project = tracker.target, tracker.camera.project
+        names = []
+        for face in pose.faces:
+            of_face = np.array([label.face == face for label in target.labels])
+            hull = cv2.convexHull(places(project(pose.camera_from_target @ target.xyz[of_face])))
+            colour = _bgr(COLOURS[[*target.target_from_plane].index(face) % len(COLOURS)])
+            cv2.polylines(picture, [hull], True, colour, round(1.5 * unit), cv2.LINE_AA)
+            corner = hull[:, 0].min(0) - round(6 * unit)
+            names.append((f"face {face}", np.maximum(corner, [0, round(14 * unit)]), colour))
         length = 0.4 * float(np.linalg.norm(np.ptp(target.xyz, axis=0)))
         ends = pose.camera_from_target @ np.vstack([np.zeros(3), length * np.eye(3)])
         if (ends[:, 2] > 0).all():
-            origin, *tips = (place(xy) for xy in camera.project(ends))
+            origin, *tips = places(project(ends)).tolist()
             for tip, colour in zip(tips, AXIS_COLOURS, strict=False):
                 cv2.arrowedLine(picture, origin, tip, _bgr(colour), round(2 * unit), cv2.LINE_AA, tipLength=0.12)
-    for xy in centres_px:
-        cv2.drawMarker(picture, place(xy), (0, 255, 0), cv2.MARKER_CROSS, round(7 * unit), round(unit), cv2.LINE_AA)
+        font, height = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * unit
+        for words, corner, colour in names:  # over all else, each above its face
+            for ink, width in (((0, 0, 0), 4), (colour, 1.5)):
+                cv2.putText(picture, words, corner, font, height, ink, round(width * unit), cv2.LINE_AA)
+    for place in places(centres_px).tolist():
+        cv2.drawMarker(picture, place, (0, 255, 0), cv2.MARKER_CROSS, round(7 * unit), round(unit), cv2.LINE_AA)
     return picture
 
 
-def _bgr(colour: str) -> tuple[int, int, int]:
+def _bgr(colour: str) -> tuple[int, ...]:
     """Returns blue, green and red of a colour like ``#0b5394``."""
-    return int(colour[5:7], 16), int(colour[3:5], 16), int(colour[1:3], 16)
-
-
-def _jpeg(picture: np.ndarray) -> bytes:
-    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return tuple(bytes.fromhex(colour[1:]))[::-1]

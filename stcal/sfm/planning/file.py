@@ -349,17 +349,6 @@ def advice_text(advice: Advice) -> str:
     return "\n".join([*lines, "", _verdict(advice)])
 
 
-def next_text(advice: Advice) -> str:
-    """Returns the first view of :func:`advice_text` in one line."""
-    if not advice.choices:
-        return "no other view within ±50° shows the whole board and a face"
-    choice = advice.choices[0]
-    return (
-        f"group {choice.view.group}, from {choice.view.middle} {where(choice.view)}, {choice.view.distance_mm:.0f} mm: "
-        f"worst face {MICRO * advice.now.worst()[1]:.2f} → {MICRO * choice.sigma_mm:.2f} µm"
-    )
-
-
 def where(view: PlannedView) -> str:
     """Returns the direction from the named photograph to the view, as seen in that photograph: ``25° right, 12°
     up``."""

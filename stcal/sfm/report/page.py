@@ -55,7 +55,6 @@ def report_html(
     report: dict,
     overlays: dict[str, bytes],
     residuals: Mapping[str, Residuals] | None = None,
-    reload_s: int | None = None,
     gone: int = 0,
 ) -> str:
     """Returns the page.
@@ -65,7 +64,6 @@ def report_html(
     report : result of :func:`stcal.sfm.runs.output.report_of`
     overlays : JPEG by image name
     residuals : centres and their residuals by image name, px; none are drawn if None
-    reload_s : seconds after which the page reloads itself; never if None
     gone : number of overlays that are no longer in the run's folder
     """
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
@@ -102,9 +100,7 @@ def report_html(
         f"{summary['faces']} faces"
     )
     banner = [_warning(report), macro("answers", judgement.answers()[:1], tone_of(judgement.verdict))]
-    return Document(
-        report["target"], counts, sections, banner, reload_s, f"{report['target']}: calibration report"
-    ).page()
+    return Document(report["target"], counts, sections, banner, f"{report['target']}: calibration report").page()
 
 
 def _with_named_groups(report: dict) -> dict:

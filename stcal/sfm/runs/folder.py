@@ -118,10 +118,10 @@ def _overlay_in(run: Path, name: str) -> Path:
     return earlier if earlier.is_file() else path
 
 
-def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> Judgement:
+def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     """Writes database, models, faces and report into a folder that holds the overlays; returns the judgement.
 
-    The database has corrected centres. The page of the report reloads itself every ``reload_s`` seconds.
+    The database has corrected centres.
     """
     observations = result.observations()
     ids = image_ids(observations)
@@ -146,14 +146,14 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
         faces = FacesFile.of(result.target, result.target_design, options, factor, result.calibration.rim_mm)
         save(out / "faces.json", json_text(faces.content()))
         require_faces_written(out / "faces.json", result.target)
-    write_report(out, report, out, reload_s)
+    write_report(out, report, out)
     progress("report", 1, 1)
     return Judgement.model_validate(report["judgement"])
 
 
-def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None) -> None:
+def write_report(out: Path, report: dict, run: Path) -> None:
     """Writes ``report.json`` and ``report.html`` into a folder; ``run`` : folder of the overlays."""
-    page = _report_page(run, report, reload_s)
+    page = _report_page(run, report)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
 
@@ -250,9 +250,9 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     return tuple(file for file, _ in outputs), gone
 
 
-def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
+def _report_page(run: Path, report: dict) -> bytes:
     overlays = {name: _overlay_in(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode("utf-8", "backslashreplace")
+    return report_html(report, overlays, _residuals(run, list(overlays))).encode("utf-8", "backslashreplace")
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:

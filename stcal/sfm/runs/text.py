@@ -1,6 +1,6 @@
 """Text for the terminal: the findings of a run or a detection in a few lines."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -158,37 +158,19 @@ def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]
     return "\n".join([*found_lines(labelled), *_skipped(detection.skipped)])
 
 
-def found_lines(labelled: Sequence[LabelledImage], blur_px: Mapping[str, float] | None = None) -> Iterator[str]:
-    """Yields faces and dots of each image, its blur if that is known, and what was left out in it and helps."""
+def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
+    """Yields faces and dots of each image, and what was left out in it and helps."""
     board_seen = any(isinstance(label, DotLabel) for each in labelled for label in each.observations.labels)
     for labelled_image in labelled:
         image = labelled_image.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         faces = ", ".join(sorted(image.face_ids())) or "none"
-        blur = f", edges blurred by {blur_px[image.name]:.2f} px" if blur_px and image.name in blur_px else ""
-        yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots{blur}"
+        yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots"
         yield from (f"  {note}" for note in labelled_image.notes)
         if not image.face_ids():
             yield f"  no face is read: {REMEDIES['face']}"
         if board_seen and not dots:
             yield f"  the board is not read: {REMEDIES['board']}"
-
-
-def so_far_text(result: RunResult) -> str:
-    """Returns one line on a run that is not finished: its images, its worst face, its checks."""
-    target = result.target
-    sigma = {
-        face: (float(np.sqrt(np.trace(c[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(c[:3, :3])))))
-        for face, c in target.face_covariance.items()
-        if face != target.reference_face
-    }
-    faces = f"{len(target.target_from_face)} of {len(result.target_design.faces)} faces"
-    if sigma and (result.judgement is None or result.judgement.verdict != "no"):
-        worst = max(sigma, key=lambda face: sigma[face])
-        faces += f", worst is face {worst}: σ {1e3 * sigma[worst][0]:.1f} µm, {1e3 * sigma[worst][1]:.1f} mdeg"
-    mapped = sum(len(solution.model.images) for solution in result.solutions)
-    checks = count_verdicts([(check.verdict, check.remedy) for check in result.checks])
-    return f"{mapped} images mapped, {faces}; checks: {checks}"
 
 
 def _skipped(skipped: Sequence[Skipped]) -> Iterator[str]:

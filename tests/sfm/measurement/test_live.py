@@ -1,23 +1,26 @@
-"""The live view: poses as pictures come, the page that shows them, and sources that give none."""
+"""The live view and the app that answers images: poses, the page, who is refused, and sources that give no picture."""
 
-import http.client
+import base64
 import json
-import threading
+import sys
 import time
-from itertools import cycle
+import zlib
+from importlib import import_module
 
 import cv2
 import numpy as np
 import pytest
+from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
 from stcal.io.device import frames_of, pictures_of
 from stcal.io.images import mosaic_of
-from stcal.sfm.measurement.live import WIDEST_PX, LiveView, drawn, follow, line_of
+from stcal.sfm import MeasureOptions, measure
+from stcal.sfm.measurement.live import WIDEST_PX, LiveService, drawn, line_of, served
 from stcal.sfm.measurement.pose import TargetPose
-from stcal.sfm.measurement.serve import MeasureService, ServeOptions, Setting, show_live
+from stcal.sfm.measurement.report import poses_file
 from stcal.sfm.measurement.target import read_target
 from stcal.sfm.measurement.tracker import Tracker
 from tests.outcome import fails_with
@@ -25,14 +28,12 @@ from tests.report.browser import faults
 from tests.report.browser import opened as browser
 from tests.sfm.truth import true_poses
 
-PATIENCE_S = 60.0
 
-
-@pytest.fixture(scope="module")
-def setting(small_run, small_scene):
+@pytest.fixture
+def tracker(small_run, small_scene):
     target = read_target(small_run / "faces.json", small_scene.target)
     object.__setattr__(target, "design", small_scene.target)
-    return Setting(target, read_camera(small_run / "cameras.txt"))
+    return Tracker(target, read_camera(small_run / "cameras.txt"))
 
 
 @pytest.fixture(scope="module")
@@ -40,42 +41,116 @@ def photograph(small_dataset):
     return cv2.imread(str(next((small_dataset / "images" / "12").iterdir())), cv2.IMREAD_GRAYSCALE)
 
 
-@pytest.fixture
-def service(setting):
-    return MeasureService(setting, 1)
+def client(tracker, **options) -> TestClient:
+    return TestClient(LiveService(tracker, **options).app, "http://127.0.0.1:8765")
 
 
-def tracker_of(setting) -> Tracker:
-    return Tracker(setting.target, setting.camera)
+def test_an_answer_is_that_of_measure(tracker, small_dataset, tmp_path):
+    photograph = min((small_dataset / "images" / "12").iterdir())
+    (tmp_path / photograph.name).symlink_to(photograph)
+    own = poses_file(measure(tmp_path, tracker.model, tracker.target, options=MeasureOptions(workers=1))).content()
+    answer = client(tracker).post("/pose", content=photograph.read_bytes(), params={"name": photograph.name})
+    assert answer.status_code == 200
+    assert answer.json() == own
+    assert tracker.recent == ()  # no image depends on another one
 
 
-def got(server, place: str) -> tuple[int, str, bytes]:
-    line = http.client.HTTPConnection(*server.server_address[:2], timeout=PATIENCE_S)
-    line.request("GET", place)
-    answer = line.getresponse()
-    found = answer.status, answer.headers["Content-Type"], answer.read()
-    line.close()
-    return found
+def png(image) -> bytes:
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def huge() -> bytes:
+    """3.6 gigapixels in a hundred bytes."""
+    data = bytearray(png(np.zeros((48, 64), np.uint8)))
+    data[16:24] = (60_000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "code"),
+    [
+        (b"", 400, "E-IMAGE-UNREADABLE"),
+        (np.random.default_rng(0).bytes(10_000), 400, "E-IMAGE-UNREADABLE"),
+        (png(np.zeros((480, 640), np.uint8))[:-9], 400, "E-IMAGE-TRUNCATED"),
+        (png(np.zeros((48, 64), np.uint8)), 400, "E-IMAGE-SIZE"),
+        (huge(), 400, "E-IMAGE-TOO-LARGE"),
+        (bytes(1_100_000), 413, "E-SERVICE-REQUEST"),
+    ],
+)
+def test_what_is_no_image_of_this_camera(tracker, data, status, code):
+    answer = client(tracker, max_megabytes=1.0).post("/pose", content=data)
+    assert (answer.status_code, answer.json()["code"]) == (status, code)
+
+
+def test_an_image_without_the_target_has_a_reason(tracker):
+    grey = np.full((tracker.model.height, tracker.model.width), 90, np.uint8)
+    answer = client(tracker).post("/pose?name=wall.png", content=png(grey))
+    assert (answer.status_code, answer.json()["images"]) == (422, [])
+    assert answer.json()["left_out"][0]["name"] == "wall.png"
+
+
+OWN, EVIL = "127.0.0.1:8765", "evil.example:8765"
+
+
+@pytest.mark.parametrize("place", ["/", "/events", "/pose"])
+@pytest.mark.parametrize(
+    ("headers", "token", "status"),
+    [
+        ({"Host": EVIL}, "", 403),  # a name that now points to this machine
+        ({"Host": EVIL, "Origin": f"http://{EVIL}"}, "", 403),
+        ({"Host": OWN, "Origin": f"http://{EVIL}"}, "", 403),
+        ({"Host": OWN, "Origin": "null"}, "", 403),
+        ({"Host": EVIL, "Origin": f"http://{EVIL}"}, "word", 401),
+        ({"Host": OWN, "Origin": f"http://{EVIL}", "Authorization": "Bearer word"}, "word", 403),
+        ({"Host": OWN, "Authorization": "Bearer other"}, "word", 401),
+        ({"Host": "lab:8765", "Origin": "http://lab:8765", "Authorization": "Bearer word"}, "word", 200),
+        ({"Host": "[::1]:8765", "Origin": "http://[::1]:8765"}, "", 200),
+        ({"Host": "localhost"}, "", 200),
+    ],
+)
+def test_who_is_answered(tracker, place, headers, token, status):
+    service = LiveService(tracker, live=True, token=token)
+    assert list(service.follow([], tracker)) == []
+    method = "POST" if place == "/pose" else "GET"
+    answer = TestClient(service.app).request(method, place, headers=headers)
+    assert answer.status_code == (400 if status == 200 and method == "POST" else status)  # an image of no bytes
+
+
+def test_a_browser_has_the_token_in_its_address(tracker):
+    word = client(tracker, live=True, token="word")
+    assert [word.get(place).status_code for place in ("/?token=word", "/?token=wor", "/")] == [200, 401, 401]
+    assert [client(tracker).get("/").status_code, client(tracker).get("/pose").status_code] == [404, 405]
 
 
 @pytest.mark.slow
-def test_each_picture_has_its_pose_or_the_reason_why_not(setting, photograph):
-    view, pictures = LiveView(), []
-    assert follow([photograph, np.zeros_like(photograph), photograph], tracker_of(setting), view, pictures.append) == 3
-    assert [picture.content["status"] for picture in pictures] == ["certain", "no pose", "certain"]
-    first, dark, _ = (picture.content for picture in pictures)
+def test_each_picture_has_its_pose_or_the_reason_why_not(tracker, photograph):
+    service = LiveService(tracker, live=True)
+    first, dark, _ = service.follow([photograph, np.zeros_like(photograph), photograph], tracker)
+    assert [first["status"], dark["status"], service.newest["status"]] == ["certain", "no pose", "certain"]
     assert first["poses"]["images"][0]["image"] == "picture 1"
     assert len(first["poses"]["images"][0]["circles"]) == int(dict(first["shown"])["circles"])
     assert "face" in dark["reason"]
-    assert "mm" in line_of(pictures[0])
-    assert dark["reason"] in line_of(pictures[1])
-    assert view.ended
-    assert json.loads(view.json())["picture"] == 3
+    assert "mm" in line_of(first)
+    assert dark["reason"] in line_of(dark)
+    last, end = TestClient(service.app, f"http://{OWN}").get("/events").text.split("\n\n")[:2]
+    assert json.loads(last.removeprefix("data: ")) == service.newest
+    assert end.startswith("event: ended")
 
 
 @pytest.mark.slow
-def test_faces_and_centres_are_drawn_where_they_are(setting, photograph):
-    tracker = tracker_of(setting)
+def test_picture_and_pose_are_of_one_message(tracker, photograph):
+    """Of pictures that are bright or dark in turn, so that the pose tells which one it was."""
+    service, frames = LiveService(tracker, live=True), [photograph, np.zeros_like(photograph)] * 2
+    for content, frame in zip(service.follow(frames, tracker), frames, strict=True):
+        assert service.newest["poses"] == content["poses"]
+        shown = cv2.imdecode(np.frombuffer(base64.b64decode(service.newest["jpeg"]), np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert shown.shape[1] == WIDEST_PX
+        assert (shown.max() > 100) == (content["status"] == "certain") == (frame.max() > 100)
+
+
+@pytest.mark.slow
+def test_faces_and_centres_are_drawn_where_they_are(tracker, photograph):
     labelled, pose = tracker.observe(photograph)
     assert isinstance(pose, TargetPose)
     centres = labelled.observations.centre_px
@@ -87,30 +162,16 @@ def test_faces_and_centres_are_drawn_where_they_are(setting, photograph):
     assert drawn(photograph, centres[:0], None, tracker).shape == picture.shape
 
 
-def test_pictures_of_another_size_end_it(setting, photograph):
+def test_pictures_of_another_size_end_it(tracker, photograph):
     with fails_with("E-IMAGE-SIZE"):
-        follow([photograph[::2, ::2]], tracker_of(setting), LiveView())
+        next(LiveService(tracker).follow([photograph[::2, ::2]], tracker))
 
 
-@pytest.mark.slow
-def test_places_of_the_view(service, setting, photograph):
-    view = LiveView()
-    with show_live(service, ServeOptions(port=0, token="word"), view) as server:
-        assert got(server, "/live.json")[0] == 401
-        assert json.loads(got(server, "/live.json?token=word")[2])["status"] == "waiting"
-        follow([photograph], tracker_of(setting), view)
-        assert json.loads(got(server, "/live.json?token=word")[2])["status"] == "certain"
-        _, kind, page = got(server, "/?token=word")
-        assert kind == "text/html; charset=utf-8"
-        assert b"live.mjpg" in page
-        _, kind, pictures = got(server, "/live.mjpg?token=word")
-        kind, _, boundary = kind.partition("; boundary=")
-        assert kind == "multipart/x-mixed-replace"
-        head, _, rest = pictures.partition(b"\r\n\r\n")
-        assert head.startswith(f"--{boundary}\r\n".encode())
-        assert view.newest is not None
-        assert rest.removesuffix(f"\r\n--{boundary}\r\n".encode()) == view.newest.jpeg
-        assert got(server, "/elsewhere?token=word")[0] == 404
+def test_the_extra_that_is_missing_is_named(monkeypatch):
+    monkeypatch.delitem(sys.modules, "stcal.sfm.measurement.live")
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    with fails_with("E-EXTRA-MISSING … --live, --serve … stereo-target-calibration[live]"):
+        import_module("stcal.sfm.measurement.live")
 
 
 def test_every_picture_of_a_video_is_read(tmp_path):
@@ -193,30 +254,21 @@ def test_a_video_without_live_is_told_how_it_is_measured(small_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_browser_and_other_programs_see_picture_and_pose(service, setting, photograph):
-    view, stop = LiveView(), threading.Event()
+def test_a_page_shows_picture_and_pose_and_keeps_the_last(tracker, photograph):
+    service = LiveService(tracker, live=True)
+    with served(service, port=0) as url, browser() as chrome:
+        chrome.get(url)
+        assert len(list(service.follow([photograph], tracker))) == 1
+        shown = "return document.getElementById('counts').textContent"
+        wait_until(lambda: chrome.execute_script(shown).endswith("; ended"))
+        assert chrome.find_element("id", "status").text.strip() == "certain"
+        assert "mm" in chrome.find_element("id", "rows").text
+        assert chrome.execute_script("return document.getElementById('picture').naturalWidth") == WIDEST_PX
+        assert faults(chrome) == []
 
-    def device():
-        for frame in cycle([photograph]):
-            if stop.is_set():
-                return
-            yield frame
 
-    with show_live(service, ServeOptions(port=0), view) as server, browser() as chrome:
-        thread = threading.Thread(target=follow, args=(device(), tracker_of(setting), view))
-        thread.start()
-        try:
-            chrome.get(server.url)
-            until = time.monotonic() + PATIENCE_S
-            while chrome.find_element("id", "status").text.strip() != "certain" and time.monotonic() < until:
-                time.sleep(0.1)
-            assert chrome.find_element("id", "status").text.strip() == "certain"
-            with pictures_of(f"{server.url}/live.mjpg") as streamed:  # the newest ones, as of any stream
-                first, second = next(streamed), next(streamed)
-            assert first.shape[1] == second.shape[1] == WIDEST_PX
-            assert "mm" in chrome.find_element("id", "rows").text
-            assert chrome.execute_script("return document.getElementById('picture').naturalWidth") > 0
-            assert [fault for fault in faults(chrome) if "favicon" not in fault] == []
-        finally:
-            stop.set()
-            thread.join()
+def wait_until(done, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
