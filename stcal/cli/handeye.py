@@ -287,7 +287,7 @@ def handeye(
     export: Annotated[
         list[str] | None,
         "Write the transform to this file; repeat it for more files. Forms: ros2, moveit, moveit2, easy-handeye, "
-        "easy-handeye2, zivid, kuka, abb, ur, fanuc.",
+        "easy-handeye2.",
         Opt(metavar="FORM=FILE"),
     ] = None,
     parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
@@ -449,13 +449,12 @@ def _require_frames(
     camera_frame: "CameraFrame",
 ) -> None:
     """Checks that frames are named only for outputs with frames, and that their names differ."""
-    from stcal.handeye.report.export import ROS_FORMS, frame_names, require_frame_names
+    from stcal.handeye.report.export import frame_names, require_frame_names
 
-    if (parent or child or camera_frame != "optical") and not (ros or any(form in ROS_FORMS for form, _ in exports)):
+    if (parent or child or camera_frame != "optical") and not (ros or exports):
         raise InputError(
             "E-OPTION-NEEDS",
-            "--parent, --child, --camera-frame: only with --ros, --urdf or --export of a ROS form, whose frames they "
-            "name",
+            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
         )
     require_frame_names(*frame_names(setup, parent, child, camera_frame))
 

@@ -1,6 +1,5 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
 from .export import offsets_csv as offsets_csv
-from .export import robot_program as robot_program
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
 from .identification.solve import identify as identify

@@ -370,25 +370,20 @@ def test_every_form_of_export(command, tmp_path):
     for form, kind in FORMS.items():
         path = tmp_path / "deep" / f"{form}.txt"
         assert f"written: {path}" in shown
-        found = kind.read(path.read_text())
-        if not isinstance(found, Rigid):
-            assert (found[0].parent, found[0].child) == ("tool0", "left_link")
-            found = found[0].pose @ Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+        link = kind.read(path.read_text())[0]
+        assert (link.parent, link.child) == ("tool0", "left_link")
+        found = link.pose @ Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
         assert np.abs(found.matrix() - wanted.matrix()).max() < 1e-6  # mm, as printed
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--export", "kuka=poses.csv"), "--export poses.csv: is an input of this command; give another name"),
-        (("--export", "kuka=a", "--export", "ur=a"), "--export a: is also what --export writes"),
-        (("--export", "ur=a", "--out", "a"), "--export a: is also what --out writes"),
-        (("--export", "ur"), "--export ur: no file; give ur=FILE"),
-        (("--export", "motoman=a"), "--export motoman: unknown; one of ros2, moveit, "),
-        (
-            ("--export", "ur=a", "--camera-frame", "link"),
-            "--camera-frame: only with --ros, --urdf or --export of a ROS",
-        ),
+        (("--export", "ros2=poses.csv"), "--export poses.csv: is an input of this command; give another name"),
+        (("--export", "ros2=a", "--export", "moveit=a"), "--export a: is also what --export writes"),
+        (("--export", "ros2=a", "--out", "a"), "--export a: is also what --out writes"),
+        (("--export", "ros2"), "--export ros2: no file; give ros2=FILE"),
+        (("--export", "kuka=a"), "--export kuka: unknown; one of ros2, moveit, "),
         (("--ros", "a", "--camera-frame", "link", "--parent", "camera_optical_frame"), "both 'camera_optical_frame'"),
     ],
 )
@@ -407,7 +402,7 @@ def test_exports_that_cannot_be_are_refused(command, tmp_path, monkeypatch, word
     ("options", "message"),
     [
         (("--sigma-px", 0.1), "--sigma-px, --sigma-board-mm: only with images"),
-        (("--parent", "tool0"), "--parent, --child, --camera-frame: only with --ros, --urdf or --export of a ROS form"),
+        (("--parent", "tool0"), "--parent, --child, --camera-frame: only with --ros, --urdf or --export"),
         (("--sigma-robot-mm", 1000, "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
         (("--sigma-robot-mm", "inf", "--sigma-robot-deg", 1), "robot_mm inf: a finite number"),
         (

@@ -16,13 +16,7 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.result import HandEye
-from stcal.io.poses.columns import program_name
 from stcal.io.poses.programs import (
-    ABB,
-    FANUC,
-    KUKA,
-    REMARK,
-    UR,
     Static,
     fixed_joint,
     messages,
@@ -93,7 +87,7 @@ def require_frame_names(*names: str) -> None:
 
 
 def said_of(result: HandEye) -> list[str]:
-    """Returns lines for comments: the transform's name, σ, and covariance. ASCII only, for robot controllers."""
+    """Returns lines for comments: the transform's name, σ, and covariance."""
     frames = FRAMES[result.setup]
     lines = [f"stcal {stcal.__version__}: {frames.camera}, {result.setup}, {result.method}, {len(result.names)} poses"]
     if result.covariance is None:
@@ -114,49 +108,6 @@ def opencv_yaml(result: HandEye) -> str:
         if covariance is not None:
             lines += opencv_matrix(f"{name}_covariance", covariance)
     return "\n".join(lines) + "\n"
-
-
-def zivid_yaml(result: HandEye) -> str:
-    """Returns a file as ``zivid.Matrix4x4`` saves and loads it: 4×4, mm."""
-    head = "".join(f"# {line}\n" for line in said_of(result))
-    content = {
-        "__version__": {"serializer": 1, "data": 1},
-        "FloatMatrix": {"Data": result.mount_from_camera.matrix().tolist()},
-    }
-    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
-
-
-def kuka_dat(result: HandEye, name: str) -> str:
-    """Returns a data list of KRL with the frame."""
-    head = "".join(f"; {line}\n" for line in said_of(result))
-    frame = f"DECL GLOBAL FRAME {FRAMES[result.setup].camera}={{{KUKA.write(result.mount_from_camera)}}}\n"
-    return f"&ACCESS RVP\nDEFDAT {name} PUBLIC\n{head}{frame}ENDDAT\n"
-
-
-def abb_module(result: HandEye, name: str) -> str:
-    """Returns a module of RAPID with a ``pose``."""
-    head = "".join(f"  ! {line}\n" for line in said_of(result))
-    frame = f"  PERS pose {FRAMES[result.setup].camera}:=[{ABB.write(result.mount_from_camera)}];\n"
-    return f"MODULE {name}\n{head}{frame}ENDMODULE\n"
-
-
-def ur_script(result: HandEye) -> str:
-    """Returns a pose of URScript."""
-    head = "".join(f"# {line}\n" for line in said_of(result))
-    return f"{head}{FRAMES[result.setup].camera} = {UR.write(result.mount_from_camera)}\n"
-
-
-def fanuc_program(result: HandEye, name: str) -> str:
-    """Returns a program (LS) with the frame as its position."""
-    remarks = [FRAMES[result.setup].camera]
-    if result.covariance is not None:
-        sigma = np.sqrt(np.diag(result.covariance))
-        for unit, part in (("mm", sigma[3:]), ("deg", np.degrees(sigma[:3]))):
-            remarks.append(f"sigma {unit} " + " ".join(f"{v:.2g}" for v in part))
-    lines = [f"/PROG  {name}", "/ATTR", 'COMMENT = "stcal handeye";', "/MN"]
-    lines += [f"   {k}:  !{remark[:REMARK]} ;" for k, remark in enumerate(remarks, 1)]
-    lines += ["/POS", "P[1]{", "   GP1:", "\tUF : 0, UT : 0,\t\tCONFIG : 'N U T, 0, 0, 0',"]
-    return "\n".join([*lines, FANUC.write(result.mount_from_camera), "};", "/END"]) + "\n"
 
 
 IN_HAND = "eye-in-hand"
@@ -279,30 +230,19 @@ class Form:
     """A file format.
 
     ``write`` : returns the text for a result, its named transforms, and the file's name without its ending; ``read`` :
-    returns the transforms, or the one pose, of the text.
+    returns the transforms of the text.
     """
 
     write: Callable[[HandEye, list[Static], str], str]
-    read: Callable[[str], "list[Static] | Rigid"]
+    read: Callable[[str], list[Static]]
 
 
-ROS_FORMS = {
+FORMS = {
     "ros2": Form(lambda result, transforms, _: ros2_commands(transforms, said_of(result)), read_ros2_commands),
     "moveit": Form(lambda result, transforms, _: ros1_launch(transforms, said_of(result)), read_ros1_launch),
     "moveit2": Form(lambda result, transforms, _: ros2_launch(transforms, said_of(result)), read_ros2_launch),
     "easy-handeye": Form(easy_handeye, read_easy_handeye),
     "easy-handeye2": Form(easy_handeye2, read_easy_handeye2),
-}
-"""Formats that hold names of frames, and the camera's link on demand."""
-FORMS = ROS_FORMS | {
-    "zivid": Form(
-        lambda result, *_: zivid_yaml(result),
-        lambda text: Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"]),
-    ),
-    "kuka": Form(lambda result, _, name: kuka_dat(result, program_name(name)), KUKA.first),
-    "abb": Form(lambda result, _, name: abb_module(result, program_name(name)), ABB.first),
-    "ur": Form(lambda result, *_: ur_script(result), UR.first),
-    "fanuc": Form(lambda result, _, name: fanuc_program(result, program_name(name)), FANUC.first),
 }
 """All formats, by the word of ``--export``."""
 
@@ -317,19 +257,15 @@ def exported(
 ) -> str:
     """Returns the file's text, after reading it back and comparing the transform.
 
-    ``form`` : one of :data:`FORMS`; ``name`` : name of the file without its ending; files of easy_handeye and of robot
-    controllers hold it too; ``parent``, ``child``, ``camera_frame`` : frames for :data:`ROS_FORMS`; see
-    :func:`~stcal.handeye.report.export.tree`.
+    ``form`` : one of :data:`FORMS`; ``name`` : name of the file without its ending, which files of easy_handeye hold
+    too; ``parent``, ``child``, ``camera_frame`` : see :func:`~stcal.handeye.report.export.tree`.
 
     Raises InputError: the format is unknown, or cannot hold the name of a frame.
     """
     require_form(form, FORMS)
     transforms = tree(result, parent, child, camera_frame)
     text = FORMS[form].write(result, transforms, name)
-    read_back = FORMS[form].read(text)
-    if isinstance(read_back, Rigid):
-        read_back, transforms = [Static("", "", read_back)], [Static("", "", result.mount_from_camera)]
-    for static, wanted in zip(read_back, transforms, strict=False):
+    for static, wanted in zip(FORMS[form].read(text), transforms, strict=False):
         difference = static.pose.inverse() @ wanted.pose
         same_names = (static.parent, static.child) == (wanted.parent, wanted.child)
         if not same_names or difference.angle_rad() > SAME_RAD or np.abs(difference.translation).max() > SAME_MM:
