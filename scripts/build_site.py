@@ -32,10 +32,11 @@ THEME = ("furo", "myst_parser")
 sys.path.insert(0, str(SITE))
 pages = __import__("pages")
 
-MADE = {"reference/commands": pages.commands, "reference/api": pages.interface}
 LISTED = """## Reference
 
 - [Commands](reference/commands/index.md), with all options
+- [Keys of result files](reference/files/index.md)
+- [Errors and their codes](reference/errors.md)
 - [Python interface](reference/api/index.rst)
 """
 """What docs/index.md has more as a page of the site."""
@@ -63,12 +64,9 @@ def collect(source: Path) -> None:
     for path in linked - set(documents()):
         (source / place_of(path)).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, source / place_of(path))
-    for folder, make in MADE.items():
-        for name, text in make():
-            if folder.endswith("commands"):
-                write(source / folder / f"{name}.md", text if name != "index" else text + contents("", items(text)))
-            else:
-                write(source / folder / f"{name}.rst", text)
+    for place, text in pages.made():
+        is_list = place.endswith("index.md")
+        write(source / place, text + contents("", items(text)) if is_list else text)
     for path in (SITE / "conf.py", SITE / "docstrings.py"):
         shutil.copyfile(path, source / path.name)
     shutil.copytree(SITE / "static", source / "static")
@@ -98,8 +96,7 @@ def with_links(text: str, page: Path, linked: set[Path]) -> str:
 
 
 def with_contents(page: Path, text: str) -> str:
-    """The page with the pages that it lists below it in the site's tree: index.md by its sections, others that are
-    tables of pages as a whole."""
+    """The page; docs/index.md with the pages that its sections list, below it in the site's tree."""
     if page == DOCS / "index.md":
         text = text.replace("## Reference\n\n", LISTED)
         parts = re.split(r"^## (.+)$", text, flags=re.MULTILINE)
@@ -112,11 +109,6 @@ def with_contents(page: Path, text: str) -> str:
             seen.update(own)
             listed += contents(title, own) if own else ""
         return text + listed
-    if page.name == "index.md" or page.name == "data_layout.md":
-        known = {"data_layout.md": "reference/files/"}.get(page.name, "")
-        return text + contents(
-            "", [name for name in dict.fromkeys(items(text)) if name.startswith(known) and ".." not in name]
-        )
     return text
 
 

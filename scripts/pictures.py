@@ -1,4 +1,4 @@
-"""The pictures of README.md and docs/: what is found in the sample photographs, the report's page, a target's plates.
+"""The pictures of README.md and docs/: what is found in the sample photographs, and the report's page.
 
 .venv/bin/python scripts/pictures.py [NAME …] [--out FOLDER]
 
@@ -16,7 +16,6 @@ from pathlib import Path
 
 from PIL import Image
 
-from stcal.drawing.draw import draw
 from stcal.sfm import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -83,12 +82,7 @@ def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> N
     Image.open(out).convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(out, optimize=True)
 
 
-def plates(result: Path, out: Path) -> None:
-    """The plates of the reference target as they are printed or cut."""
-    draw(result / "target.toml", out / "plates.svg")
-
-
-PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report, "plates": plates}
+PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report}
 
 
 def main() -> None:

@@ -4,8 +4,9 @@
 
 A table of figures in README.md or docs/ has a comment directly above it, ``<!-- printed by: COMMAND -->``; COMMAND is a
 script with its arguments. ``docs/printed/NAME.txt`` holds what it printed, after a line with the command and the commit
-that it ran at. With names the commands of these are run and stored anew; without, the documents are compared with what
-is stored, and what differs is printed. ``tests/test_printed.py`` does the same, and runs the quick ones.
+that it ran at; a document may show some of the rows. With names the commands of these are run and stored anew; without,
+the documents are compared with what is stored, and what differs is printed. ``tests/test_printed.py`` does the same,
+and runs the quick ones.
 """
 
 import re
@@ -125,18 +126,10 @@ def stored(command: str) -> tuple[str, list[str]]:
 
 
 def first_missing(block: Block, lines: list[str]) -> str | None:
-    """The first row that what was printed does not have at its place, cell by cell; None where it has all of them, one
-    after the other."""
-    printed = [cells_of(line) for line in lines if line.strip() and not is_rule(line)]
-    best = 0
-    for begin in range(len(printed)):
-        length = 0
-        for row, other in zip(block.rows, printed[begin:], strict=False):
-            if row != other:
-                break
-            length += 1
-        best = max(best, length)
-    return None if best == len(block.rows) else " | ".join(block.rows[best])
+    """Returns the first row that what was printed does not have after the rows above it, cell by cell; None if it has
+    all of them in this order. A document may leave out rows."""
+    printed = (cells_of(line) for line in lines)
+    return next((" | ".join(row) for row in block.rows if row not in printed), None)
 
 
 def differing_figures(before: list[str], after: list[str], digits: float = 1.0) -> list[str]:

@@ -5,8 +5,8 @@ class's ``exit_code`` (2: the input is at fault; 3: the computation could not de
 and the user asked for this exit code).
 
 Every error also has a short code such as ``E-CAMERA-MODEL``, which stays the same when its sentence is reworded. One
-code names one kind of mistake, wherever it is found. ``--debug`` and JSON show the code; `docs/reference/errors.md`
-lists all codes with their sentences.
+code names one kind of mistake, wherever it is found. ``--debug`` and JSON show the code; the site of the
+documents lists all codes with their sentences.
 """
 
 import os

@@ -34,7 +34,7 @@ def ended(main: Callable[[], object], capture) -> Outcome:
 def fails_with(error: str) -> Iterator[pytest.ExceptionInfo[StcalError]]:
     """Expect an error by its code and what it names, in this order: ``E-POINTS-FEW … 2 … 3``.
 
-    What is named are places, values and remedies. Sentences stand in `docs/reference/errors.md`.
+    What is named are places, values and remedies.
     """
     code, *parts = error.split(" … ")
     with pytest.raises(StcalError) as caught:

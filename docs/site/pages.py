@@ -1,4 +1,5 @@
-"""Pages of the site that are made from the program: its commands with their options, and its public interface."""
+"""Pages of the site that are made from the program: commands with their options, keys of result files, errors, and the
+public interface."""
 
 import inspect
 import re
@@ -6,6 +7,8 @@ from collections.abc import Iterator
 from importlib import import_module
 from typing import Any
 
+import errors_page
+import files_pages
 from typer.main import get_command
 
 import stcal
@@ -30,6 +33,16 @@ BESIDE = {
     "stcal.errors": None,
 }
 """Names that results and arguments are made of; all that a module defines where None."""
+
+
+def made() -> Iterator[tuple[str, str]]:
+    """Yields (place in the site, text) of each page made from the program."""
+    yield "reference/errors.md", errors_page.page()
+    for folder, pages in (("commands", commands()), ("files", files_pages.pages())):
+        for name, text in pages:
+            yield f"reference/{folder}/{name}.md", text
+    for name, text in interface():
+        yield f"reference/api/{name}.rst", text
 
 
 def commands() -> Iterator[tuple[str, str]]:

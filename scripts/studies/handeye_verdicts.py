@@ -1,4 +1,4 @@
-"""How many honest sets of poses `stcal handeye` finds good: the figures of docs/reference/files/handeye.md.
+"""How many honest sets of poses `stcal handeye` finds good.
 
 .venv/bin/python scripts/studies/handeye_verdicts.py [--sets 60]
 

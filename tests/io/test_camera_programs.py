@@ -5,7 +5,6 @@ import re
 import sqlite3
 import struct
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -13,7 +12,7 @@ import pytest
 
 from stcal.errors import InputError, InputNote
 from stcal.io.cameras.foreign import ForeignLens
-from stcal.io.cameras.forms import WRITERS, name_to_write
+from stcal.io.cameras.forms import name_to_write
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_chosen, read_camera, read_lens
 from tests.io.camera_files import (
@@ -423,14 +422,3 @@ def test_a_key_that_is_a_number_is_named(tmp_path):
     with pytest.warns(InputNote, match="42"):
         lens = read(tmp_path, f"K: {FLAT}\nD: {D5}\n42: 7\n")
     np.testing.assert_allclose(project(lens), perspective(D5), atol=1e-9)
-
-
-def test_the_page_of_camera_files_has_every_program():
-    """Its tables say what is taken, refused and lost; programs whose files are read here are all in one of them."""
-    page = (Path(__file__).parents[2] / "docs" / "cameras.md").read_text()
-    tables = "\n".join(line for line in page.splitlines() if line.startswith("|")).split("| written by")[0].lower()
-    shapes = {"a list of nested cameras", "a matrix as intrinsics", "a nested size"}  # of keys, by no program alone
-    names = {re.sub(r" \d+$", "", name.split(",")[0]) for name in FILES} - shapes
-    assert [name for name in sorted(names) if name.lower() not in tables] == []
-    for form in WRITERS:
-        assert f"`{form}`" in tables

@@ -1,7 +1,6 @@
 """The report in four sentences: may I use it, how good is it, what limits it, what to do next.
 
-The rules are those of ``docs/reference/files/run.md`` (Judgement). They use nothing but the content of ``report.json``,
-so that everyone can follow them.
+The rules use nothing but the content of ``report.json``, so that everyone can follow them.
 """
 
 import math

@@ -1,31 +1,21 @@
-"""The page of all errors, docs/reference/errors.md: each code with its sentences, as they stand in the source.
+"""The page of all errors: each code with its sentences, as they stand in the source."""
 
-.venv/bin/python scripts/errors.py [--check]
-
-`--check` writes nothing, and exits with 1 where the page differs. A changed sentence is read in the page's diff.
-"""
-
-import argparse
 import ast
 import functools
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "reference" / "errors.md"
+PACKAGE = Path(__file__).resolve().parents[2] / "stcal"
 CODE = re.compile(r"E(-[A-Z]+)+")
 HEAD = """# Errors
 
 Every error is one line on standard error: what is wrong, where, what was measured, what is needed, and what to do. The
 exit code is 2 where an input is at fault, 3 where a computation could not deliver, 4 where a result failed its checks.
 
-Each error also has a code, which stays when its sentence is reworded. `--debug` prints it behind the traceback,
-`--json -` writes `{"error": …, "code": …}`, and so does `stcal-sfm measure --serve`. In Python it is
-`StcalError.code`. Below, `{…}` stands for what the message fills in.
-
-This page is made by `scripts/errors.py`.
+Each error also has a code, which stays when its sentence is reworded. `--debug` prints it behind the traceback, and
+`--json -` writes `{"error": …, "code": …}`. In Python it is `StcalError.code`. Below, `{…}` stands for what the message
+fills in.
 """
 
 
@@ -62,12 +52,12 @@ def errors_in(source: str) -> Iterator[tuple[str, str, str]]:
 @functools.cache
 def all_errors() -> list[tuple[str, str, str]]:
     """:func:`errors_in` of all modules of the package."""
-    sources = (path.read_text(encoding="utf-8") for path in sorted((ROOT / "stcal").rglob("*.py")))
+    sources = (path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py")))
     return [error for source in sources for error in errors_in(source)]
 
 
 def page() -> str:
-    """The page, made anew."""
+    """Returns the page."""
     sentences: dict[str, set[str]] = {}
     for _, code, text in all_errors():
         sentences.setdefault(code, set()).add(text)
@@ -79,16 +69,3 @@ def page() -> str:
 
 def _literal(text: str) -> str:
     return f"`` {text} ``" if "`" in text else f"`{text}`"
-
-
-def main() -> None:
-    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    arguments.add_argument("--check", action="store_true", help="write nothing, exit with 1 where the page differs")
-    made = page()
-    if arguments.parse_args().check:
-        sys.exit(int(PAGE.read_text(encoding="utf-8") != made))
-    PAGE.write_text(made, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
