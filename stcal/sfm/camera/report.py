@@ -1,27 +1,23 @@
-"""The report of calibrated intrinsics, of one camera or of a rig."""
+"""Report of calibrated intrinsics."""
 
 import numpy as np
 
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.report.camera import distortion_figure
 from stcal.report.document import (
-    Block,
     Document,
     Section,
     Table,
     alarms,
-    bullets,
     page_only,
     plot,
     plots,
-    subheading,
 )
-from stcal.report.svg import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
-from stcal.report.text import HEADS, number, transform_rows
+from stcal.report.svg import INK, SMALL, calm, new_figure, round_below
+from stcal.report.text import number
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
 from stcal.sfm.camera.file import CalibrationFile
-from stcal.sfm.camera.rig import RigCalibration
 
 CELLS = (12, 8)
 """Number of cells of the figure of residuals, in x and y."""
@@ -195,170 +191,4 @@ def residual_map(result: CameraCalibration):
         *middle.T, *(times * mean).T, angles="xy", scale_units="xy", scale=1, color=INK, width=0.003, headwidth=4
     )
     axes.set_title(f"enlarged {times:g} times; the longest is {longest:.4f} px", fontsize=SMALL + 1, color=INK)
-    return figure
-
-
-CAMERA_HEADS = (
-    "<camera",
-    "<lens model",
-    "views",
-    "shared",
-    "RMS px",
-    "alone px",
-    "σ of a projection px",
-    "held out px",
-)
-FRUSTUM_SHARE = 0.15
-"""Length of the drawn fields of view, as a share of the rig's extent."""
-
-
-def _headline(rig: RigCalibration) -> str:
-    shared = sum(len(images) > 1 for images in rig.instants.values())
-    return (
-        f"{len(rig.names)} cameras, {len(rig.instants)} instants, {shared} of them seen by several; residuals are "
-        f"{rig.factor:.3g} times those of the cameras alone"
-    )
-
-
-def _camera_rows(rig: RigCalibration) -> list[list[str]]:
-    return [
-        [
-            name,
-            camera.intrinsics.colmap_model,
-            str(len(camera.views)),
-            str(shared),
-            number(rms, 4),
-            number(alone, 4),
-            number(float(np.median(camera.projection.sigma_px)), 4),
-            number(camera.held_out.rms_px() if camera.held_out else None, 4),
-        ]
-        for name, camera, shared, rms, alone in zip(
-            rig.names, rig.cameras, rig.shared, rig.rms_of_cameras(), rig.alone_rms_px, strict=True
-        )
-    ]
-
-
-def _poses(rig: RigCalibration) -> list[tuple[str, list[list[str]]]]:
-    each = zip(rig.names[1:], rig.camera_from_first[1:], rig.covariance[1:], strict=True)
-    return [(f"{name}_from_{rig.names[0]}", transform_rows(pose, covariance)) for name, pose, covariance in each]
-
-
-def rig_report(rig: RigCalibration, where: str) -> Document:
-    """Returns the report of ``calibrate-camera --rig``."""
-    own = list(zip(rig.names, rig.cameras, strict=True))
-    left_out = [[each.camera, each.image, each.reason] for each in rig.apart]
-    left_out += [[name, each.name, each.reason] for name, camera in own for each in camera.skipped]
-    instants = [
-        [name, number(rig.rms_px[name], 4), *(images.get(camera, "") for camera in rig.names)]
-        for name, images in rig.instants.items()
-    ]
-    poses = [Table(["<" + name, *HEADS[1:]], rows) for name, rows in _poses(rig)]
-    maps: list[Block] = []
-    for name, camera in own:
-        maps += [
-            subheading(name),
-            bullets(camera.warnings),
-            plots(
-                plot(lambda camera=camera: sigma_map(camera), f"σ of a projection of {name}", css=""),
-                plot(lambda camera=camera: residual_map(camera), f"mean residuals of {name}", css=""),
-            ),
-        ]
-    return Document(
-        f"Calibration of a rig of cameras: {', '.join(rig.names)}",
-        f"{where}: {_headline(rig)}",
-        [
-            Section(
-                "Cameras",
-                [
-                    alarms(rig.warnings),
-                    Table(CAMERA_HEADS, _camera_rows(rig), css="text"),
-                    page_only(
-                        "Shared: instants that another camera saw too. Alone: residuals before the cameras were held "
-                        "to one rig. Views were held out from each camera by itself"
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Where they sit",
-                [
-                    *poses,
-                    page_only(
-                        "The pose of the first camera in the other. σ are those of rotations about the axes, and of "
-                        "translations along the axes, of the frame named first"
-                    ),
-                    plot(
-                        lambda: _arrangement(rig),
-                        "cameras from above and from the side",
-                        "Cameras and their fields of view from above and from the side, in the frame of "
-                        f"{rig.names[0]}",
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Over the images",
-                [
-                    "σ of where a known direction is seen, up to a rotation of the camera; white: dots. Mean "
-                    "residuals are measured minus projected: what is alike in neighbouring cells is what the lens "
-                    "model leaves",
-                    *maps,
-                ],
-            ),
-            Section(
-                "Instants",
-                [
-                    plot(
-                        lambda: _by_instant(rig),
-                        "residuals by instant",
-                        "Residuals of each instant; grey: seen by one camera alone",
-                    ),
-                    Table(["<instant", "RMS px", *(name.replace("<", "") for name in rig.names)], instants, css="text"),
-                ],
-            ),
-            Section("Left out", [Table(["<camera", "<image or file", "<reason"], left_out, css="text")], terminal=True),
-        ],
-    )
-
-
-def _arrangement(rig: RigCalibration):
-    """Returns a figure of the cameras and their fields of view from above (x, z) and from the side (z, y).
-
-    Coordinates are in the frame of the first camera.
-    """
-    inverse = [pose.inverse() for pose in rig.camera_from_first]
-    places = np.array([pose.translation for pose in inverse])
-    length = FRUSTUM_SHARE * max(float(np.ptp(places, axis=0).max()), 1.0) * 3
-    figure = new_figure(7.2, 3.4)
-    figure.set_layout_engine("constrained")
-    for axes, (a, b), labels in zip(
-        figure.subplots(1, 2), ((0, 2), (2, 1)), (("x, mm", "z, mm"), ("z, mm", "y, mm")), strict=True
-    ):
-        for k, (name, pose, calibration) in enumerate(zip(rig.names, inverse, rig.cameras, strict=True)):
-            camera, colour = calibration.intrinsics.camera, COLOURS[k % len(COLOURS)]
-            across = 0 if a == 0 else 1
-            half = 0.5 * (camera.width, camera.height)[across] / camera.focal[across]
-            edge = np.zeros((2, 3))
-            edge[:, across], edge[:, 2] = [-half, half], 1.0
-            ends = pose @ (length * edge / np.hypot(half, 1))
-            fan = np.array([ends[0], pose.translation, ends[1]])
-            axes.plot(fan[:, a], fan[:, b], color=colour, linewidth=1.2)
-            axes.annotate(
-                name, pose.translation[[a, b]], fontsize=SMALL, color=colour, xytext=(4, -8), textcoords="offset points"
-            )
-        plane(axes, *labels, 0.15)
-    figure.axes[1].invert_yaxis()
-    return figure
-
-
-def _by_instant(rig: RigCalibration):
-    """Returns a figure of the residuals by instant. Instants that several cameras saw have their own colour."""
-    figure = new_figure(7.2, 2.2)
-    figure.set_layout_engine("constrained")
-    axes = figure.add_subplot()
-    shared = [len(images) > 1 for images in rig.instants.values()]
-    axes.bar(
-        range(len(shared)), list(rig.rms_px.values()), color=[COLOURS[0] if each else "#9aa0a8" for each in shared]
-    )
-    calm(axes, "instant", "RMS, px")
     return figure
