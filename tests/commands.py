@@ -61,14 +61,13 @@ class Call:
 
     ``words`` : in them ``@place`` is an input, a file or folder of the stock; ``>name`` a file that is written, also
     over an earlier one; ``+name`` one that must be new; ``~place`` a copy of the stock's folder to write to;
-    ``seconds`` : processor time that it takes about; ``code`` : exit code; ``also`` : places that its inputs name.
+    ``seconds`` : processor time that it takes about; ``code`` : exit code.
     """
 
     command: str
     words: str
     seconds: float = 0.3
     code: int = 0
-    also: tuple[str, ...] = ()
 
     def split(self) -> list[str]:
         return shlex.split(self.words.replace("~", "\\~"))
@@ -108,7 +107,6 @@ CALLS = (
     Call("sfm run", f"{_SET} --out +new", 9.0),
     Call("sfm run", f"{_SET} --out ~run --board-only --no-strict", 3.0),
     Call("sfm run", f"{_SET} --out ~run --solve paper --no-strict", 4.0),
-    Call("sfm run", f"{_SET} --out ~run --frame three-point", 4.0),
     Call("sfm run", f"{_SET} --out ~run --compare paper", 6.0),
     Call("sfm detect", f"{_SET} --out ~detected", 1.5),
     Call("sfm detect", f"{_SET} --out ~detected --solve paper", 2.0),
@@ -142,11 +140,6 @@ CALLS = (
     Call("sfm budget", "@run --field operator=A --lengths @run --json >budget.json --report >page.html", 2.5),
     Call("sfm advise", "@run --count 1 --json >advice.json", 10.0),
     Call("sfm calibrate-camera", f"@data/images {_DESIGNS} --out +cameras.txt --workers 1 --report >page.html", 15.0),
-    Call(
-        "sfm calibrate-camera",
-        f"@rig {_DESIGNS} --rig --model OPENCV --model right=RADIAL --out +calibrated --workers 1 --report >page.html",
-        30.0,
-    ),
     Call(
         "sfm measure",
         "@shots --camera @data/cameras.txt --faces @run/faces.json --target @data/target.toml --sequence "
@@ -213,7 +206,7 @@ CALLS = (
     ),
     Call(
         "handeye",
-        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/board.toml "
+        "@handeye/images --poses @handeye/robot.csv --camera @handeye/cameras.txt --board @handeye/checker.yaml "
         "--splits 0 --refine-camera --camera-out >cameras.txt --out >h.json --workers 1",
         3.0,
     ),
@@ -223,12 +216,6 @@ CALLS = (
         "--dry-run",
     ),
     Call("handeye plan", "@handeye/poses.csv --count 2 --seed 1 --out >next.csv --json >all.json"),
-    Call(
-        "handeye rig",
-        f"@handeye/rig.toml --splits 0 --out >h.json --workers 1 {_ALL}",
-        5.0,
-        also=tuple(f"handeye/{name}" for name in ("checker.yaml", "robot.csv", "cameras.txt", "images", "right")),
-    ),
     Call("locate schedule", "1 100 5"),
     Call("locate capture", "+scenes --simulate @locate/scenes/a/1.png --shortest 0.5 --longest 2 --count 3"),
     Call(

@@ -152,7 +152,6 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
     run("run_chain", images, camera, "--solve", "chain")
     run("run_refined", images, camera, "--refine-camera")
     run("run_control", images, camera, "--no-eccentricity")
-    run("run_three_point", images, camera, "--frame", "three-point")
     add("detect", "sfm", "detect", images, "--camera", camera, "--out", "@/detect")
     files = ["--out", "@/poses.csv", "--json", "@/poses.json", "--report", "@/p.html"]
     add("measure", "sfm", "measure", images, "--camera", camera, "--faces", sample / "faces.json", *files)

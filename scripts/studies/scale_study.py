@@ -87,7 +87,7 @@ def measure(count: int, kind: str) -> dict:
     groups = 4
     scene = make_scene(SceneOptions(seed=5, images_per_group=count // groups))
     observations = observe(scene)
-    options = RunOptions(graph=kind).settled(scene.target)
+    options = RunOptions().settled(scene.target)
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     marks, processor = [("start", time.perf_counter())], time.process_time()
     with tempfile.TemporaryDirectory() as folder:

@@ -1,5 +1,5 @@
-"""Commands ``stcal handeye``, ``handeye plan`` and ``handeye rig``: where cameras are on or beside a robot, with σ, and
-which robot poses to take next."""
+"""Commands ``stcal handeye`` and ``handeye plan``: where a camera is on or beside a robot, with σ, and which
+poses of the robot to take next."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,7 +12,6 @@ from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
-from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
@@ -29,27 +28,6 @@ if TYPE_CHECKING:
 
 SetupName = Literal["eye-in-hand", "eye-to-hand"]
 """Name of the setup, by the carrier of the camera."""
-
-
-RotationOption = Annotated[
-    list[str] | None,
-    "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
-    "xyz (fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
-]
-LengthUnit = Annotated[
-    list[str] | None,
-    "Take lengths in this unit, if the file does not name it: mm, m, cm, um, in; robot=… or camera=… for one side.",
-]
-PosesAre = Annotated[
-    list[str] | None,
-    "Take poses in this direction, if the file does not name it: base_from_flange or flange_from_base, and "
-    "camera_from_board or board_from_camera; once for each side.",
-]
-TimeTolerance = Annotated[
-    float,
-    "Take the robot's nearest pose within this time, s, if none can be interpolated.",
-    Opt(min=0, max=3600),
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +56,20 @@ class PoseFiles:
         "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file "
         "decides; if it does not say, eye-in-hand.",
     ] = None
-    rotation: RotationOption = None
-    length_unit: LengthUnit = None
-    poses_are: PosesAre = None
+    rotation: Annotated[
+        list[str] | None,
+        "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
+        "xyz (fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
+    ] = None
+    length_unit: Annotated[
+        list[str] | None,
+        "Take lengths in this unit, if the file does not name it: mm, m, cm, um, in; robot=… or camera=… for one side.",
+    ] = None
+    poses_are: Annotated[
+        list[str] | None,
+        "Take poses in this direction, if the file does not name it: base_from_flange or flange_from_base, and "
+        "camera_from_board or board_from_camera; once for each side.",
+    ] = None
     first: shared.FirstTable = None
     second: shared.SecondTable = None
     key: shared.Key = "image"
@@ -150,65 +139,6 @@ class PoseFiles:
 
 
 POSE_FILES = PoseFiles()
-EVOLVED = ("de", "de-polished")
-"""Methods that take the options ``--de-…``."""
-
-
-@dataclass(frozen=True, slots=True)
-class Evolution:
-    """Options of differential evolution."""
-
-    de_bounds_deg: Annotated[
-        str | None,
-        "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
-        "about the closed form; ±180 if not given.",
-    ] = None
-    de_bounds_mm: Annotated[
-        str | None,
-        "Begin --method de within this translation: ± about zero, X,Y,Z,± or closed-form,±; if not given, up to the "
-        "distance of the farthest pose.",
-    ] = None
-    de_population: Annotated[
-        int | None, "Use this many candidates M; if not given 30, the paper's.", Opt(min=4, max=100_000)
-    ] = None
-    de_f: Annotated[
-        float | None, "Use this mutation factor F; if not given 0.5, the paper's.", Opt(min=1e-6, max=2)
-    ] = None
-    de_cr: Annotated[
-        float | None, "Use this crossover factor CR; if not given 0.9, the paper's.", Opt(min=0, max=1)
-    ] = None
-    de_lambda: Annotated[
-        float | None,
-        "Multiply squared translations in m² by this λ; if not given 1, the paper's.",
-        Opt(min=1e-12, max=1e12),
-    ] = None
-    de_generations: Annotated[
-        int | None, "End after this many generations; if not given 100, the paper's.", Opt(min=0, max=100_000)
-    ] = None
-    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=shared.MOST_SEED)] = None
-
-    def options(self, method: str | None) -> "EvolutionOptions":
-        """Returns the options of differential evolution, with defaults for those that were not given."""
-        from stcal.handeye import EvolutionOptions
-        from stcal.workflows.handeye.calibrate import ALL
-
-        values = {
-            "bounds_rad": _bounds("--de-bounds-deg", self.de_bounds_deg, math.radians(1)),
-            "bounds_mm": _bounds("--de-bounds-mm", self.de_bounds_mm, 1.0),
-            "population": self.de_population,
-            "factor": self.de_f,
-            "crossover": self.de_cr,
-            "weight": self.de_lambda,
-            "generations": self.de_generations,
-            "seed": self.de_seed,
-        }
-        given = {name: value for name, value in values.items() if value is not None}
-        if given and method not in (ALL, *EVOLVED):
-            raise InputError("E-OPTION-NEEDS", f"--de-…: only with --method {', '.join(EVOLVED)} or {ALL}")
-        return EvolutionOptions(**given)
-
-
-EVOLUTION = Evolution()
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
@@ -273,7 +203,11 @@ def handeye(
     times_columns: Annotated[
         Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
     ] = None,
-    time_tolerance: TimeTolerance = 0.02,
+    time_tolerance: Annotated[
+        float,
+        "Take the robot's nearest pose within this time, s, if none can be interpolated.",
+        Opt(min=0, max=3600),
+    ] = 0.02,
     motions_held_out: Annotated[
         int | None,
         "Hold out this many motions at the end, and predict them from the motions before, as the paper on "
@@ -300,7 +234,16 @@ def handeye(
     camera_out: Annotated[
         Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
     ] = None,
-    evolution: Evolution = EVOLUTION,
+    de_bounds_deg: Annotated[
+        str | None,
+        "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
+        "about the closed form; ±180 if not given.",
+    ] = None,
+    de_bounds_mm: Annotated[
+        str | None,
+        "Begin --method de within this translation: ± about zero, X,Y,Z,± or closed-form,±; if not given, up to the "
+        "distance of the farthest pose.",
+    ] = None,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
@@ -340,7 +283,7 @@ def handeye(
         raise InputError(
             "E-OPTION-NEEDS", "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px"
         )
-    evolved = evolution.options(method)
+    evolved = _evolution(method, de_bounds_deg, de_bounds_mm)
     if dry_run:
         say("\n".join(files.understood(pairs, timing, robot_model)))
         return
@@ -459,6 +402,21 @@ def _require_frames(
     require_frame_names(*frame_names(setup, parent, child, camera_frame))
 
 
+def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":
+    """Returns the options of differential evolution, with the defaults for bounds that were not given."""
+    from stcal.handeye import EvolutionOptions
+    from stcal.workflows.handeye.calibrate import ALL
+
+    bounds = {
+        "bounds_rad": _bounds("--de-bounds-deg", bounds_deg, math.radians(1)),
+        "bounds_mm": _bounds("--de-bounds-mm", bounds_mm, 1.0),
+    }
+    given = {name: value for name, value in bounds.items() if value is not None}
+    if given and method not in (ALL, "de", "de-polished"):
+        raise InputError("E-OPTION-NEEDS", f"--de-bounds-…: only with --method de, de-polished or {ALL}")
+    return EvolutionOptions(**given)
+
+
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
     """Returns the bounds in a text like ``±``, ``X,Y,Z,±`` or ``closed-form,±``."""
     from stcal.handeye.methods.evolution import Bounds
@@ -531,78 +489,6 @@ def plan(
     write_if(json_file, lambda: planned_file(planned.result, planned.poses, planned.joints))
 
 
-def rig(
-    rig_file: Annotated[
-        Path,
-        "Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file (TOML).",
-        Arg("RIG.toml"),
-    ],
-    refine_camera: Annotated[
-        bool, "Adjust the intrinsics of each camera too, starting from its file and weighted by their σ."
-    ] = False,
-    with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
-    rotation: RotationOption = None,
-    length_unit: LengthUnit = None,
-    poses_are: PosesAre = None,
-    quaternions: shared.Quaternions = "wxyz",
-    time_tolerance: TimeTolerance = 0.02,
-    held_out: Annotated[
-        int | None,
-        "Hold out this many of the robot's poses in each split; a quarter of them if not given.",
-        Opt(min=1, max=100_000),
-    ] = None,
-    splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
-    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
-    out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
-    workers: shared.Workers = None,
-    json_file: shared.JsonFile = None,
-    report: shared.ReportFile = None,
-    strict: shared.Strict = False,
-) -> None:
-    """Find where several cameras are on one flange, or in one base, and relative to each other, in one adjustment."""
-    from stcal.handeye.data.views import read_rig_file
-    from stcal.handeye.report.file import HandEyeRigFile
-    from stcal.handeye.report.outcome import rig_judged
-    from stcal.handeye.report.rig_page import rig_report
-    from stcal.workflows.handeye.rig import calibrate_handeye_rig, read_handeye_rig
-
-    files = read_rig_file(rig_file)
-    written = {"--out": out, "--json": json_file, "--report": report}
-    keep_apart([(name, path) for name, path in written.items() if path], files.read())
-    with StageProgress() as progress:
-        inputs = read_handeye_rig(
-            files,
-            rotation=rotation or (),
-            length_unit=length_unit or (),
-            poses_are=poses_are or (),
-            quaternions=quaternions,
-            tolerance_s=time_tolerance,
-            workers=workers,
-            progress=progress,
-        )
-        print_each("understood", inputs.understood)
-        outcome = calibrate_handeye_rig(
-            inputs,
-            refine_camera,
-            with_scale,
-            repeats=splits,
-            held_out=held_out,
-            seed=seed,
-            workers=workers,
-            progress=progress,
-        )
-    document = rig_report(outcome)
-    say(document.text())
-    for name, what, why in outcome.left_out():
-        say(f"left out {name}: {what}: {why}")
-    print_each("note", outcome.all_notes())
-    write_if(out, lambda: HandEyeRigFile.of(outcome))
-    write_if(report, document.page)
-    write_if(json_file, lambda: HandEyeRigFile.of(outcome, whole=True))
-    shared.require_passed(strict, rig_judged(outcome).failed(), report, rig_judged(outcome).doubt())
-
-
 app = typer.Typer()
 app.command("handeye")(handeye)
 app.command("handeye plan")(plan)
-app.command("handeye rig")(rig)

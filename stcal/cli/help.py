@@ -44,9 +44,7 @@ PANELS = {
     "Files for other programs": (
         *("ros", "urdf", "opencv", "export", "parent", "child", "camera_frame", "camera_out"),
     ),
-    "Differential evolution": (
-        *("de_bounds_deg", "de_bounds_mm", "de_population", "de_f", "de_cr", "de_lambda", "de_generations", "de_seed"),
-    ),
+    "Differential evolution": ("de_bounds_deg", "de_bounds_mm"),
 }
 """Panels of the help text in their order, each with the names of its parameters. All other parameters are in Input if
 they are paths to read, in Output if they are paths to write, and else in Method. ``--help`` is shown in Output."""
@@ -142,7 +140,6 @@ EXAMPLES = {
     "register": ("pairs.csv --out b_from_a.json --report pairs.html",),
     "handeye": ("photos --poses flange.csv --camera cameras.txt --board board.toml --report handeye.html",),
     "handeye plan": ("photos --poses flange.csv --camera cameras.txt --board board.toml --robot robot.toml",),
-    "handeye rig": ("rig.toml --report rig.html",),
     "locate run": ("scenes --layout tags.toml --camera cameras.txt --out poses.csv",),
     "locate calibrate": ("photos --camera cameras.txt --board board.toml --layout tags.toml --out measured.toml",),
     "locate schedule": ("1 64 7",),
@@ -167,7 +164,7 @@ EXAMPLES = {
 GROUPS = {
     "stcal": {
         "Stereo targets": ("sfm",),
-        "Robots": ("robot", "handeye", "handeye plan", "handeye rig"),
+        "Robots": ("robot", "handeye", "handeye plan"),
         "Other instruments and targets": ("register", "locate"),
         "Camera files": ("camera",),
     },

@@ -92,7 +92,7 @@ def declared(parameter: str, annotation: Any) -> Declared:
     info.rich_help_panel = panel_of(parameter, is_path, given.writes)
     # With Annotated, Typer takes an option's first name for its default.
     word = info.default if isinstance(given, Opt) else parameter
-    of_images = is_path and (parameter in ("images", "exposures", "rig_file") or "IMAGES" in (given.metavar or ""))
+    of_images = is_path and (parameter in ("images", "exposures") or "IMAGES" in (given.metavar or ""))
     return Declared(Annotated[kind, info], word, is_path and not given.writes, given.writes, of_images)
 
 

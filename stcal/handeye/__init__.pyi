@@ -1,8 +1,6 @@
 from .data.pairs import SETUPS as SETUPS
 from .data.pairs import HandEyePoses as HandEyePoses
 from .data.pairs import read_poses as read_poses
-from .data.views import RigCamera as RigCamera
-from .data.views import RigPoses as RigPoses
 from .data.views import View as View
 from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views
@@ -15,9 +13,6 @@ from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
 from .plan import planned_csv as planned_csv
 from .result import HandEye as HandEye
-from .rig import Rig as Rig
-from .rig import RigOptions as RigOptions
-from .rig import handeye_rig as handeye_rig
 from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
 from .validate import Compared as Compared

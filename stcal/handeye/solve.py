@@ -217,8 +217,8 @@ class Solved:
             )
         board = None
         if isinstance(solution, Adjusted):
-            state = solution.without(out).of(0)
-            found, corners = solution.found[0], state.scale * state.corners
+            state = solution.without(out)
+            found, corners = solution.found, state.scale * state.corners
             board = replace(found, camera=state.camera, corners=corners)
         else:
             state = solution.without(task.loop, out)
@@ -363,7 +363,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
     solution, contradicted = _by_true_robot(task, adjusted_by)
-    state, outliers, reprojection = solution.state.of(0), ~solution.used[0], solution.found[0]
+    state, outliers, reprojection = solution.state, ~solution.used, solution.found
     if solution.sigma_scale is not None:
         require_scale(state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = state.mount_from_camera, state.stand_from_board
@@ -372,10 +372,10 @@ def _by_views(task: _Task, views: Views) -> Solved:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal())
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    adjusted = replace(solution.loops[0], camera_from_board=resected(names, views, reprojection))
+    adjusted = replace(solution.loop, camera_from_board=resected(names, views, reprojection))
     residuals = adjusted.residuals(x, z)
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
-    notes += of_camera_file(float(solution.camera_gain[0]), solution.sigma)
+    notes += _of_camera_file(solution.camera_gain, solution.sigma)
     result = HandEye(
         method="reprojection",
         setup=task.setup,
@@ -397,7 +397,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
     return Solved(task, result, solution)
 
 
-def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
+def _of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
     """Returns notes on a camera file that the corners contradict.
 
     ``camera_gain`` : gain of other intrinsics; ``sigma`` : holds the factors by which the file's σ were widened.

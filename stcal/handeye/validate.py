@@ -1,6 +1,6 @@
 """Validation of a hand-eye calibration on poses and motions that were held out, and the scatter of its solutions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -448,37 +448,13 @@ def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
     if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
         return float("nan")
     m, k = len(result.names), held_out.rows.shape[1]
-    return scatter_of(
-        [result.mount_from_camera], held_out.mount_from_camera[:, None], result.covariance, m, k / m, UNKNOWNS
-    )
-
-
-def scatter_of(
-    found: Sequence[Rigid], matrices: np.ndarray, covariance: np.ndarray, images: int, out: float, unknowns: int
-) -> float:
-    """Returns the :func:`scatter` of c cameras.
-
-    ``found`` : the c poses from all images, with their ``covariance`` (6c, 6c); ``matrices`` : (s, c, 4, 4) those of
-    each split; ``out`` : share of the ``images`` that each split holds out; ``unknowns`` : number of unknowns.
-    """
-    parts = []
-    for i, pose in enumerate(found):
-        solutions = Poses(matrices[:, i, :3, :3], matrices[:, i, :3, 3])
-        parts.append(solutions.difference(Poses.of([pose] * len(solutions))))
-    differences = np.concatenate(parts, axis=1)
-    squared = np.einsum("sa,ab,sb->s", differences, generalised_inverse(covariance), differences)
-    dof = 6 * images * (1 - out) - unknowns - 1
-    return float(np.sqrt(squared.mean() / differences.shape[1] * dof / (6 * images * out)))
-
-
-def scatter_notes(factor: float, which: str) -> tuple[str, ...]:
-    """Returns a note if the scatter is large. ``which`` : the transforms with widened σ."""
-    if factor <= SCATTERED:
-        return ()
-    return (
-        f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
-        f"independently and alike: σ of {which} transforms are widened by that",
-    )
+    matrices = held_out.mount_from_camera
+    solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
+    differences = solutions.difference(Poses.of([result.mount_from_camera] * len(solutions)))
+    squared = np.einsum("sa,ab,sb->s", differences, generalised_inverse(result.covariance), differences)
+    out = k / m
+    dof = 6 * m * (1 - out) - UNKNOWNS - 1
+    return float(np.sqrt(squared.mean() / differences.shape[1] * dof / (6 * m * out)))
 
 
 def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
@@ -486,7 +462,13 @@ def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
     factor = scatter(result, held_out)
     if not factor > 1:
         return result
-    return replace(result.widened(factor), notes=(*result.notes, *scatter_notes(factor, "both")))
+    notes = result.notes
+    if factor > SCATTERED:
+        notes += (
+            f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
+            "independently and alike: σ of both transforms are widened by that",
+        )
+    return replace(result.widened(factor), notes=notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

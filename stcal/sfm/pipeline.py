@@ -442,7 +442,7 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
     )
 
     progress("map", 0, len(groups))
-    graph = image_graph(observations, board, options.graph)
+    graph = image_graph(observations, board)
     usable = [image for image in observations if image.group in groups]
     circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
 

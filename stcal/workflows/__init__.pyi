@@ -1,12 +1,9 @@
 from .board_views import calibration_images as calibration_images
 from .calibrate_camera import calibrate_camera_by_corners as calibrate_camera_by_corners
-from .calibrate_camera import calibrate_rig as calibrate_rig
 from .from_photos import robot_from_photos as robot_from_photos
 from .handeye.calibrate import calibrate_handeye as calibrate_handeye
 from .handeye.calibrate import plan_handeye as plan_handeye
 from .handeye.inputs import read_handeye as read_handeye
 from .handeye.inputs import without_flips as without_flips
-from .handeye.rig import calibrate_handeye_rig as calibrate_handeye_rig
-from .handeye.rig import read_handeye_rig as read_handeye_rig
 from .register_robot import RegisteredRobot as RegisteredRobot
 from .register_robot import register_with_robot as register_with_robot

@@ -1,6 +1,6 @@
-"""Calibration of a camera, or of the cameras of a rig, from photographs of a board."""
+"""Calibration of a camera from photographs of a board with corners or circles."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,22 +16,16 @@ from stcal.boards.design import (
     HexagonalCirclesDesign,
     TagLayout,
 )
-from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import InputError, StcalError
+from stcal.design import BoardDesign
+from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.forms import kalibr_chain
-from stcal.io.cameras.model import CameraModel, cameras_txt
-from stcal.io.cameras.write import require_camera_written
-from stcal.io.files import json_text
-from stcal.io.images import ImageFile, Skipped, find_images, name_fault, require_common_size
-from stcal.io.json import ResultFile, require_result_written
+from stcal.io.cameras.model import CameraModel
+from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
     MAX_RESIDUAL_PX,
     CameraCalibration,
-    calibrate_camera,
     judged,
     of_chosen_model,
     require_determined,
@@ -39,9 +33,7 @@ from stcal.sfm.camera.calibrate import (
     require_views,
 )
 from stcal.sfm.camera.checks import AUTO, foretold
-from stcal.sfm.camera.file import CalibrationFile, RigCalibrationFile
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form, start_camera
-from stcal.sfm.camera.rig import RigCalibration, rig_of
 from stcal.sfm.data.model import ImageObservations
 from stcal.workflows.board_views import detect_boards, kind_of
 
@@ -215,162 +207,3 @@ def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: Cor
             )
         )
     return observations
-
-
-RIG_FILE, CHAIN_FILE = "rig.json", "camchain.yaml"
-TAKEN = ("rig", "camchain")
-"""Names that a camera must not have, as its files would overwrite other files."""
-
-
-def models_of(given: Sequence[str], default: str) -> tuple[dict[str, str], str]:
-    """Returns the lens models by camera, and the one of all other cameras, from words NAME=MODEL and one word MODEL.
-
-    Raises InputError: two models for one camera, or two words MODEL.
-    """
-    model_of: dict[str, str] = {}
-    common = [word for word in given if "=" not in word]
-    for word in given:
-        name, separator, model = word.rpartition("=")
-        if separator and name in model_of:
-            raise InputError(
-                "E-OPTION-REPEATED", f"--model {word}: {name} has {model_of[name]} already; one for each camera"
-            )
-        if separator:
-            model_of[name] = model
-    if len(common) > 1:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each",
-        )
-    return model_of, common[0] if common else default
-
-
-@require_arguments
-def calibrate_rig(
-    images: str | Path,
-    target: TargetDesign,
-    board: BoardDesign | FlatBoard,
-    colmap_model: str = "OPENCV",
-    models: Mapping[str, str] | None = None,
-    workers: int | None = None,
-    progress: Progress | None = None,
-) -> RigCalibration:
-    """Returns the intrinsics of cameras that are fixed to each other, and where they sit, from photographs of a board.
-
-    Each camera is calibrated by itself, then all together.
-
-    Parameters
-    ----------
-    images : str or Path
-        Folder with a folder of photographs for each camera; those of one instant are named alike.
-    target : TargetDesign
-        Design of the target beside a board of dots, whose circles are not dots.
-    board : BoardDesign or another board design
-        The board, mm: dots, a chessboard or a ChArUco board.
-    colmap_model : str
-        COLMAP's camera model, or ``auto``.
-    models : dict of str, optional
-        Models of cameras that differ, by the name of their folder.
-    workers : int, optional
-        Number of processes; one per core if None.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    RigCalibration
-        ``names``, ``cameras`` with their calibration alone, and ``camera_from_first``, mm.
-
-    Raises
-    ------
-    InputError
-        The folder, a name, a model or the board cannot be used.
-    StcalError
-        A camera cannot be calibrated; the message names it.
-    """
-    folder, own = Path(images), models or {}
-    names = camera_names(folder)
-    unknown = [name for name in own if name not in names]
-    if unknown:
-        raise InputError(
-            "E-OPTION-VALUE", f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}"
-        )
-    grid = board if isinstance(board, BoardDesign) else corner_grid(board)
-    cameras: dict[str, CameraCalibration] = {}
-    for name in names:
-        model = own.get(name, colmap_model)
-
-        def step(stage: str, done: int, total: int, name=name) -> None:
-            if progress:
-                progress(f"{name}: {stage}", done, total)
-
-        try:
-            if isinstance(board, BoardDesign):
-                calibration = calibrate_camera(folder / name, target, board, model, workers=workers, progress=step)
-            else:
-                calibration = calibrate_camera_by_corners(folder / name, board, model, workers, step)
-        except StcalError as error:
-            raise type(error)(error.code, f"rig: {name}: {error}") from error
-        cameras[name] = calibration
-    return rig_of(cameras, grid)
-
-
-def camera_names(folder: Path) -> list[str]:
-    """Returns the names of the folders in a folder.
-
-    Raises InputError: not a folder, fewer than two folders in it, or names that no file can have.
-    """
-    if not folder.is_dir():
-        raise InputError(
-            "E-IMAGES-FOLDER",
-            f"rig folder {folder}: {'not a folder' if folder.exists() else 'does not exist'}; give one",
-        )
-    names = sorted(
-        subfolder.name for subfolder in folder.iterdir() if subfolder.is_dir() and not subfolder.name.startswith(".")
-    )
-    if len(names) < 2:
-        raise InputError(
-            "E-RIG-CAMERAS",
-            f"rig folder {folder}: {len(names)} folders in it, one for each of two cameras and more needed; put "
-            "photographs into <camera>/, or leave --rig away",
-        )
-    for name in names:
-        fault = "is that of a file of the result" if name.lower() in TAKEN else name_fault(name)
-        if fault or not name.isprintable():
-            raise InputError(
-                "E-RIG-CAMERAS", f"rig folder {folder}: camera name {name!r} {fault or 'is not printable'}; rename it"
-            )
-    return names
-
-
-def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
-    """Returns the contents of the files by name, and what is missing, with the reason.
-
-    The files are a camera file and its JSON for each camera, ``rig.json``, and ``camchain.yaml`` where Kalibr has
-    models for the lenses.
-    """
-    files, cameras = {}, []
-    for name, calibration in zip(rig.names, rig.cameras, strict=True):
-        intrinsics = calibration.intrinsics
-        camera = Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance)
-        files |= {f"{name}.txt": cameras_txt(camera), f"{name}.json": json_text(CalibrationFile.of(calibration))}
-        cameras.append((name, camera))
-    summary: ResultFile = RigCalibrationFile.of(rig)
-    files[RIG_FILE] = json_text(summary)
-    missing = []
-    try:
-        chain = [(*named_camera, pose) for named_camera, pose in zip(cameras, rig.camera_from_first, strict=True)]
-        files[CHAIN_FILE] = kalibr_chain(chain)
-    except InputError as error:
-        missing.append(f"no {CHAIN_FILE}: {error}")
-    return files, missing
-
-
-def require_rig_written(out: Path, files: Mapping[str, str], rig: RigCalibration) -> None:
-    """Read the ``files`` of :func:`files_of` in folder ``out`` again, and require their content."""
-    for number, (name, calibration) in enumerate(zip(rig.names, rig.cameras, strict=True)):
-        require_camera_written(out / f"{name}.txt", calibration.intrinsics.camera)
-        require_result_written(out / f"{name}.json", CalibrationFile.of(calibration))
-        if CHAIN_FILE in files:
-            require_camera_written(out / CHAIN_FILE, calibration.intrinsics.camera, f"cam{number}")
-    require_result_written(out / RIG_FILE, RigCalibrationFile.of(rig))

@@ -73,7 +73,7 @@ def lay_out(stock: Path, folder: Path, call: Call, earlier: bool) -> tuple[Path,
     """Copy the inputs of a call, and what an earlier call left where it writes; the two folders."""
     read, written = folder / IN, folder / OUT
     shutil.rmtree(folder, ignore_errors=True)
-    for place, below in [*((p, read) for p in (*call.inputs, *call.also)), *((p, written) for p in call.folders)]:
+    for place, below in [*((p, read) for p in call.inputs), *((p, written) for p in call.folders)]:
         _copy(stock / place, below / place)
     for below in (read, written):
         below.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +35,6 @@ from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, s
 from tests.shared import own_copy
 from tests.support.arms import elastic
 from tests.support.handeye import simulated
-from tests.support.handeye_rig import FIRST_FROM
 
 SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 """As the tests' small data set."""
@@ -104,8 +102,6 @@ def _of_runs(folder: Path) -> None:
     placed_faces = {key: truth[key] for key in ("unit", "reference_face", "target_from_face", "circles")}
     (folder / "faces.json").write_text(json.dumps({"format": "stcal faces 1"} | placed_faces, indent=1))
     export_model(folder / "run", folder / "model-txt", "colmap-txt")
-    for camera in ("left", "right"):  # two cameras at one place
-        own_copy(folder / "data/images", folder / "rig" / camera)
     (folder / "detected").mkdir()
     own_copy(folder / "run/cache", folder / "detected/cache")
     own_copy(folder / "run/detections.csv", folder / "detected")
@@ -230,9 +226,9 @@ def _handeye(folder: Path, rng: np.random.Generator) -> None:
         [*pose_cells(a), *pose_cells(b)] for a, b in zip(pairs.base_from_flange, pairs.camera_from_board, strict=True)
     ]
     write_rows(folder / "poses.csv", header, rows)
-    seen = looks(rng, 7, np.array([70.0, 50.0]), 0.6)
-    _photographed(folder, seen)
-    _rig(folder, seen)
+    _photographed(folder, looks(rng, 7, np.array([70.0, 50.0]), 0.6))
+    (folder / "checker.yaml").write_text(KALIBR)
+    (folder / "boards.toml").write_text(BOARDS)
 
 
 def _photographed(folder: Path, seen: Poses) -> None:
@@ -244,23 +240,6 @@ def _photographed(folder: Path, seen: Poses) -> None:
         path.rename(folder / name)
     found.images.rename(folder / "images")
     inner.rmdir()
-
-
-def _rig(folder: Path, seen: Poses) -> None:
-    """A second camera beside the one that took ``seen``, and the file of both."""
-    second = FIRST_FROM[1].inverse() @ seen
-    inner = folder / "drawn"
-    inner.mkdir()
-    found = photographs(inner, *chessboard_mm(6, 8, 20.0), second, CHESSBOARD)
-    found.images.rename(folder / "right")
-    shutil.rmtree(inner)
-    cameras = "".join(
-        f'\n[[camera]]\nname = "{name}"\nimages = "{images}"\ncamera = "cameras.txt"\n'
-        for name, images in (("left", "images"), ("right", "right"))
-    )
-    (folder / "checker.yaml").write_text(KALIBR)
-    (folder / "boards.toml").write_text(BOARDS)
-    (folder / "rig.toml").write_text(f'setup = "eye-in-hand"\nboard = "checker.yaml"\nposes = "robot.csv"\n{cameras}')
 
 
 def _tags(folder: Path, rng: np.random.Generator) -> None:

@@ -26,7 +26,7 @@ def assert_derivatives(problem, state, unknowns: Iterable[int]) -> None:
     derivatives in both are those of the residuals."""
     normals = {name: dense(part.equations)[0] for name, part in problem.parts(state).items()}
     for k in unknowns:
-        step = np.zeros(problem.count())
+        step = np.zeros(problem.places()["board"].stop)
         step[k] = 1e-5
         ahead, behind = (problem.parts(problem.moved(state, sign * step)) for sign in (1, -1))
         for name, normal in normals.items():

@@ -14,6 +14,7 @@ from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import photograph
 from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 
+BOARD = 'type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20\n'
 CAMERA = Camera(800, 600, [1000, 1000], [406, 293], np.zeros(8))
 PER_MM = 4
 MARGIN_MM = 30.0
@@ -75,11 +76,15 @@ def photographs(folder: Path, sheet: np.ndarray, first_mm: float, seen: Poses, b
     found = Photographs(*(folder / name for name in ("images", "poses.csv", "cameras.txt", "board.toml")))
     found.images.mkdir()
     base_from_flange = BASE_FROM_BOARD @ seen.inverse() @ FLANGE_FROM_CAMERA.inverse()
-    rows = [",".join(["image", *(f"base_from_flange_{column}" for column in POSE)])]
-    for i, (pose, flange) in enumerate(zip(seen, base_from_flange, strict=True)):
+    for i, pose in enumerate(seen):
         cv2.imwrite(str(found.images / f"{i}.png"), take(sheet, first_mm, pose))
-        rows.append(",".join([f"{i}.png", *pose_cells(flange)]))
-    found.poses.write_text("\n".join(rows) + "\n")
+    write_poses(found.poses, {f"{i}.png": flange for i, flange in enumerate(base_from_flange)})
     write_cameras_txt(found.camera, Camera.of(CAMERA, "PINHOLE"))
     found.board.write_text(board_toml)
     return found
+
+
+def write_poses(path: Path, poses: dict[str, Rigid], column: str = "image") -> None:
+    rows = [",".join([column, *(f"base_from_flange_{c}" for c in POSE)])]
+    rows += [",".join([name, *pose_cells(pose)]) for name, pose in poses.items()]
+    path.write_text("\n".join(rows) + "\n")

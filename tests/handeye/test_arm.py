@@ -1,14 +1,11 @@
 """The arm's parameters beside hand and eye."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
-from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, cross_validate, splits
 from stcal.handeye.data.pairs import SETUPS
 from stcal.handeye.solve import handeye
@@ -17,9 +14,9 @@ from stcal.robot.kinematics.file import save_robot
 from stcal.workflows.handeye.robot_at_images import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
-from tests.outcome import ended, fails_with
+from tests.outcome import fails_with
 from tests.support.arms import arm_at
-from tests.support.handeye import simulated_views
+from tests.support.handeye import simulated_views, squared
 
 OFF = (1e-3, 0.5)
 """σ of the axes about the robot's file: rad, mm."""
@@ -63,13 +60,12 @@ def test_what_the_arm_errs_is_found(setup):
 @pytest.mark.full
 def test_sigma_is_honest_with_an_arm_that_errs():
     """240 numbers of χ²: their mean lies within 1 ± 4 √(2 / 240) by chance; σ of groups are estimated of few values."""
-    squared = []
+    errors = []
     for seed in range(40):
         truth, pairs, _, model = scene(100 + seed, count=25)
         found = handeye(pairs, truth.setup, None, truth.views, HandEyeOptions(arm=model))
-        off = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
-        squared.append(off @ np.linalg.solve(found.covariance, off) / 6)
-    assert 1 - 4 * np.sqrt(2 / 240) < np.mean(squared) < 1 + 4 * np.sqrt(2 / 240)
+        errors.append(squared(found, truth) / 6)
+    assert 1 - 4 * np.sqrt(2 / 240) < np.mean(errors) < 1 + 4 * np.sqrt(2 / 240)
 
 
 def test_only_corners_tell_of_the_arm():
@@ -92,17 +88,6 @@ def photographed(tmp_path_factory):
     files.poses.write_text("\n".join(",".join(row) for row in [heads, *rows]) + "\n")
     save_robot(folder / "robot.toml", arm.robot)
     return files, folder / "robot.toml", arm
-
-
-@pytest.fixture
-def command(monkeypatch, capsys):
-    """Exit code, standard output and error."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
 
 
 @pytest.mark.full

@@ -1,4 +1,4 @@
-"""``stcal handeye`` with boards of the newer kinds, drawn."""
+"""``stcal handeye`` with a set of boards, drawn."""
 
 import json
 
@@ -7,18 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign
+from stcal.boards.design import AprilGridDesign
 from stcal.geometry.rigid import Rigid
 from tests.boards.drawn import aprilgrid_mm, photograph_of_several
-from tests.handeye.photographed import CAMERA, PER_MM, image_from_sheet, looks, photographs, sheet_of_dots
-from tests.handeye.test_cli import CHANCE, EXACT, command, in_sigmas  # noqa: F401
+from tests.handeye.photographed import CAMERA, PER_MM, image_from_sheet, looks, photographs
+from tests.handeye.test_cli import CHANCE, EXACT, in_sigmas
 from tests.handeye.test_images import charuco
 from tests.support.handeye import FLANGE_FROM_CAMERA
 
 GRID = AprilGridDesign(3, 4, 25.0, 0.3)
-CIRCLES = AsymmetricCirclesDesign(9, 4, 18.0, 6.0, "dark")
-APRILGRID = "target_type: aprilgrid\ntagCols: 4\ntagRows: 3\ntagSize: 0.025\ntagSpacing: 0.3\n"
-ASYMMETRIC = 'type = "asymmetric-circles"\nrows = 9\ncolumns = 4\nspacing_mm = 18\nradius_mm = 6\npolarity = "dark"\n'
 SET = """type = "boards"
 [[board]]
 type = "charuco"
@@ -41,17 +38,13 @@ rpy_deg = [0.0, 30.0, 0.0]
 COMMON_FROM_GRID = Rigid(Rotation.from_euler("y", 30, degrees=True).as_matrix(), [-165, 105, 30])
 
 
-def drawn(kind: str, folder):
-    """Eight photographs, eye-in-hand, without errors of the robot."""
-    rng = np.random.default_rng(21)
-    if kind == "aprilgrid":
-        return photographs(folder, *aprilgrid_mm(GRID, 2), looks(rng, 8, np.array([60, -45]), 1.0), APRILGRID)
-    if kind == "asymmetric circles":
-        seen = looks(rng, 8, CIRCLES.xy_mm().mean(0), 1.0)
-        return photographs(folder, *sheet_of_dots(CIRCLES.xy_mm(), CIRCLES.radii_mm()), seen, ASYMMETRIC)
+@pytest.mark.slow
+def test_several_boards_are_one(command, tmp_path):
+    """Eye-in-hand, without errors of the robot: within chance of its σ, and within 0.2 mm; `--dry-run` says what the
+    board is."""
+    seen = looks(np.random.default_rng(21), 8, np.array([10, 60]), 1.0)
     _, sheet, first = charuco()
-    seen = looks(rng, 8, np.array([10, 60]), 1.0)
-    found = photographs(folder, sheet, first, seen, SET)
+    files, out = photographs(tmp_path, sheet, first, seen, SET), tmp_path / "h.json"
     grid, origin = aprilgrid_mm(GRID, 2)
     for i, pose in enumerate(seen):
         sheets = [
@@ -59,25 +52,10 @@ def drawn(kind: str, folder):
             (sheet, image_from_sheet(first, pose)),
         ]
         picture = photograph_of_several(sheets, PER_MM, (CAMERA.width, CAMERA.height))
-        cv2.imwrite(str(found.images / f"{i}.png"), picture)
-    return found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        ("aprilgrid", "AprilGrid"),
-        pytest.param("asymmetric circles", "asymmetric circles", marks=pytest.mark.full),
-        pytest.param("boards", "2 boards", marks=pytest.mark.full),
-    ],
-)
-def test_the_camera_is_found(command, tmp_path, kind, said):  # noqa: F811
-    """Within chance of its σ, and within 0.2 mm; `--dry-run` says what the board is."""
-    files, out = drawn(kind, tmp_path), tmp_path / "h.json"
+        cv2.imwrite(str(files.images / f"{i}.png"), picture)
     code, shown, _ = command(*files.arguments(), "--dry-run")
     assert code == 0
-    assert said in shown
+    assert "2 boards" in shown
     options = ("--workers", 1, "--splits", 0, "--method", "reprojection", "--out", out)
     code, shown, err = command(*files.arguments(), *options, *EXACT)
     assert code == 0, err

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, Views, pairs_of_views, splits
 from stcal.handeye.choose import BY_POSES, BY_VIEWS, CLOSED_FORMS, Candidate, choose
 from stcal.handeye.solve import handeye, solved
 from stcal.io.cameras.model import camera_prior
 from tests.levels import sampled
-from tests.support.handeye import CAMERA, simulated, simulated_views
+from tests.support.handeye import CAMERA, error, simulated, simulated_views
 
 ROBOT = (5e-4, 0.2)
 """σ of a common arm: rad, mm."""
@@ -74,9 +73,7 @@ def test_a_board_of_another_size_is_found_out():
 @pytest.mark.slow
 @pytest.mark.parametrize(("scale", "name"), [(1.0, "pose"), (1.02, "pose + scale")])
 def test_poses_alone_are_chosen_among_too(scale, name):
-    truth = simulated(np.random.default_rng(7), 16, "eye-in-hand", ROBOT, (5e-4, 0.2))
-    eye = truth.pairs.camera_from_board
-    pairs = replace(truth.pairs, camera_from_board=replace(eye, translation=eye.translation / scale))
+    truth, pairs = pairs_of_size(scale, 7, 16)
     found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(16, None, 8))
     assert found.chosen.name == name
     assert found.held_out.board_mm is None
@@ -90,8 +87,7 @@ def pairs_of_size(scale, seed, count=15):
     return truth, replace(truth.pairs, camera_from_board=replace(eye, translation=eye.translation / scale))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", sampled((28, 32, 33, 34), kept=(28, 33)))
+@pytest.mark.parametrize("seed", sampled((28, 32, 33, 34), kept=(0, 2)))
 def test_sound_poses_are_taken_as_filed(seed):
     """Sets on whose poses held out the scale (28, 32) or a closed form (33, 34) is ahead, by chance."""
     truth, pairs = pairs_of_size(1.0, seed)
@@ -189,16 +185,14 @@ def test_steps_from_the_solution_of_all_are_solutions_of_the_others():
     for method in ("pose", "reprojection", "shah"):
         near = solved(truth.pairs, truth.setup, method, truth.views, options).without(out)
         exact = handeye(truth.pairs[remaining], truth.setup, method, truth.views[remaining], options)
-        moved = Poses.of([near.mount_from_camera]).difference(Poses.of([exact.mount_from_camera]))[0]
+        moved = error(near, exact)
         size = [1e-9] * 6 if exact.covariance is None else np.sqrt(np.diag(exact.covariance))
         assert (np.abs(moved) < 0.1 * np.array(size)).all(), method
 
 
 @pytest.mark.slow
 def test_a_board_of_another_unit_is_told_by_a_factor():
-    truth = simulated(np.random.default_rng(7), 12, "eye-in-hand", ROBOT, (5e-4, 0.2))
-    eye = truth.pairs.camera_from_board
-    pairs = replace(truth.pairs, camera_from_board=replace(eye, translation=eye.translation / 2.7))
+    truth, pairs = pairs_of_size(2.7, 7, 12)
     found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(12, None, 4))
     assert "the board is 2.7 ± " in found.sentence
     assert " times as large as stated" in found.sentence

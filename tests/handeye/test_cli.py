@@ -1,13 +1,11 @@
 """``stcal handeye`` as a user types it."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 import yaml
 
-from stcal.cli.main import main
 from stcal.design import BoardDesign
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
@@ -16,22 +14,10 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_dots
-from tests.outcome import ended
-from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
+from tests.support.handeye import FLANGE_FROM_CAMERA, simulated
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 INPUT, COMPUTATION = 2, 3
-
-
-@pytest.fixture
-def command(monkeypatch, capsys):
-    """Exit code, standard output and error."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
 
 
 def write(path, sides: dict[str, Poses], edit=None):
@@ -152,90 +138,19 @@ def test_stated_sigmas_weight(command, tmp_path):
     assert "both or none needed" in err
 
 
-@pytest.mark.slow
-def test_the_boards_size_is_found(command, tmp_path):
-    """The file states a board of 0.96 times its true size."""
-    truth = simulated(np.random.default_rng(8), 20, **NOISE)
-    seen = truth.pairs.camera_from_board
-    small = Poses(seen.rotation, 0.96 * seen.translation)
-    source = write(tmp_path / "p.csv", {"base_from_flange": truth.pairs.base_from_flange, "camera_from_board": small})
-    out = tmp_path / "h.json"
-    code, shown, _ = command(source, "--with-scale", "--out", out)
-    board = json.loads(out.read_text())["board"]
-    assert code == 0
-    assert abs(board["scale"] - 1 / 0.96) < 4 * board["scale_sigma"] < 0.02
-    assert "times its stated size" in shown
-    _, shown, _ = command(source, "--splits", 0)
-    assert "note: by the robot's motion the board is" in shown
-
-
-def test_four_axes(command, tmp_path):
-    """Rotations about the vertical only: all is found but the height."""
-    rng = np.random.default_rng(9)
-    turn = np.column_stack([np.zeros((15, 2)), rng.uniform(-2, 2, 15)])
-    place = np.array([500, 0, 300]) + rng.uniform(-200, 200, (15, 3))
-    flange = Poses.of(Rigid.exp([*w, *t]) for w, t in zip(turn, place, strict=True))
-    seen = FLANGE_FROM_CAMERA.inverse() @ flange.inverse() @ BASE_FROM_BOARD
-    source = write(tmp_path / "p.csv", {"base_from_flange": flange, "camera_from_board": seen})
-    code, _, err = command(source)
-    assert code == COMPUTATION
-    assert "rotate the flange about" in err
-    out = tmp_path / "h.json"
-    code, shown, _ = command(source, "--four-dof", "--splits", 0, "--out", out)
-    assert code == 0
-    data = json.loads(out.read_text())
-    found = np.array(data["flange_from_camera"])
-    assert found[:2, 3] == pytest.approx(FLANGE_FROM_CAMERA.translation[:2], abs=1e-3)
-    assert found[2, 3] == pytest.approx(0, abs=1e-6)
-    assert "is not known along" in shown
-
-
-def change(column: int, value: str):
-    def edit(rows):
-        rows[3][column] = value
-
-    return edit
-
-
-def inverted(sides):
-    return {name: poses.inverse() if name == "camera_from_board" else poses for name, poses in sides.items()}
-
-
-def in_metres(sides):
-    board = sides["camera_from_board"]
-    return sides | {"camera_from_board": Poses(board.rotation, board.translation / 1000)}
-
-
-def first(count: int):
-    return lambda sides: {name: poses[:count] for name, poses in sides.items()}
-
-
-def again(sides):
-    order = [0, 1, 2, 3, 1, 4]
-    return {name: poses[order] for name, poses in sides.items()}
-
-
 @pytest.mark.parametrize(
-    ("alter", "edit", "code", "parts"),
-    [
-        (first(2), None, COMPUTATION, ["2 poses, 3 needed"]),
-        (again, None, INPUT, ["line 3 and line 6 are identical poses"]),
-        (None, change(3, "0.2"), INPUT, ["line 5: quaternion of length", "is the order qw, qx, qy, qz?"]),
-        (None, change(0, "nan"), INPUT, ["line 5: base_from_flange_x_mm is 'nan'"]),
-        (None, change(1, ""), INPUT, ["line 5: base_from_flange_y_mm is ''"]),
-        (inverted, None, INPUT, ["contradict each other", "either these are board_from_camera: rename"]),
-        (in_metres, None, INPUT, ["if they are metres, name the columns x_m"]),
-    ],
+    ("count", "cell", "code", "part"),
+    [(2, "0", COMPUTATION, "2 poses, 3 needed"), (6, "nan", INPUT, "line 3: base_from_flange_x_mm is 'nan'")],
 )
-def test_bad_poses_are_named(command, tmp_path, alter, edit, code, parts):
-    truth = simulated(np.random.default_rng(10), 12, **NOISE).pairs
-    sides = {"base_from_flange": truth.base_from_flange, "camera_from_board": truth.camera_from_board}
-    source = write(tmp_path / "poses.csv", alter(sides) if alter else sides, edit)
+def test_bad_poses_are_named(command, tmp_path, count, cell, code, part):
+    def edit(rows):
+        rows[1][0] = cell
+
+    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(10), count, **NOISE), edit)
     found, out, err = command(source, "--out", tmp_path / "h.json")
     (line,) = err.splitlines()
     assert (found, out) == (code, "")
-    for part in parts:
-        assert part in line
+    assert part in line
     assert not (tmp_path / "h.json").exists()
 
 
@@ -330,7 +245,6 @@ def test_what_images_need_is_said(command, chessboard, tmp_path):
     [
         (["0.png", "0.png"], "line 2 and line 3: both are of image '0.png'"),
         (["a.png", "b.png"], "no row is of an image in"),
-        pytest.param(["0.png", "1.png"], "2 poses, 3 needed", marks=pytest.mark.slow),
     ],
 )
 def test_bad_rows_of_images_are_named(command, chessboard, tmp_path, rows, part):
@@ -340,23 +254,8 @@ def test_bad_rows_of_images_are_named(command, chessboard, tmp_path, rows, part)
     poses.write_text("\n".join([header, *lines]) + "\n")
     images, _, _, *rest = chessboard.arguments()
     code, _, err = command(images, "--poses", poses, *rest, "--workers", 1)
-    assert code == (COMPUTATION if "needed" in part else INPUT)
+    assert code == INPUT
     assert part in err.splitlines()[-1]
-
-
-def test_no_output_replaces_an_input_or_another(command, tmp_path):
-    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 8, **NOISE))
-    before = source.read_text()
-    for options, message in (
-        (("--out", source), "poses.csv: is an input of this command; give another name"),
-        (("--out", tmp_path / "a", "--ros", tmp_path / "b/../a"), "is also what --out writes; give each its own name"),
-        (("--report", tmp_path), "is a folder; the name of a file needed"),
-    ):
-        code, shown, err = command(source, *options, "--splits", 0)
-        assert (code, shown) == (INPUT, "")
-        assert message in err
-    assert source.read_text() == before
-    assert list(tmp_path.iterdir()) == [source]
 
 
 def test_every_form_of_export(command, tmp_path):
@@ -430,20 +329,6 @@ def test_methods_without_splits_are_compared_without_errors(command, tmp_path):
 
 
 @pytest.mark.slow
-def test_errors_of_the_poses_that_agree_are_told_apart(command, tmp_path):
-    def edit(rows):
-        rows[6][0] = repr(float(rows[6][0]) + 15)
-
-    source = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 15, **NOISE), edit)
-    out = tmp_path / "h.json"
-    code, shown, _ = command(source, "--out", out)
-    errors = json.loads(out.read_text())["held_out"]
-    assert code == 0
-    assert "held out, mean without the 1 left out above: rotation" in shown
-    assert errors["agreeing"]["translation_mm"] < 0.7 * errors["translation_mm"]
-
-
-@pytest.mark.slow
 def test_splits_that_hold_out_nothing_but_outliers(command, tmp_path):
     """There is no error of agreeing poses then, and no empty mean."""
 
@@ -476,14 +361,6 @@ def test_what_was_left_out_is_said_with_the_failure(command, chessboard, tmp_pat
     assert " left out before, first 2.png: no row in poses.csv" in err
 
 
-def test_a_board_file_without_a_type_is_said(command, chessboard, tmp_path):
-    board = tmp_path / "board.toml"
-    board.write_text("rows = 5\ncolumns = 8\nsquare_mm = 20.0\n")
-    code, _, err = command(*chessboard.arguments()[:-1], board)
-    assert code == INPUT
-    assert 'board.toml: no type; a file with type = "chessboard", "charuco", "tags", "aprilgrid", ' in err
-
-
 def test_the_order_of_quaternions_is_an_option(command, tmp_path):
     """x, y, z, w under the names of w, x, y, z."""
 
@@ -510,11 +387,9 @@ def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
     assert "first population ±10° about the closed-form solution and ±20 mm about the closed-form solution" in text
     near = Rigid.from_matrix(json.loads(out.read_text())["flange_from_camera"])
     assert np.linalg.norm(near.translation - FLANGE_FROM_CAMERA.translation) < 5
-    code, text, _ = command(path, *words, "--de-bounds-deg", "0,0,90,45", "--de-generations", 0, "--de-population", 4)
+    code, text, _ = command(path, *words, "--de-bounds-deg", "0,0,90,45")
     assert code == 0
     assert "±45° about 0, 0, 90° and as far as the farthest pose about zero" in text
-    far = Rigid.from_matrix(json.loads(out.read_text())["flange_from_camera"])
-    assert np.linalg.norm(far.translation - FLANGE_FROM_CAMERA.translation) > 10  # four candidates at random
 
 
 @pytest.mark.parametrize(
@@ -522,7 +397,7 @@ def test_differential_evolution_begins_where_it_is_told(command, tmp_path):
     [
         (("--method", "de", "--de-bounds-deg", "1,2"), "--de-bounds-deg 1,2: one number, X,Y,Z,± or closed-form,±"),
         (("--method", "de", "--de-bounds-mm", "-5"), "positive half width needed"),
-        (("--method", "pose", "--de-seed", 3), "only with --method de, de-polished or all"),
+        (("--method", "pose", "--de-bounds-mm", 3), "only with --method de, de-polished or all"),
     ],
 )
 def test_what_is_no_bounds_of_differential_evolution(command, tmp_path, words, said):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stcal.geometry.rigid import Poses
 from stcal.handeye import handeye
 from stcal.handeye.data.pairs import read_poses
 from stcal.handeye.solve import HandEyeOptions, solved
@@ -16,7 +15,7 @@ from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
 from stcal.workflows.handeye.calibrate import Splits, calibrate
 from stcal.workflows.handeye.inputs import PREFIXES, HandEyeInput
-from tests.support.handeye import simulated
+from tests.support.handeye import simulated, squared
 
 COMMON = np.array([[1e-3, 0, 0, 0, 0.4, 0], [0, -1e-3, 0, 0.4, 0, 0], [0, 0, 0, 0, 0, 0.8]]).T
 """Errors of the principal point and of the focal length at about 450 mm, rad and mm, (6, 3)."""
@@ -40,12 +39,6 @@ def draw(seed: int, count: int = 16, stated: bool = True, size_sigma: float | No
         camera_from_board_common=common if stated else None,
     )
     return pairs, truth
-
-
-def squared(found, truth) -> float:
-    """eᵀ C⁻¹ e of X, six degrees of freedom."""
-    error = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
-    return float(error @ np.linalg.solve(found.covariance, error))
 
 
 @pytest.mark.slow

@@ -1,20 +1,18 @@
 """The functions of `stcal.workflows` for hand-eye calibration give what their commands write."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 
 import stcal
 from stcal import workflows
-from stcal.cli.main import main
 from stcal.handeye.plan import planned_file
 from stcal.handeye.report.file import HandEyeFile
 from stcal.io.files import json_text
 from stcal.io.table import POSE, pose_cells
 from tests.handeye.test_plan_cli import NOISE, poses_file
-from tests.outcome import ended, fails_with
+from tests.outcome import fails_with
 from tests.support.handeye import simulated
 
 
@@ -24,10 +22,9 @@ def poses(tmp_path):
 
 
 @pytest.fixture
-def written(monkeypatch, capsys, tmp_path):
+def written(command, tmp_path):
     def call(*words) -> dict:
-        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, words), "--json", str(tmp_path / "a.json")])
-        assert ended(main, capsys)[0] == 0
+        assert command(*words, "--json", tmp_path / "a.json")[0] == 0
         return json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
 
     return call
@@ -71,10 +68,3 @@ def test_without_flips(poses):
     given, said = workflows.without_flips(workflows.read_handeye(poses))
     assert given.pairs.camera_from_board == workflows.read_handeye(poses).pairs.camera_from_board
     assert said.endswith("0 of 8 poses: none")
-
-
-def test_a_rig_file_is_read(tmp_path):
-    with fails_with(f"E-FILE-UNREADABLE … {tmp_path}"):
-        workflows.read_handeye_rig(tmp_path / "rig.toml")
-    with fails_with("E-FIELD-TYPE … given … RigInput"):
-        workflows.calibrate_handeye_rig(tmp_path)

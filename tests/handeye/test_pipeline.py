@@ -1,24 +1,25 @@
 """The answer of :func:`stcal.handeye.handeye`: that of the command, from pairs of poses and from matrices."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 
 from stcal import handeye
-from stcal.cli.main import main
 from stcal.geometry.rigid import Poses
-from stcal.io.table import POSE, pose_cells
-from tests.outcome import ended, fails_with
+from tests.handeye.test_cli import NOISE, poses_file
+from tests.outcome import fails_with
 from tests.support.handeye import FLANGE_FROM_CAMERA, simulated
-
-NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 
 
 @pytest.fixture
-def pairs():
-    return simulated(np.random.default_rng(7), 8, **NOISE).pairs
+def truth():
+    return simulated(np.random.default_rng(7), 8, **NOISE)
+
+
+@pytest.fixture
+def pairs(truth):
+    return truth.pairs
 
 
 def metres(poses: Poses) -> np.ndarray:
@@ -27,16 +28,11 @@ def metres(poses: Poses) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [None, "pose"])
-def test_the_answer_is_that_of_the_command(pairs, method, tmp_path, monkeypatch, capsys):
+def test_the_answer_is_that_of_the_command(command, truth, pairs, method, tmp_path):
     """To the last digits of the file: result, method and σ, which poses held out widen here."""
-    path, out = tmp_path / "poses.csv", tmp_path / "result.json"
-    sides = pairs.base_from_flange, pairs.camera_from_board
-    names = [f"{side}_{column}" for side in ("base_from_flange", "camera_from_board") for column in POSE]
-    rows = [[cell for pose in row for cell in pose_cells(pose)] for row in zip(*sides, strict=True)]
-    path.write_text("\n".join(",".join(line) for line in [names, *rows]) + "\n")
-    words = ["stcal", "handeye", path, "--out", out, *(["--method", method] if method else [])]
-    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-    assert ended(main, capsys)[0] == 0
+    out = tmp_path / "result.json"
+    words = ["--method", method] if method else []
+    assert command(poses_file(tmp_path / "poses.csv", truth), "--out", out, *words)[0] == 0
     said, found = json.loads(out.read_text()), handeye.handeye(pairs, method=method)
     assert said["method"] == found.method
     np.testing.assert_allclose(said["flange_from_camera"], found.mount_from_camera.matrix(), atol=1e-6)

@@ -9,7 +9,7 @@ from stcal.handeye.data.pairs import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
 from stcal.handeye.solve import handeye
 from tests.outcome import fails_with
-from tests.support.handeye import CAMERA, board_corners, disturbed, simulated
+from tests.support.handeye import CAMERA, board_corners, disturbed, simulated, squared
 
 ROBOT, SEEN = (5e-4, 0.2), (2e-4, 0.05)
 OUTLINE = board_corners(8, 7, 25.0)
@@ -36,21 +36,20 @@ def with_more(truth, planned, rng):
 def test_sigma_comes_out_as_planned(setup):
     """The information of poses within a degree and a few mm of those planned: 10 %. Errors of X are then within what
     the σ of the new result say: χ² of six numbers, of which four sets of eight exceed 12 in one case in a thousand."""
-    squared = []
+    errors = []
     for seed in range(4):
         truth, found = few(seed, setup)
         planned = plan_poses(truth.pairs, found, 3, OUTLINE, CAMERA)
         again = with_more(truth, planned, np.random.default_rng(seed))
         result = handeye(again, setup, "pose", options=HandEyeOptions(Noise(*ROBOT, *SEEN)))
-        off = Poses.of([result.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
-        squared.append(off @ np.linalg.solve(result.covariance, off))
+        errors.append(squared(result, truth))
         eye = truth.pairs.camera_from_board
         points = judged_at(eye.rotation @ OUTLINE.mean(0) + eye.translation)
         now = worst_sigma(np.linalg.inv(result.covariance), result.mount_from_camera, points)
         assert now == pytest.approx(planned.sigma_mm[-1], rel=0.1)
         assert planned.sigma_mm[-1] < planned.sigma_mm[0] / 2
         assert (np.diff(planned.sigma_mm) < 0).all()
-    assert np.sum(squared) < 51.2  # χ² of 24, one in a thousand
+    assert np.sum(errors) < 51.2  # χ² of 24, one in a thousand
 
 
 def test_planned_poses_are_better_than_such_as_were_taken():

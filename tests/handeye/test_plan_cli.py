@@ -2,33 +2,24 @@
 
 import csv
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.model import mh80
 from tests.handeye.test_cli import NOISE, poses_file
-from tests.outcome import ended
 from tests.support.handeye import simulated
 
 INPUT = 2
 
 
 @pytest.fixture
-def plan(monkeypatch, capsys):
-    """Exit code, standard output and error."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", "plan", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
+def plan(command):
+    return lambda *arguments: command("plan", *arguments)
 
 
 @pytest.fixture

@@ -68,6 +68,8 @@ def test_errors_of_a_stated_pair_widen_sigma():
     right = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(0.0, 0.0, 1e-3, 0.3)))
     told = handeye(truth.pairs, options=HandEyeOptions(noise=Noise(0.0, 0.0, 2e-4, 0.06)))
     np.testing.assert_allclose(np.diag(told.covariance), np.diag(right.covariance), rtol=0.5)
+    assert "times what the stated σ make expect" in told.notes[-1]
+    assert right.notes == ()
 
 
 @pytest.mark.parametrize("setup", ["eye-in-hand", "eye-to-hand"])

@@ -1,31 +1,17 @@
 """``stcal handeye`` with poses by time: a stream of the robot's, and times of the camera."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
-from tests.handeye.rig.photographed import BOARD, write_poses
-from tests.outcome import ended
+from tests.handeye.photographed import BOARD, write_poses
 from tests.support.handeye_stream import StreamTruth, simulated_stream
 
 INPUT, COMPUTATION = 2, 3
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
-
-
-@pytest.fixture
-def command(monkeypatch, capsys):
-    """Exit code, standard output and error."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, arguments)])
-        return ended(main, capsys)
-
-    return call
 
 
 def tum(path: Path, times: np.ndarray, poses: Poses) -> Path:
@@ -68,27 +54,6 @@ def test_the_offset_is_found_and_used(command, tmp_path):
     assert "time_offset" not in plain
     assert plain["rms"]["translation_mm"] > 5 * found["rms"]["translation_mm"]
     assert "poses by time: 16 times in 1200 samples of robot.txt: 16 interpolated (cubic; samples 0.02 s apart" in shown
-
-
-def test_what_lies_outside_is_left_out(command, tmp_path):
-    truth = simulated_stream(np.random.default_rng(7), 16, offset_s=0.0)
-    code, shown, _ = command(*two_files(tmp_path, truth, late=4.0), "--dry-run")
-    assert code == 0
-    last = truth.seconds[-1] + 4 - truth.stream.seconds[-1]
-    assert f"{last:.4g} s after the samples of robot.txt, 0.02 s allowed (--time-tolerance)" in shown
-    assert "left out" in shown
-
-
-def test_a_robot_that_stands_still_has_no_offset(command, tmp_path):
-    truth = simulated_stream(np.random.default_rng(5), 12, still=True)
-    far = np.abs(truth.seconds[:, None] - truth.seconds[None]) + 9 * np.eye(len(truth.seconds))
-    alone = np.flatnonzero(far.min(1) > 0.6)
-    kept = StreamTruth(
-        truth.stream, truth.pairs[alone], truth.seconds[alone], 0.0, truth.mount_from_camera, truth.setup
-    )
-    code, _, error = command(*two_files(tmp_path, kept), "--time-offset", "--splits", 0)
-    assert code == COMPUTATION
-    assert "the flange stands still at the images" in error
 
 
 def photographs(folder: Path, names: list[str], times: np.ndarray) -> list:

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import (
-    METHODS,
     HandEyeOptions,
     HandEyePoses,
     Noise,
@@ -86,20 +85,6 @@ def test_solutions_of_parts_scatter_as_sigma_says():
         assert any("solutions of parts of the poses scatter" in note for note in wide.notes)
     assert np.mean(ratios) == pytest.approx(1, abs=0.15)
     assert np.isnan(scatter(handeye(truth.pairs, truth.setup, "li"), held_out))
-
-
-@pytest.mark.slow
-def test_compare_lists_every_method():
-    truth = simulated_views(np.random.default_rng(3), 10, robot=(3e-4, 0.1), corner_px=0.1)
-    found = compare(truth.pairs, views=truth.views, rows=splits(10, 3, 2))
-    assert tuple(c.method for c in found) == METHODS
-    errors = {c.method: c.held_out.means()["board_mm"] for c in found}
-    assert all(np.isfinite(list(errors.values())))
-    assert errors["reprojection"] < 1.3 * min(errors.values())
-    assert all(c.result.method == c.method for c in found)
-    poses_only = compare(truth.pairs, rows=splits(10, 3, 2), methods=("pose", "reprojection", "shah"))
-    assert [c.method for c in poses_only] == ["pose", "shah"]
-    assert poses_only[0].held_out.board_mm is None
 
 
 def test_a_method_that_fails_says_why():

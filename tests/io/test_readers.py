@@ -6,7 +6,6 @@ One key more is named. Camera files: ``test_camera_programs.py``.
 import json
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, require_own
 from stcal.handeye.data.robot_poses import read_robot_poses
-from stcal.handeye.data.views import read_rig_file
 from stcal.io.design import load_target
 from stcal.io.files import text_of
 from stcal.io.poses.columns import read_mapped
@@ -111,9 +109,6 @@ URDF = '<robot name="a">\n  <link name="base_link"/>\n' + "".join(
     for i, parent, roll in ((1, "base_link", 0.0), (2, "l1", 1.5), (3, "l2", -1.5))
 )
 URDF += "</robot>\n"
-RIG = 'setup = "eye-in-hand"\nboard = "b.toml"\nposes = "p.csv"\n' + "".join(
-    f'\n[[camera]]\nname = "{name}"\nimages = "{name}"\ncamera = "c.yaml"\ncamera_name = "{name}"\n' for name in "ab"
-)
 CONF = (
     "[mounting]\ndelta_theta = [ 1e-5, 0.3, -0.3, 1e-5, -2e-5, 0]\ndelta_a = [ 1e-5, 0.02, 3e-3, -5e-5, 8e-6, 0]\n"
     "delta_d = [ 4e-5, 300.0, -320.0, 20.0, 1e-5, -4e-4]\ndelta_alpha = [ 1e-4, 3e-4, 6e-3, -1e-3, -2e-4, 0]\n"
@@ -136,10 +131,6 @@ def of_conf(path: Path) -> np.ndarray:
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error}") from error
     assert is_conf(text)
     return np.array(robot_toml(robot_of_conf(text, str(path), None, "standard")).splitlines())
-
-
-def of_rig(path: Path) -> np.ndarray:
-    return np.array([repr(replace(read_rig_file(path), file=path))])
 
 
 def of_columns(path: Path) -> np.ndarray:
@@ -248,7 +239,6 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
     ),
     "URDF": (URDF, of_urdf),
     "calibration.conf": (CONF, of_conf),
-    "rig": (RIG, of_rig),
     "map of columns": (
         'delimiter = "semicolon"\ndecimal_comma = true\n\n[columns]\nx_mm = "A"\ny_mm = "B"\n',
         of_columns,

@@ -54,7 +54,7 @@ def test_every_command_with_a_camera_chooses_one_of_several():
 def test_every_command_with_photographs_reads_mosaics():
     for name, command in COMMANDS.items():
         options = inspect.signature(command).parameters
-        reads = bool({"images", "exposures", "rig_file"} & options.keys()) and name not in WRITE_PHOTOGRAPHS
+        reads = bool({"images", "exposures"} & options.keys()) and name not in WRITE_PHOTOGRAPHS
         assert (reads or name in SOURCES) == ("bayer" in options), name
 
 

@@ -9,6 +9,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import View, Views, pairs_of_views
+from stcal.handeye.result import HandEye
 
 FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True).as_matrix(), [35.0, -62.0, 84.0])
 BASE_FROM_BOARD = Rigid(Rotation.from_euler("zyx", [30, 176, 3], degrees=True).as_matrix(), [780.0, 120.0, 60.0])
@@ -67,6 +68,22 @@ def simulated_views(
     )
     views = Views(camera, views)
     return Truth(pairs_of_views(disturbed(rng, base_from_flange, *robot), views), views, x, z, setup)
+
+
+def error(found: HandEye, truth: Truth) -> np.ndarray:
+    """Of X, (6,), as its covariance states it."""
+    return Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
+
+
+def squared(found: HandEye, truth: Truth) -> float:
+    """eᵀ C⁻¹ e of X, six degrees of freedom."""
+    off = error(found, truth)
+    return float(off @ np.linalg.solve(found.covariance, off))
+
+
+def normalised(errors, covariances) -> float:
+    """RMS of errors in units of their covariances."""
+    return float(np.sqrt(np.mean([e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True)]) / 6))
 
 
 def board_corners(columns: int, rows: int, square_mm: float) -> np.ndarray:

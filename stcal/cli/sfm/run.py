@@ -14,14 +14,6 @@ from stcal.io.files import keep_apart
 app = typer.Typer()
 
 
-Frame = Literal["plane", "three-point"]
-"""Definition of a face's frame."""
-
-
-PairsChoice = Literal["all", "sparse"]
-"""Choice of the pairs of images that are matched."""
-
-
 ComparedWith = Literal["paper"]
 """Method with which a run's result is compared."""
 
@@ -41,11 +33,6 @@ def run(
         Solve | None,
         "Use joint, one adjustment over all groups (default); chain, group by group; or paper, the whole method of "
         "Zhang & Wei (2017) as published, including detection, for comparison.",
-    ] = None,
-    frame: Annotated[
-        Frame | None,
-        "Define a face's frame by plane: Z is the normal of the plane of all its circles (default); or by "
-        "three-point, as in the paper.",
     ] = None,
     reference_face: Annotated[
         str | None, "Take the frame of this face as the target frame; the first if not given."
@@ -75,10 +62,6 @@ def run(
     compare: Annotated[
         ComparedWith | None,
         "Solve the same photographs as published too (paper), and show what each later step improves.",
-    ] = None,
-    pairs: Annotated[
-        PairsChoice | None,
-        "Match all pairs of images, or a sparse set that connects every circle; sparse above 80 images if not given.",
     ] = None,
     exclude: shared.Exclude = None,
     every: Annotated[
@@ -111,7 +94,6 @@ def run(
 
     options = RunOptions(
         solve=solve,
-        frame=frame,
         eccentricity=eccentricity,
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
@@ -119,7 +101,6 @@ def run(
         rim=rim,
         board_only=board_only,
         compare=compare,
-        graph=pairs,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
         ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,

@@ -18,7 +18,7 @@ from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.formats.record import FRAMES
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
-from stcal.handeye.data.views import View, Views
+from stcal.handeye.data.views import Views
 from stcal.handeye.judge.remarks import Aside, Grave, of_still, spoken
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
@@ -401,7 +401,7 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         camera_from_board_common=None if common is None else carried @ common,
     )
     if views is not None:
-        turned = (turned_view(view, every[k]) for view, k in zip(views.views, best, strict=True))
+        turned = (view.turned(every[k].inverse()) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))
     return Repair(repaired, views, best)
 
@@ -470,11 +470,6 @@ def _carried(seen: Poses, poses: Poses) -> np.ndarray:
     jacobian = np.tile(np.eye(6), (len(poses), 1, 1))
     jacobian[:, 3:, :3] = -skew(poses.translation - seen.translation)
     return jacobian
-
-
-def turned_view(view: View, turn: Rigid) -> View:
-    """Returns the same corners under the numbers that they have after the turn."""
-    return view.turned(turn.inverse())
 
 
 PUT_RIGHT = 0.2

@@ -1,6 +1,5 @@
-"""Unknowns and residuals of a hand-eye adjustment with one camera or several, and of an arm that is adjusted too."""
+"""Unknowns and residuals of a hand-eye adjustment from corners, and of an arm that is adjusted too."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
@@ -247,19 +246,27 @@ class Corners:
         """Returns the number of unknowns besides the corners of the board, which come last."""
         return self.places()["board"].start
 
-    def own_groups(self, state: Bundle) -> "list[Group]":
-        """Returns the observations of this camera: the corners seen, and the prior knowledge of its intrinsics."""
-        groups, place = [self._seen_group(state)], self.places()["camera"]
+    def parts(self, state: Bundle) -> "dict[str, Part]":
+        """Returns all observations by the name of their σ."""
+        return {name: part for group in self.groups(state) for name, part in group.parts.items()}
+
+    def linear(self, state: Bundle) -> Equations:
+        """Returns cost and normal equations; the cost is infinite where a corner lies behind the camera."""
+        if not self.in_front(state):
+            return Equations.impossible(self.kept(), self._corners())
+        groups = self.groups(state)
+        equations = reduce(add, (part.equations for group in groups for part in group.parts.values()))
+        return replace(equations, cost=sum(group.cost for group in groups))
+
+    def groups(self, state: Bundle) -> "list[Group]":
+        """Returns all observations: the corners seen, the prior knowledge of the intrinsics, the board as designed, the
+        robot's poses as reported, and the arm as filed."""
+        groups, at = [self._seen_group(state)], self.places()
         if self.basis.shape[1]:
             deviation = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
             for name, rows in self.camera_parts():
                 root = np.linalg.cholesky(self.information[rows][:, rows]).T / self.sigma[name]
-                groups.append(self._prior(name, root @ deviation[rows], root, place.start + rows))
-        return groups
-
-    def shared_groups(self, state: Bundle) -> "list[Group]":
-        """Returns the observations that all cameras share: the board as designed, and the robot's poses as reported."""
-        at, groups = self.places(), []
+                groups.append(self._prior(name, root @ deviation[rows], root, at["camera"].start + rows))
         if at["board"].stop > at["board"].start:
             nothing, information = self._nothing(), 1 / self.sigma["board_mm"] ** 2
             deviation = state.corners - self.xyz_board
@@ -373,158 +380,3 @@ class Group:
 
     cost: float
     parts: dict[str, Part]
-
-
-def summed(groups: Sequence[Group]) -> Equations:
-    """Returns the sum of all equations, with Huber's cost."""
-    equations = reduce(add, (part.equations for group in groups for part in group.parts.values()))
-    return replace(equations, cost=sum(group.cost for group in groups))
-
-
-POSE_PARAMETERS = 6
-"""Number of unknowns of a pose."""
-SHARED = ("scale", "arm", "robot", "board")
-"""Unknowns of all cameras together, in their order."""
-OWN = ("corner_px", "camera")
-"""First parts of the names of the groups that each camera has of its own."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigBundle:
-    """The unknowns: X and intrinsics of each camera, Z, the true base_from_flange (m), the board's corners (K, 3) and
-    scale, and a step of the arm's parameters (k,)."""
-
-    mount_from_camera: tuple[Rigid, ...]
-    stand_from_board: Rigid
-    base_from_flange: Poses
-    corners: np.ndarray
-    camera: tuple[Camera, ...]
-    scale: float = 1.0
-    arm: np.ndarray = field(default_factory=lambda: np.zeros(0))
-
-    def of(self, i: int) -> Bundle:
-        """Returns the unknowns of one camera's problem."""
-        x, camera = self.mount_from_camera[i], self.camera[i]
-        return Bundle(x, self.stand_from_board, self.base_from_flange, self.corners, camera, self.scale, self.arm)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigCorners:
-    """``names`` : of the cameras; ``each`` : measurements of each camera, with the same poses of the robot, the same
-    corners of the board and the same σ of both. The name of a σ that belongs to one camera ends in a colon and the
-    camera's name, unless that is empty."""
-
-    names: tuple[str, ...]
-    each: tuple[Corners, ...]
-
-    @property
-    def base_from_flange(self) -> Poses:
-        """The m poses of the flange, as reported."""
-        return self.each[0].base_from_flange
-
-    @property
-    def sigma(self) -> dict[str, float]:
-        """σ of each group."""
-        sigma_of_group = {}
-        for name, corners in zip(self.names, self.each, strict=True):
-            sigma_of_group |= {_renamed(key, name): value for key, value in corners.sigma.items()}
-        return sigma_of_group
-
-    def places(self) -> dict[str, slice]:
-        """Returns the slices of the unknowns in a step: all X, Z, the intrinsics of all cameras, and the shared
-        unknowns."""
-        shared = self.each[0].places()
-        sizes = {
-            "x": POSE_PARAMETERS * len(self.each),
-            "z": POSE_PARAMETERS,
-            "camera": sum(corners.basis.shape[1] for corners in self.each),
-        }
-        sizes |= {name: shared[name].stop - shared[name].start for name in SHARED}
-        ends = np.cumsum([0, *sizes.values()])
-        return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
-
-    def columns(self, i: int) -> np.ndarray:
-        """Returns the columns, among all unknowns, of the unknowns of one camera's problem."""
-        at, places = self.places(), self.each[i].places()
-        before = sum(corners.basis.shape[1] for corners in self.each[:i])
-        first = {name: place.start for name, place in at.items()}
-        first |= {"x": POSE_PARAMETERS * i, "camera": at["camera"].start + before}
-        return np.concatenate([first[name] + np.arange(place.stop - place.start) for name, place in places.items()])
-
-    def count(self) -> int:
-        """Returns the number of unknowns."""
-        return max(place.stop for place in self.places().values())
-
-    def robot_weight(self) -> np.ndarray:
-        """Returns the whitening (m, 6, 6) of errors of base_from_flange."""
-        return self.each[0].robot_weight()
-
-    def factors(self) -> dict[str, float]:
-        """Returns a factor of 1 for each kind of the intrinsics solved for."""
-        factor_of_kind = {}
-        for name, corners in zip(self.names, self.each, strict=True):
-            factor_of_kind |= {_renamed(key, name): value for key, value in corners.factors().items()}
-        return factor_of_kind
-
-    def only(self, keep: np.ndarray) -> "RigCorners":
-        """Returns the problem of the poses ``keep``, a mask (m,)."""
-        return replace(self, each=tuple(own.only(keep) for own in self.each))
-
-    def with_sigma(self, sigma: dict[str, float]) -> "RigCorners":
-        """Returns the same problem with other σ."""
-        problems = []
-        for name, corners in zip(self.names, self.each, strict=True):
-            problems.append(replace(corners, sigma={key: sigma[_renamed(key, name)] for key in corners.sigma}))
-        return replace(self, each=tuple(problems))
-
-    def with_intrinsics(self, known: dict[int, tuple[np.ndarray, np.ndarray]]) -> "RigCorners":
-        """Returns the same problem with intrinsics of some cameras among the unknowns: basis and information, by number
-        of the camera."""
-        each = (own.with_intrinsics(*known[i]) if i in known else own for i, own in enumerate(self.each))
-        return replace(self, each=tuple(each))
-
-    def moved(self, state: RigBundle, step: np.ndarray) -> RigBundle:
-        """Returns the state after a step of all unknowns."""
-        moved = [corners.moved(state.of(i), step[self.columns(i)]) for i, corners in enumerate(self.each)]
-        x, cameras, first = (m.mount_from_camera for m in moved), (m.camera for m in moved), moved[0]
-        return RigBundle(
-            tuple(x),
-            first.stand_from_board,
-            first.base_from_flange,
-            first.corners,
-            tuple(cameras),
-            first.scale,
-            first.arm,
-        )
-
-    def parts(self, state: RigBundle) -> dict[str, Part]:
-        """Returns all observations by the name of their σ: what each camera saw, and the prior knowledge."""
-        return {name: part for group in self.groups(state) for name, part in group.parts.items()}
-
-    def groups(self, state: RigBundle) -> list[Group]:
-        """Returns all observations: what each camera saw, and the prior knowledge."""
-        count, observations = self.places()["board"].start, []
-        for i, (name, corners) in enumerate(zip(self.names, self.each, strict=True)):
-            columns = self.columns(i)[: corners.kept()]
-            observations += [_among(group, columns, count, name) for group in corners.own_groups(state.of(i))]
-        columns = self.columns(0)[: self.each[0].kept()]
-        return observations + [_among(group, columns, count, "") for group in self.each[0].shared_groups(state.of(0))]
-
-    def linear(self, state: RigBundle) -> Equations:
-        """Returns cost and normal equations; the cost is infinite where a corner lies behind its camera."""
-        if not all(own.in_front(state.of(i)) for i, own in enumerate(self.each)):
-            at = self.places()["board"]
-            return Equations.impossible(at.start, (at.stop - at.start) // 3)
-        return summed(self.groups(state))
-
-
-def _renamed(key: str, name: str) -> str:
-    return f"{key}:{name}" if name and key.startswith(OWN) else key
-
-
-def _among(group: Group, columns: np.ndarray, count: int, name: str) -> Group:
-    """Returns one camera's group with its columns among all unknowns that are kept."""
-    parts = {
-        _renamed(key, name): Part(part.count, part.equations.among(columns, count)) for key, part in group.parts.items()
-    }
-    return Group(group.cost, parts)

@@ -6,7 +6,7 @@ little as one for the others alone.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 
@@ -62,16 +62,6 @@ class Equations:
             factor * self.slope,
             cross,
         )
-
-    def among(self, columns: np.ndarray, count: int) -> "Equations":
-        """Returns the equations with the kept unknowns at the places ``columns`` among ``count``."""
-        normal, gradient = np.zeros((count, count)), np.zeros(count)
-        normal[np.ix_(columns, columns)], gradient[columns] = self.normal, self.gradient
-        cross = None
-        if self.cross is not None:
-            cross = np.zeros((*self.block.shape[:2], count))
-            cross[:, :, columns] = self.cross
-        return replace(self, normal=normal, gradient=gradient, cross=cross)
 
     def eliminated(self, damping: float = 0.0) -> "Eliminated":
         """Returns the equations without the corners, with this share of each unknown's information added."""

@@ -1,7 +1,6 @@
-"""Reprojection adjustment of one camera or of several: X of each, one Z, one board and one robot, from all corners; and
-the effect of an error of a camera file."""
+"""Reprojection adjustment of X, Z, board and robot from all corners; and the effect of an error of a camera file."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -13,29 +12,18 @@ from stcal.errors import DegenerateError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.pairs import Loop, Setup
-from stcal.handeye.data.views import RigCamera, RigPoses, Views, whitened
-from stcal.handeye.methods.bundle import (
-    ARM_ROUNDS,
-    SETTLED_MM,
-    ArmModel,
-    Bundle,
-    LinearArm,
-    RigBundle,
-    RigCorners,
-    camera_parts,
-)
+from stcal.handeye.data.pairs import Loop
+from stcal.handeye.data.views import Views, whitened
+from stcal.handeye.methods.bundle import ARM_ROUNDS, SETTLED_MM, ArmModel, Bundle, Corners, LinearArm, camera_parts
 from stcal.handeye.methods.equations import Equations
 from stcal.handeye.methods.noise import Noise, adjust, estimated
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES, LoopState, PoseSolution
 from stcal.handeye.methods.reprojection import (
-    CAMERA_GAIN,
     FIRST,
     GROSS_RAD,
     GROSS_SHARE,
     UNKNOWN_LENS,
     Reprojection,
-    board_of,
     found_of,
     problem,
 )  # fmt: skip
@@ -50,8 +38,8 @@ SETTLED = 1e-3
 class CameraError:
     """``slope`` : (12, q) derivative of the gradient of X and Z by the intrinsics; ``moment`` : (q, q) second moment of
     the intrinsics' error about zero, from the prior and from the corners; ``noise`` : (12, 12) covariance of the
-    gradient by all other errors, None where it equals the normal matrix. For a rig of c cameras, 6c + 6 replaces 12;
-    with the scale among the unknowns, 13 does."""
+    gradient by all other errors, None where it equals the normal matrix. With the scale among the unknowns, 13 replaces
+    12."""
 
     slope: np.ndarray
     moment: np.ndarray
@@ -64,7 +52,7 @@ class CameraError:
         return without_camera + moved @ self.moment @ moved.T
 
 
-def considered(wider: RigCorners, state: RigBundle, free: tuple[str, ...]) -> CameraError:
+def considered(wider: Corners, state: Bundle, free: tuple[str, ...]) -> CameraError:
     """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``.
 
     Parameters that are not solved for, but are not exact either, are *considered* (Schmidt 1966; Bierman,
@@ -75,7 +63,7 @@ def considered(wider: RigCorners, state: RigBundle, free: tuple[str, ...]) -> Ca
     factors, poses = wider.factors(), wider.places()["z"].stop
     sigma = wider.sigma | estimated(wider, state, (*free, *factors))
     camera = np.arange(wider.places()["camera"].start, wider.places()["camera"].stop)
-    left = wider.with_sigma(sigma).linear(state).eliminated()
+    left = replace(wider, sigma=sigma).linear(state).eliminated()
     covariance = generalised_inverse(left.normal)
     error = -covariance[camera] @ left.gradient
     # Equations and gradient noise of all other observations, in units of the σ that weighted the solution.
@@ -177,12 +165,6 @@ def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, pri
     return second
 
 
-LEAST_VIEWS = 1
-"""Least number of views of a camera. One image of a board gives the camera's place if other cameras give the
-board's."""
-MISSED = 3.0
-"""Factor over the usual discrepancy between a view's own pose of the board and that of the others, from which the view
-is doubted."""
 INFLUENCE_STEPS, LEAST_DAMPING = 2, 1e-9
 """Number of steps from the solution of all poses to one without some of them, and their damping, which only keeps
 directions that nothing determines."""
@@ -192,48 +174,40 @@ SEEN = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """An adjustment of c cameras.
+    """An adjustment of corners.
 
-    ``loops`` : the loop of each camera, with all its views; ``rows`` : the poses of the robot that were used;
-    ``corners`` : problem of these poses, ``state`` : its solution, ``linear`` : its normal equations there; ``used`` :
-    which views of each camera were used; ``outliers`` : (m,) poses of the robot that contradict the others;
-    ``covariance`` : (6c + 6, 6c + 6) of all X and Z; ``camera_error`` : error of the intrinsics as filed, which it does
-    not hold, where their prior is known; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : groups whose σ were
-    estimated; ``scale_hint`` : the scale if it were solved for, and its σ; ``camera_gain`` : (c,) fall of the cost per
-    parameter if a camera's intrinsics were solved for; ``found`` : results of each camera; ``settled`` : whether the
-    estimated σ settled.
+    ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses, ``state``
+    : its solution, ``linear`` : its normal equations there; ``covariance`` : (12, 12) of X and Z; ``camera_error`` :
+    error of the intrinsics as filed, which it does not hold, where their prior is known; ``sigma_scale``; ``sigma`` :
+    by group; ``estimated`` : groups whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its
+    σ; ``camera_gain`` : fall of the cost per parameter if the intrinsics were solved for; ``found`` : other results;
+    ``settled`` : whether the estimated σ settled.
     """
 
-    loops: tuple[Loop, ...]
-    rows: np.ndarray
-    corners: RigCorners
-    state: RigBundle
+    loop: Loop
+    used: np.ndarray
+    corners: Corners
+    state: Bundle
     linear: Equations
-    used: tuple[np.ndarray, ...]
-    outliers: np.ndarray
     covariance: np.ndarray
     camera_error: CameraError | None
     sigma_scale: float | None
     sigma: dict[str, float]
     estimated: tuple[str, ...]
     scale_hint: tuple[float, float]
-    camera_gain: np.ndarray
-    found: tuple[Reprojection, ...]
+    camera_gain: float
+    found: Reprojection
     settled: bool
 
-    def whole_covariance(self) -> np.ndarray:
-        """Returns the covariance of all X and Z, with the errors of intrinsics as filed."""
-        return self.covariance if self.camera_error is None else self.camera_error.covariance(self.covariance)
-
     def normal(self) -> np.ndarray:
-        """Returns the normal matrix (6c + 6, 6c + 6) of all X and Z, all other unknowns eliminated."""
+        """Returns the normal matrix (12, 12) of X and Z, all other unknowns eliminated."""
         normal, k = self.linear.eliminated().normal, len(self.covariance)
         return normal[:k, :k] - normal[:k, k:] @ generalised_inverse(normal[k:, k:]) @ normal[k:, :k]
 
-    def without(self, out: np.ndarray) -> RigBundle:
+    def without(self, out: np.ndarray) -> Bundle:
         """Returns the solution without the poses ``out``, rows among all: by steps from the solution of all, with its
         σ. The error of such a step is of second order in a small change (influence: Cook & Weisberg 1982)."""
-        keep = ~np.isin(self.rows, out)
+        keep = ~np.isin(np.flatnonzero(self.used), out)
         corners, state = self.corners.only(keep), self.state
         state = replace(state, base_from_flange=state.base_from_flange[keep])
         for _ in range(INFLUENCE_STEPS):
@@ -255,7 +229,7 @@ def adjust_views(
     camera: CameraPrior | None = None,
     arm: ArmModel | None = None,
 ) -> Adjusted:
-    """Returns the least-squares adjustment of all corners of one camera from ``first`` X, Z, scale.
+    """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale.
 
     ``loop`` holds the same poses; its poses of the board come from ``views``. Unknowns are X, Z, and, according to
     their σ, the true poses of the robot and the true places of the board's corners. Intrinsics about ``intrinsics``
@@ -266,111 +240,82 @@ def adjust_views(
 
     Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses agree.
     """
-    rows, refine = np.arange(len(views)), intrinsics is not None
-    one = RigCamera("", views, rows, ("",) * len(rows), intrinsics if refine else camera)
-
-    def adjusted(loop: Loop, flange: Poses, first, *arm) -> Adjusted:
-        x, z, scale = first
-        poses = RigPoses(flange, (one,), where="hand-eye")
-        return _adjusted(poses, [loop], ([x], z, scale), noise, refine, with_scale, *arm, each_view=False)
-
     if arm is None:
-        return adjusted(loop, base_from_flange, first)
+        return _adjusted(loop, base_from_flange, views, first, noise, intrinsics, with_scale, camera)
     parameters, sigma = np.zeros(len(arm.angles)), FIRST
     for _ in range(ARM_ROUNDS):
         linear, flange = LinearArm.about(arm, parameters), arm.poses(parameters)
         moved = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
-        result = adjusted(moved, flange, first, linear, sigma)
+        result = _adjusted(moved, flange, views, first, noise, intrinsics, with_scale, camera, linear, sigma)
         sigma, state = FIRST | result.sigma, result.state
         parameters = parameters + state.arm
-        first = (state.mount_from_camera[0], state.stand_from_board, state.scale)
+        first = (state.mount_from_camera, state.stand_from_board, state.scale)
         if linear.moves_mm(state.arm) < SETTLED_MM:
             return result
     return replace(result, settled=False)
 
 
-def adjust_rig(
-    given: RigPoses,
-    setup: Setup,
-    first: tuple[list[Rigid], Rigid, float],
-    noise: Noise,
-    refine: bool = False,
-    with_scale: bool = False,
-) -> Adjusted:
-    """Returns the least-squares adjustment of all corners of all cameras from ``first`` X of each, Z, scale.
-
-    It is like :func:`adjust_views`. The error of each pose of the robot is one unknown, to which all images from that
-    pose contribute, and σ of the robot is estimated over all images. Poses of the robot that contradict the others are
-    left out, and so is an image that contradicts the others of the same pose.
-
-    Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses of the robot agree,
-    or no view of a camera agrees.
-    """
-    loops = [Loop.of(given.pairs(i), setup) for i in range(len(given.cameras))]
-    return _adjusted(given, loops, first, noise, refine, with_scale)
-
-
 def _adjusted(
-    given: RigPoses,
-    loops: Sequence[Loop],
-    first: tuple[list[Rigid], Rigid, float],
+    loop: Loop,
+    base_from_flange: Poses,
+    views: Views,
+    first: tuple[Rigid, Rigid, float],
     noise: Noise,
-    refine: bool,
+    intrinsics: CameraPrior | None,
     with_scale: bool,
+    camera: CameraPrior | None,
     arm: LinearArm | None = None,
     sigma: Mapping[str, float] = FIRST,
-    each_view: bool = True,
 ) -> Adjusted:
     """Returns the adjustment with the arm, if there is one, linearised. ``sigma`` : first guesses of the σ that are
-    estimated; ``each_view`` : whether single views are tested, besides poses of the robot."""
-    used = tuple(_near(loop, x, *first[1:]) for loop, x in zip(loops, first[0], strict=True))
-    outliers = np.zeros(len(given), bool)
+    estimated."""
+    used, good = _near(loop, *first), len(loop)
     while True:
-        rows = _rows(given, used, outliers)
-        corners, free = _problem(given, loops, used, rows, noise, refine, with_scale, arm, sigma)
-        cameras, one = tuple(camera.views.camera for camera in given.cameras), corners.each[0]
+        rows = np.flatnonzero(used)
+        if len(rows) < 3:
+            raise DegenerateError(
+                "E-HANDEYE-DISAGREE",
+                f"hand-eye: {len(rows)} of {good} poses of the robot agree, 3 needed; check that poses and images "
+                "belong together, and the conventions of both",
+            )
+        flange, linear_arm = base_from_flange[rows], None if arm is None else arm[rows]
+        corners, free = problem(loop[rows], flange, views[rows], noise, intrinsics, with_scale, linear_arm, sigma)
         no_step = np.zeros(0 if arm is None else len(arm.parameters))
-        begin = RigBundle(tuple(first[0]), first[1], one.base_from_flange, one.xyz_board, cameras, first[2], no_step)
+        begin = Bundle(*first[:2], flange, corners.xyz_board, views.camera, first[2], no_step)
         solution = adjust(corners, begin, free)
         corners, state = solution.corners, solution.state
         inverse = solution.linear.inverse()
         bad = contradicting(corners, state, inverse)
-        if bad.any() and len(rows) - bad.sum() >= LEAST_POSES:
-            outliers[rows[bad]] = True
-            used = tuple(u & ~outliers[c.rows] for u, c in zip(used, given.cameras, strict=True))
-            continue
-        worst = _worst_view(given, used, rows, corners, state) if each_view else None
-        if worst is None or used[worst[0]].sum() < LEAST_POSES:
+        if not bad.any() or len(rows) - bad.sum() < LEAST_POSES:
             break
-        used[worst[0]][worst[1]] = False
-    at = corners.places()
-    results = []
-    for i, camera in enumerate(given.cameras):
-        columns, view = corners.columns(i)[: corners.each[i].kept()], np.full(len(given), -1)
-        view[camera.rows[used[i]]] = np.flatnonzero(used[i])
-        own, reported = inverse[np.ix_(columns, columns)], given.base_from_flange[camera.rows]
-        results.append(found_of(corners.each[i], state.of(i), own, reported, view[rows], refine))
+        used[rows[bad]] = False
+        good -= int(bad.sum())
+    at, camera_error = corners.places(), None
+    if intrinsics is None and camera is not None:
+        known = intrinsic_basis(camera.colmap_model), np.linalg.inv(camera.covariance)
+        camera_error = considered(corners.with_intrinsics(*known), state, free)
+    gain = 1.0
+    if intrinsics is None:  # by one step from the solution; about 1 where the camera is right
+        gain = corners.with_intrinsics(*UNKNOWN_LENS).linear(state).gain() / UNKNOWN_LENS[0].shape[1]
     return Adjusted(
-        loops=tuple(loops),
-        rows=rows,
+        loop=loop,
+        used=used,
         corners=corners,
         state=state,
         linear=solution.linear,
-        used=used,
-        outliers=outliers,
         covariance=inverse[: at["z"].stop, : at["z"].stop],
-        camera_error=None if refine else _considered(given, corners, state, free),
+        camera_error=camera_error,
         sigma_scale=float(np.sqrt(inverse[at["scale"], at["scale"]].item())) if with_scale else None,
         sigma={name: float(value) for name, value in corners.sigma.items() if value},
         estimated=free,
         scale_hint=_scale_hint(corners, state),
-        camera_gain=np.ones(len(given.cameras)) if refine else _camera_gains(corners, state),
-        found=tuple(results),
+        camera_gain=gain,
+        found=found_of(corners, state, inverse, base_from_flange, rows, intrinsics is not None),
         settled=solution.settled,
     )
 
 
-def contradicting(corners: RigCorners, state: Bundle | RigBundle, inverse: np.ndarray) -> np.ndarray:
+def contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.ndarray:
     """Returns which poses (m,) have an error of the robot that is not by chance: its estimate is tested against the
     variance that it should have."""
     m = len(corners.base_from_flange)
@@ -389,122 +334,17 @@ def contradicting(corners: RigCorners, state: Bundle | RigBundle, inverse: np.nd
     return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
 
 
-def _scale_hint(corners: RigCorners, state: RigBundle) -> tuple[float, float]:
+def _scale_hint(corners: Corners, state: Bundle) -> tuple[float, float]:
     """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
     unknowns."""
-    wider = replace(corners, each=tuple(replace(own, with_scale=True) for own in corners.each))
+    wider = replace(corners, with_scale=True)
     left, at = wider.linear(state).eliminated(), wider.places()["scale"].start
     inverse = generalised_inverse(left.normal)
     return state.scale - float(inverse[at] @ left.gradient), float(np.sqrt(inverse[at, at]))
 
 
 def _near(loop: Loop, x: Rigid, z: Rigid, scale: float) -> np.ndarray:
-    """Returns which views (v,) are not wrong from the start."""
+    """Returns which poses (m,) are not wrong from the start."""
     miss = loop.residuals(x, z, scale)
     far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
     return ~(far | (np.linalg.norm(miss[:, :3], axis=1) > GROSS_RAD))
-
-
-def _rows(given: RigPoses, used: tuple[np.ndarray, ...], outliers: np.ndarray) -> np.ndarray:
-    """Returns the poses of the robot that are used in some view."""
-    for camera, good in zip(given.cameras, used, strict=True):
-        if good.sum() < LEAST_VIEWS and camera.name:
-            raise DegenerateError(
-                "E-HANDEYE-DISAGREE",
-                f"camera {camera.name}: none of {len(good)} views agrees with the other cameras; check its images, "
-                "intrinsics, board and poses",
-            )
-    rows = np.unique(np.concatenate([camera.rows[good] for camera, good in zip(given.cameras, used, strict=True)]))
-    if len(rows) < 3:
-        raise DegenerateError(
-            "E-HANDEYE-DISAGREE",
-            f"{given.where}: {len(rows)} of {len(given) - int(outliers.sum())} poses of the robot agree, 3 needed; "
-            "check that poses and images belong together, and the conventions of both",
-        )
-    return rows
-
-
-def _problem(
-    given: RigPoses,
-    loops: Sequence[Loop],
-    used: tuple[np.ndarray, ...],
-    rows: np.ndarray,
-    noise: Noise,
-    refine: bool,
-    with_scale: bool,
-    arm: LinearArm | None,
-    sigma: Mapping[str, float],
-) -> tuple[RigCorners, tuple[str, ...]]:
-    """Returns the problem with the poses ``rows`` of the robot, and the groups whose σ are to be estimated."""
-    cameras = [camera[corners] for camera, corners in zip(given.cameras, used, strict=True)]
-    board, flange = board_of([camera.views for camera in cameras]), given.base_from_flange[rows]
-    problems, free = [], []
-    arm = None if arm is None else arm[rows]
-    for camera, loop, good in zip(cameras, loops, used, strict=True):
-        at = np.searchsorted(rows, camera.rows)
-        prior = camera.prior if refine else None
-        corners, names = problem(
-            loop[good], flange, camera.views, noise, prior, with_scale, arm, sigma, rows=at, designed=board
-        )
-        problems.append(corners)
-        named = RigCorners((camera.name,), (corners,))
-        free += [name for name in (*named.sigma, *named.factors()) if name.split(":")[0] in names]
-    return RigCorners(tuple(camera.name for camera in cameras), tuple(problems)), tuple(dict.fromkeys(free))
-
-
-def _considered(given: RigPoses, corners: RigCorners, state: RigBundle, free: tuple[str, ...]) -> CameraError | None:
-    """Returns the effect of the intrinsics as filed; None where no prior of any camera is known."""
-    known = {}
-    for i, camera in enumerate(given.cameras):
-        if camera.prior is not None:
-            known[i] = intrinsic_basis(camera.prior.colmap_model), np.linalg.inv(camera.prior.covariance)
-    return considered(corners.with_intrinsics(known), state, free) if known else None
-
-
-def _camera_gains(corners: RigCorners, state: RigBundle) -> np.ndarray:
-    """Returns (c,) the fall of the cost, per parameter of one camera, with its intrinsics among the unknowns as in
-    :data:`UNKNOWN_LENS`. It is predicted by one step from the solution, and about 1 where the camera is right.
-
-    The worst camera is tested alone, and the next one with the intrinsics of the worst among the unknowns, since a
-    wrong camera biases the board and the robot's poses of all cameras.
-    """
-    wrong: list[int] = []
-    gains, before = np.ones(len(corners.each)), 0.0
-    while len(wrong) < len(gains):
-        gain = {}
-        for i in set(range(len(gains))) - set(wrong):
-            wider = corners.with_intrinsics(dict.fromkeys((*wrong, i), UNKNOWN_LENS))
-            gain[i] = wider.linear(state).gain() / UNKNOWN_LENS[0].shape[1] - before
-            gains[i] = gain[i]
-        worst = max(gain, key=gain.__getitem__)
-        if gain[worst] <= CAMERA_GAIN:
-            break
-        wrong.append(worst)
-        before += gain[worst]
-    return gains
-
-
-def _worst_view(
-    given: RigPoses, used: tuple[np.ndarray, ...], rows: np.ndarray, corners: RigCorners, state: RigBundle
-) -> tuple[int, int] | None:
-    """Returns the view (camera, its number) that contradicts the others most, by the gain of its corners from a pose of
-    their own; None where all agree."""
-    worst, most = None, 1.0
-    for i, camera in enumerate(given.cameras):
-        corners_of_camera, numbers = corners.each[i], np.flatnonzero(used[i])
-        white, derivatives = corners_of_camera.seen(state.of(i))
-        gains = []
-        for row in np.searchsorted(rows, camera.rows[numbers]):
-            in_view = corners_of_camera.view == row
-            slope, miss = (
-                derivatives["x"][in_view].reshape(-1, 6),
-                white[in_view].ravel(),
-            )  # moving X is moving the board in the view
-            gains.append(float(miss @ slope @ generalised_inverse(slope.T @ slope) @ slope.T @ miss))
-        # An error that all views of a camera share comes from its lens or the board: a view is judged by the others.
-        usual = max(1.0, float(np.median(gains)) / 6)
-        limit = 6 * MISSED * usual * f.ppf(1 - FALSE_ALARM / len(gains), 6, len(white))
-        k = int(np.argmax(gains))
-        if gains[k] / limit > most:
-            worst, most = (i, int(numbers[k])), gains[k] / limit
-    return worst

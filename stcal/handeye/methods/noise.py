@@ -1,6 +1,6 @@
 """Errors of robot and camera: σ as stated, or estimated in rounds as variance components."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
 from stcal.geometry.variances import component_variances
 from stcal.handeye.data.pairs import Loop
-from stcal.handeye.methods.bundle import RigBundle, RigCorners
+from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.equations import Components, Equations
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
@@ -200,13 +200,13 @@ class BundleSolution:
     """``corners`` : problem with the estimated σ; ``state``, and the normal equations about it, ``linear``; ``settled``
     : whether the σ settled within :data:`ROUNDS`."""
 
-    corners: RigCorners
-    state: RigBundle
+    corners: Corners
+    state: Bundle
     linear: Equations
     settled: bool
 
 
-def adjust(corners: RigCorners, start: RigBundle, free: tuple[str, ...]) -> BundleSolution:
+def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolution:
     """Solve the problem, and estimate the σ of the ``free`` groups in rounds.
 
     Raises ConvergenceError: no minimum is reached.
@@ -216,7 +216,7 @@ def adjust(corners: RigCorners, start: RigBundle, free: tuple[str, ...]) -> Bund
         state = minimise(state, corners.linear, corners.moved, settled=ROUGHLY).required("hand-eye", WORST).state
         sigma = corners.sigma | estimated(corners, state, free)
         change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
-        corners = corners.with_sigma(sigma)
+        corners = replace(corners, sigma=sigma)
         settled = bool(change < SETTLED)
         if settled:
             break
@@ -224,7 +224,7 @@ def adjust(corners: RigCorners, start: RigBundle, free: tuple[str, ...]) -> Bund
     return BundleSolution(corners, minimum.state, minimum.linear, settled)
 
 
-def estimated(corners: RigCorners, state: RigBundle, free: tuple[str, ...]) -> dict[str, float]:
+def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
     """Returns restricted maximum-likelihood σ of the ``free`` groups, with all else linear about a state (like
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
     parts = corners.parts(state)
@@ -233,15 +233,10 @@ def estimated(corners: RigCorners, state: RigBundle, free: tuple[str, ...]) -> d
     likelihood = Components(
         [parts[name] for name in names],
         reduce(add, fixed) if fixed else None,
-        np.array([CAUTION if kind(name) in LEAST_SIGMA else 0.0 for name in names]),
+        np.array([CAUTION if name in LEAST_SIGMA else 0.0 for name in names]),
         HELD,
     )
-    least = np.log([LEAST_SIGMA.get(kind(name), 1.0) / corners.sigma[name] for name in names])
+    least = np.log([LEAST_SIGMA.get(name, 1.0) / corners.sigma[name] for name in names])
     farthest = np.full(len(names), FARTHEST)
     best = likelihood.best(np.maximum(least, -farthest), farthest)
     return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(names, best, strict=True)}
-
-
-def kind(name: str) -> str:
-    """Returns the kind of a group: ``corner_px`` for ``corner_px:left``, the group of one camera of several."""
-    return name.partition(":")[0]

@@ -1,6 +1,6 @@
 """Reprojection adjustment: X and Z from the corners in the images, with the errors of robot, board and camera."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,18 +93,10 @@ def problem(
     with_scale: bool = False,
     arm: LinearArm | None = None,
     first: Mapping[str, float] = FIRST,
-    rows: np.ndarray | None = None,
-    designed: np.ndarray | None = None,
 ) -> tuple[Corners, tuple[str, ...]]:
-    """Returns the problem, and the groups whose σ are to be estimated, from ``first``.
-
-    ``rows`` : (v,) row in base_from_flange of each view; one view for each row, in order, where None; ``designed`` :
-    (K, 3) the board's corners, from :func:`board_of`; those of the views where None.
-    """
-    designed = board_of([views]) if designed is None else designed
-    every = np.concatenate([designed, *(view.xyz_board for view in views.views)])
-    corner = np.unique(np.round(every, SAME_DIGITS), axis=0, return_inverse=True)[1].ravel()[len(designed) :]
-    rows = np.arange(len(views)) if rows is None else rows
+    """Returns the problem, and the groups whose σ are to be estimated, from ``first``."""
+    seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
+    designed, corner = np.unique(seen, axis=0, return_inverse=True)
     sigma, free = {}, []
     for name in ("corner_px", "robot_rad", "robot_mm", "board_mm"):
         value = getattr(noise, name)
@@ -123,8 +115,8 @@ def problem(
         loop.inverted,
         base_from_flange,
         designed,
-        np.repeat(rows, [len(view) for view in views.views]),
-        corner,
+        np.repeat(np.arange(len(views)), [len(view) for view in views.views]),
+        corner.ravel(),
         np.concatenate([view.xy_px for view in views.views]),
         np.concatenate([view.whitening() for view in views.views]),
         robot,
@@ -142,24 +134,16 @@ def problem(
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
 
-def board_of(every: Sequence[Views]) -> np.ndarray:
-    """Returns all corners (K, 3) that any view shows, mm, each once."""
-    corners = [view.xyz_board for views in every for view in views.views]
-    return np.unique(np.round(np.concatenate(corners), SAME_DIGITS), axis=0)
-
-
 def found_of(
     corners: Corners, state: Bundle, inverse: np.ndarray, reported: Poses, rows: np.ndarray, with_camera: bool
 ) -> Reprojection:
-    """Returns the results of one camera. ``rows`` : (m,) row in ``reported`` of each pose of the problem, -1 for a pose
-    that this camera did not see."""
+    """Returns the results. ``rows`` : (m,) row in ``reported`` of each pose of the problem."""
     at = corners.places()
     white, _ = corners.seen(state)
     residuals = corners.sigma["corner_px"] * np.linalg.solve(corners.weight, white[:, :, None])[:, :, 0]
     true = list(reported)
     for row, pose in zip(rows, state.base_from_flange, strict=True):
-        if row >= 0:
-            true[row] = pose
+        true[row] = pose
     return Reprojection(
         state.camera,
         inverse[at["camera"], at["camera"]] if with_camera else None,

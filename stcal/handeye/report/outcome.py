@@ -1,4 +1,4 @@
-"""All results of a hand-eye command, of one camera or of a rig, and the verdict on them."""
+"""All results of a hand-eye command, and the verdict on them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,6 @@ from stcal.handeye.judge.mistakes import flipped
 from stcal.handeye.judge.observability import COMMON_MM, in_words
 from stcal.handeye.judge.remarks import BAD, CARE, GOOD, MANY, Aside, Finding, Grave, SizeDoubt, Verdict, Word, spoken
 from stcal.handeye.result import HandEye
-from stcal.handeye.rig import Rig, RigHeldOut
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 
@@ -340,63 +339,3 @@ def of_notes(notes: Iterable[str]) -> list[Finding]:
 
 def _word(value: float, care: float, bad: float) -> Word:
     return BAD if value > bad else CARE if value > care else GOOD
-
-
-MOTIONS = "Motions of the flange"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigOutcome:
-    """A rig's calibration with everything that its report shows.
-
-    Parameters
-    ----------
-    where : names of the files that were solved
-    rig : rig
-    cameras : the part of each camera, as the outcome of a calibration of its own
-    alone : solution of each camera by itself; None if it cannot be solved alone
-    held_out : errors on held-out poses of the robot
-    notes : notes in addition to those of the rig
-    understood : how files were interpreted
-    widened : factor by which σ of the transforms were widened, because solutions from subsets of the poses scatter more
-    """
-
-    where: str
-    rig: Rig
-    cameras: tuple[Outcome, ...]
-    alone: tuple[HandEye | None, ...]
-    held_out: RigHeldOut | None = None
-    notes: tuple[str, ...] = ()
-    understood: tuple[str, ...] = ()
-    widened: float = 1.0
-
-    def all_notes(self) -> tuple[str, ...]:
-        """Returns the notes of the rig and its cameras, then the others."""
-        return (*self.rig.all_notes(), *self.notes)
-
-    def left_out(self) -> list[tuple[str, str, str]]:
-        """Returns (camera, image or row, reason) of everything that was left out."""
-        outcome_of_camera = zip(self.rig.names, self.cameras, strict=True)
-        return [(name, item, reason) for name, camera in outcome_of_camera for item, reason in camera.left_out]
-
-
-def rig_judged(outcome: RigOutcome) -> Verdict:
-    """Returns the verdict: findings of each camera under its name, of the robot's motions once, and of the rig."""
-    findings: list[Finding] = []
-    for name, camera in zip(outcome.rig.names, outcome.cameras, strict=True):
-        for finding in judged(camera).findings:
-            if finding.title != MOTIONS:
-                findings.append(_of(name, finding, FRAMES[outcome.rig.setup].mount))
-            elif all(earlier.title != MOTIONS for earlier in findings):
-                findings.insert(0, finding)
-    return Verdict((*findings, *of_notes((*outcome.rig.notes, *outcome.notes))))
-
-
-def _of(name: str, each: Finding, mount: str) -> Finding:
-    said = each.said.replace(f"{mount}_from_camera", f"{mount}_from_{name}")
-    return Finding(f"{name}: {each.title}", each.word, f"{name}: {said}", each.value, each.limit, each.remedy)
-
-
-def asides(outcome: RigOutcome) -> list[str]:
-    """Returns the notes that do not put the result in doubt."""
-    return [note for note in outcome.all_notes() if isinstance(note, Aside)]

@@ -1,4 +1,4 @@
-"""Report of a hand-eye calibration of one camera, and what it shares with that of a rig."""
+"""Report of a hand-eye calibration."""
 
 from collections.abc import Sequence
 
@@ -146,7 +146,7 @@ def _off(each: Compared, result: HandEye) -> list[str]:
 
 
 def outcome_report(outcome: Outcome) -> Document:
-    """Returns the report of ``handeye`` for one camera."""
+    """Returns the report of ``handeye``."""
     result, frames = outcome.result, FRAMES[outcome.result.setup]
     turn, shift = result.rms()
     held_out = []

@@ -181,8 +181,7 @@ def one_of(names: list[str], choice: str, source: str) -> str:
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
         raise InputError(
             "E-CAMERA-SEVERAL",
-            f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name, "
-            "and in a rig file camera_name",
+            f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name",
         )
     others = [name for name in names if name != (choice or names[0])]
     pass_over(others, "the other cameras, " if len(others) > 1 else "the other camera, ")

@@ -7,7 +7,7 @@ Metashape; Metashape's principal point is relative to the middle of the image.
 import ast
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,7 +15,6 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera, parameter_names
-from stcal.geometry.rigid import Rigid
 from stcal.io.cameras import metashape
 from stcal.io.cameras.foreign import (
     COLMAP_FOREIGN,
@@ -51,7 +50,6 @@ MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPE
 """Numbers of coefficients of those models of mrcal that are OpenCV's."""
 MRCAL_HARMLESS = ("extrinsics", "icamintrinsics", "optimizationinputs", "rtcamref", "rtrefcam")
 """Keys of ``.cameramodel`` that say where a camera is, and from what it was calibrated."""
-MM_PER_M = 1000.0
 LEAST_CAMERA_BYTES = 48
 """Bytes of a camera of ``cameras.bin`` with three parameters."""
 SIGMA_FORMS = ("colmap", "metashape-cameras")
@@ -248,23 +246,6 @@ def _kalibr(camera: Camera, name: str) -> str:
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {lens}\n  distortion_model: {kind}\n"
         f"  distortion_coeffs: {values}\n  resolution: [{camera.width}, {camera.height}]\n"
     )
-
-
-def kalibr_chain(cameras: Sequence[tuple[str, Camera, Rigid]]) -> str:
-    """Return the ``camchain.yaml`` of several cameras, each given by name, camera and camera_from_first.
-
-    Kalibr numbers the cameras, and states the pose of each relative to the camera before it, in metres.
-
-    Raises InputError: the form cannot hold a lens.
-    """
-    parts = []
-    for number, (name, camera, pose) in enumerate(cameras):
-        parts.append(f"# cam{number}: {name}\n{_kalibr(camera, f'cam{number}')}")
-        if number:
-            matrix = (pose @ cameras[number - 1][2].inverse()).matrix()
-            matrix[:3, 3] /= MM_PER_M
-            parts.append("".join(["  T_cn_cnm1:\n", *(f"  - {row}\n" for row in matrix.tolist())]))
-    return "".join(parts)
 
 
 def _mrcal(camera: Camera, _: str) -> str:

@@ -141,7 +141,7 @@ def camera_prior(camera: Camera) -> CameraPrior:
     Returns
     -------
     CameraPrior
-        Prior for :class:`stcal.handeye.HandEyeOptions` and :class:`stcal.handeye.RigCamera`.
+        Prior for :class:`stcal.handeye.HandEyeOptions`.
     """
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)

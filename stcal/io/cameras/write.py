@@ -67,7 +67,7 @@ def form_of(path: str | Path, form: str | None) -> CameraForm:
     return cast(CameraForm, kind)
 
 
-def require_camera_written(path: str | Path, camera: Camera, name: str = "") -> None:
+def require_camera_written(path: str | Path, camera: Camera) -> None:
     """Read a written camera file again, and require that it projects points all over the image to the same pixels."""
     size = np.array([camera.width, camera.height])
     grid = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, ACROSS)]), axis=-1) * size
@@ -75,6 +75,6 @@ def require_camera_written(path: str | Path, camera: Camera, name: str = "") -> 
     rays = rays[np.isfinite(rays).all(axis=-1)]
 
     def again() -> np.ndarray:
-        return read_camera(path, name).sized(*size).pixel_from_normalised(rays)
+        return read_camera(path).sized(*size).pixel_from_normalised(rays)
 
     require_written(path, again, camera.pixel_from_normalised(rays), WRITTEN_PX, "px")

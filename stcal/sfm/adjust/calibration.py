@@ -66,7 +66,7 @@ class AdjustOptions:
         if self.solve == "paper" and (self.eccentricity or self.frame != "three-point"):
             raise InputError(
                 "E-OPTION-CONFLICT",
-                "--solve paper: three-point frames without eccentricity, as published; leave --frame out, or use chain",
+                "--solve paper: three-point frames without eccentricity, as published; leave frame out, or use chain",
             )
         if self.refine_camera and self.solve != "joint":
             raise InputError(

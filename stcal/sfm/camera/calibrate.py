@@ -266,18 +266,6 @@ def judged(
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, of_held_out, tuple(warnings))
 
 
-def rejudged(before: CameraCalibration, result: Intrinsics, board: BoardDesign) -> CameraCalibration:
-    """Returns a camera's calibration with the intrinsics ``result`` of a joint adjustment.
-
-    σ over the image and warnings are those of ``result``; both checks are those of the camera alone.
-    """
-    projection = projection_sigma(result)
-    stale = _warnings(before.intrinsics, before.projection, before.split, board)
-    still_true = [each for each in before.warnings if each not in stale]
-    warnings = (*still_true, *_warnings(result, projection, before.split, board))
-    return replace(before, intrinsics=result, projection=projection, warnings=warnings)
-
-
 def _detect(
     files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, progress, rounds: int
 ) -> DetectionResult:

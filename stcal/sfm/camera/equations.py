@@ -1,6 +1,7 @@
 """Normal equations of a camera calibration, with the board's shape as unknowns."""
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.special import chdtrc
@@ -9,7 +10,6 @@ from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
-from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.adjust.equations import equations_of_poses, image_cost, normalised, robust_weights
 from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
 from stcal.sfm.data.model import MetricModel
@@ -101,73 +101,33 @@ START_DAMPING = 1e-3
 class State:
     """Unknowns of a calibration.
 
-    ``models`` : views of one folder's board by one camera each; ``folder``, ``camera_of`` : of each model; models of
-    one folder share their points; ``instant_of`` : (m,) index of each image of a model among the poses of its folder;
-    ``first_from_board`` : these poses, by folder; ``camera_from_first`` : poses on the rig, empty without a rig.
+    ``models`` : views of one folder's board by one camera each; ``camera_of`` : of each model. Models of one folder
+    share their points.
     """
 
     models: tuple[MetricModel, ...]
-    folder: tuple[str, ...]
     camera_of: tuple[int, ...]
-    instant_of: tuple[np.ndarray, ...]
-    first_from_board: dict[str, tuple[Rigid, ...]]
     cameras: tuple[Camera, ...]
-    camera_from_first: tuple[Rigid, ...] = ()
 
     def boards(self) -> dict[str, list[int]]:
         """Returns the indices of the models by folder."""
         members: dict[str, list[int]] = {}
-        for i, folder in enumerate(self.folder):
-            members.setdefault(folder, []).append(i)
+        for i, model in enumerate(self.models):
+            members.setdefault(model.group, []).append(i)
         return members
 
     def only(self, names: set[str]) -> "State":
-        """Returns the state with the images of these ``names`` alone, of cameras that are on no rig."""
-        kept = [(i, part) for i, model in enumerate(self.models) if (part := _of_images(model, names)).images]
-        return self._of(
-            [part for _, part in kept], [self.folder[i] for i, _ in kept], [self.camera_of[i] for i, _ in kept]
-        )
+        """Returns the state with the images of these ``names`` alone."""
+        parts = [_of_images(model, names) for model in self.models]
+        kept = [(part, k) for part, k in zip(parts, self.camera_of, strict=True) if part.images]
+        return replace(self, models=tuple(part for part, _ in kept), camera_of=tuple(k for _, k in kept))
 
     def in_two(self, half: dict[str, int]) -> "State":
         """Returns the state of one camera as that of two, of which each took the images of one ``half``, 0 or 1."""
-        models, folders, cameras = [], [], []
-        for model, folder in zip(self.models, self.folder, strict=True):
-            for k in (0, 1):
-                part = _of_images(model, {name for name, own in half.items() if own == k})
-                if part.images:
-                    models.append(part)
-                    folders.append(folder)
-                    cameras.append(k)
-        return replace(self._of(models, folders, cameras), cameras=self.cameras * 2)
-
-    def _of(self, models: list[MetricModel], folders: list[str], cameras: list[int]) -> "State":
-        poses: dict[str, tuple[Rigid, ...]] = {}
-        instants = []
-        for model, folder in zip(models, folders, strict=True):
-            before = poses.get(folder, ())
-            instants.append(len(before) + np.arange(len(model.images)))
-            poses[folder] = before + model.camera_from_model
-        return replace(
-            self,
-            models=tuple(models),
-            folder=tuple(folders),
-            camera_of=tuple(cameras),
-            instant_of=tuple(instants),
-            first_from_board=poses,
-        )
-
-    def seen(self) -> "State":
-        """Returns the state with the views' poses computed from those of instants and cameras."""
-        return replace(
-            self, models=tuple(replace(m, camera_from_model=self._poses(i)) for i, m in enumerate(self.models))
-        )
-
-    def _poses(self, i: int) -> tuple[Rigid, ...]:
-        poses, k = self.first_from_board[self.folder[i]], self.camera_of[i]
-        own = [poses[t] for t in self.instant_of[i].tolist()]
-        return (
-            tuple(self.camera_from_first[k] @ pose for pose in own) if self.camera_from_first and k > 0 else tuple(own)
-        )
+        names = [{name for name, own in half.items() if own == k} for k in (0, 1)]
+        parts = [(_of_images(model, names[k]), k) for model in self.models for k in (0, 1)]
+        kept = [(part, k) for part, k in parts if part.images]
+        return State(tuple(part for part, _ in kept), tuple(k for _, k in kept), self.cameras * 2)
 
     def cost(self, huber: float) -> float:
         """Returns the χ² of the images, with Huber's loss beyond ``huber``."""
@@ -183,7 +143,7 @@ class State:
 
         The dots add as many observations as unknowns.
         """
-        poses = sum(len(each) for each in self.first_from_board.values())
+        poses = sum(len(m.images) for m in self.models)
         return sum(2 * len(m.image_index) for m in self.models) - 6 * poses - kept
 
 
@@ -207,8 +167,7 @@ OF_OBSERVATIONS = ("point_index", "keypoint", "measured_px", "shift_px", "covari
 class Setting:
     """Constants of one minimisation.
 
-    By camera, ``basis`` : (16, q) and ``weight`` : (q, q) of the vague prior about ``start``; ``rig`` : whether the
-    cameras are on one rig.
+    By camera, ``basis`` : (16, q) and ``weight`` : (q, q) of the vague prior about ``start``.
     """
 
     basis: tuple[np.ndarray, ...]
@@ -217,7 +176,6 @@ class Setting:
     shape: dict[str, BoardShape]
     sigma_mm: float
     huber: float
-    rig: bool = False
 
     def away(self, k: int, camera: Camera) -> np.ndarray:
         """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
@@ -228,20 +186,10 @@ class Setting:
         ends = np.cumsum([0, *(b.shape[1] for b in self.basis)])
         return slice(int(ends[k]), int(ends[k + 1]))
 
-    def sits(self, k: int) -> slice:
-        """Returns the place of a camera's pose on the rig among the kept unknowns, 6 or empty."""
-        begin = self.intrinsics(len(self.basis) - 1).stop
-        return slice(begin + 6 * (k - 1), begin + 6 * k) if self.rig and k else slice(begin, begin)
-
-    def of_camera(self, k: int) -> np.ndarray:
-        """Returns the indices of the kept unknowns that a camera's views depend on."""
-        intrinsics, sits = self.intrinsics(k), self.sits(k)
-        return np.concatenate([np.arange(intrinsics.start, intrinsics.stop), np.arange(sits.start, sits.stop)])
-
     @property
     def kept(self) -> int:
         """Number of kept unknowns."""
-        return max(self.sits(len(self.basis) - 1).stop, self.intrinsics(len(self.basis) - 1).stop)
+        return self.intrinsics(len(self.basis) - 1).stop
 
 
 def dots_costs(state: State, setting: Setting) -> np.ndarray:
@@ -261,52 +209,31 @@ def _cost(state: State, setting: Setting) -> float:
     return cost + state.cost(setting.huber)
 
 
-def derivatives(state: State, setting: Setting, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the derivatives of a model's projections, px.
-
-    By the poses of its instants, (n, 2, 6), by its points, (n, 2, 3), and by the unknowns of
-    :meth:`Setting.of_camera`, (n, 2, k).
-
-    All motions are left perturbations. With camera_k_from_first = (R, t) and first_from_board = (S, s), a rotation w
-    and a shift d of the latter rotate the view's pose by R w and shift it by R d; of the former, by w and w × R s + d.
-    """
-    model, k = state.models[i], state.camera_of[i]
-    camera = state.cameras[k]
-    by_pose, by_point = projection_jacobians(model, camera)
-    xyz = model.xyz_camera()
-    by_shared = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ setting.basis[k]
-    if setting.rig and k:
-        turn = state.camera_from_first[k].rotation
-        poses = state.first_from_board[state.folder[i]]
-        carried = np.array([poses[t].translation for t in state.instant_of[i].tolist()]) @ turn.T
-        by_shift = by_pose[:, :, 3:]
-        by_turn = by_pose[:, :, :3] - by_shift @ skew(carried[model.image_index])
-        by_shared = np.concatenate([by_shared, by_turn, by_shift], axis=2)
-        by_pose = np.concatenate([by_pose[:, :, :3] @ turn, by_shift @ turn], axis=2)
-    return by_pose, by_point, by_shared
-
-
 def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
     """Returns the normal equations of a board's dots and the kept unknowns, and the reduction of the poses."""
-    p, t = setting.shape[folder].places.size, len(state.first_from_board[folder])
+    p = setting.shape[folder].places.size
     size = p + setting.kept
     full, full_right = np.zeros((size, size)), np.zeros(size)
-    block, block_right, cross = np.zeros((t, 6, 6)), np.zeros((t, 6)), np.zeros((t, 6, size))
+    block, block_right, cross = [], [], []
     for i in rows:
-        model, k, instant = state.models[i], state.camera_of[i], state.instant_of[i]
-        root = np.sqrt(robust_weights(model, state.cameras[k], setting.huber))[:, None]
-        a, c, e = (model.whiten(d) * root[..., None] for d in derivatives(state, setting, i))
-        equations = equations_of_poses(model, a, c, e, normalised(model, state.cameras[k]) * root)
-        place = np.concatenate([np.arange(p), p + setting.of_camera(k)])
+        model, k = state.models[i], state.camera_of[i]
+        camera, xyz = state.cameras[k], model.xyz_camera()
+        by_pose, by_point = projection_jacobians(model, camera)
+        by_kept = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ setting.basis[k]
+        root = np.sqrt(robust_weights(model, camera, setting.huber))[:, None]
+        a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_kept))
+        equations = equations_of_poses(model, a, c, e, normalised(model, camera) * root)
+        place = np.concatenate([np.arange(p), p + np.arange(setting.kept)[setting.intrinsics(k)]])
         if len(place) == size:
             full += equations.normal  # an index of all rows takes as long as all else here
         else:
             full[np.ix_(place, place)] += equations.normal
         full_right[place] += equations.right
-        block[instant] += equations.block
-        block_right[instant] += equations.block_right
-        cross[np.ix_(instant, np.arange(6), place)] += equations.cross
-    poses = reduce(block, block_right, cross)
+        block.append(equations.block)
+        block_right.append(equations.block_right)
+        cross.append(np.zeros((len(model.images), 6, size)))
+        cross[-1][:, :, place] = equations.cross
+    poses = reduce(np.concatenate(block), np.concatenate(block_right), np.concatenate(cross))
     return full - poses.normal, full_right - poses.right, poses
 
 
@@ -415,31 +342,18 @@ def moved(state: State, setting: Setting, step: np.ndarray) -> State:
     """Returns the state after a step of :meth:`Normal.step`."""
     boards, models = state.boards(), list(state.models)
     kept_step, remaining = np.split(step, [setting.kept])
-    sizes = [setting.shape[folder].places.size for folder in boards]
-    *dots, remaining = np.split(remaining, np.cumsum(sizes))
-    instants = np.cumsum([6 * len(state.first_from_board[folder]) for folder in boards])[:-1]
-    first_from_board = {
-        folder: moved_poses(state.first_from_board[folder], each.reshape(-1, 6))
-        for folder, each in zip(boards, np.split(remaining, instants), strict=True)
-    }
-    for rows, shift in zip(boards.values(), dots, strict=True):
+    for folder, rows in boards.items():
+        dots, remaining = np.split(remaining, [setting.shape[folder].places.size])
         for i in rows:
-            models[i] = replace(models[i], xyz_model=models[i].xyz_model + shift.reshape(-1, 3))
+            models[i] = replace(models[i], xyz_model=models[i].xyz_model + dots.reshape(-1, 3))
+    for i in chain(*boards.values()):
+        poses, remaining = np.split(remaining, [6 * len(models[i].images)])
+        models[i] = replace(models[i], camera_from_model=moved_poses(models[i].camera_from_model, poses.reshape(-1, 6)))
     cameras = tuple(
         camera.with_parameters(_positive(camera.parameters() + setting.basis[k] @ kept_step[setting.intrinsics(k)]))
         for k, camera in enumerate(state.cameras)
     )
-    camera_from_first = state.camera_from_first
-    if setting.rig:
-        moved_cameras = moved_poses(camera_from_first[1:], kept_step[setting.sits(1).start :].reshape(-1, 6))
-        camera_from_first = (camera_from_first[0], *moved_cameras)
-    return replace(
-        state,
-        models=tuple(models),
-        first_from_board=first_from_board,
-        cameras=cameras,
-        camera_from_first=camera_from_first,
-    ).seen()
+    return replace(state, models=tuple(models), cameras=cameras)
 
 
 def _positive(parameters: np.ndarray) -> np.ndarray:

@@ -183,8 +183,7 @@ class Intrinsics:
     folder's board by one camera, mm, board frame; ``camera_of`` : camera of each model; ``huber`` : length of a
     normalised residual beyond which its weight decreases; ``settled`` : whether σ and eccentricities converged within
     :data:`MAX_ROUNDS`; ``restarted`` : whether the descent from the start did not end, and began again with the focal
-    length alone; ``solution`` : state and setting from which solutions of some of the views start, None for the
-    intrinsics of a rig.
+    length alone; ``solution`` : state and setting from which solutions of some of the views start.
     """
 
     cameras: tuple[Camera, ...]
@@ -196,8 +195,8 @@ class Intrinsics:
     huber: float
     redundancy: int
     settled: bool
+    solution: tuple[State, Setting]
     restarted: bool = False
-    solution: tuple[State, Setting] | None = None
 
     @property
     def camera(self) -> Camera:
@@ -265,21 +264,18 @@ def adjust_intrinsics(
         basis=(basis,) * c,
         weight=(np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),) * c,
         start=(start,) * c,
-        shape=design_shapes(state, board),
+        shape={model.group: BoardShape.of(model.xyz_model) for model in state.models},
         sigma_mm=board.sigma_mm,
         huber=np.inf,
     )
-    restarted = False
     try:
-        adjustment = adjusted(state, setting, board, factors)
+        return _adjusted(state, setting, board, colmap_model, factors)
     except ConvergenceError:
         if held:
             raise
-        restarted = True
-        # A focal length far off makes the rest of the lens wander: it comes first, alone.
-        adjustment = adjusted(_with_focal_length(state, setting), setting, board, factors)
-    result = _intrinsics(adjustment.last, colmap_model, adjustment.factors, adjustment.settled)
-    return replace(result, restarted=restarted)
+    # A focal length far off makes the rest of the lens wander: it comes first, alone.
+    result = _adjusted(_with_focal_length(state, setting), setting, board, colmap_model, factors)
+    return replace(result, restarted=True)
 
 
 def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
@@ -312,7 +308,7 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
 
     Raises ConvergenceError, DegenerateError: as :func:`adjust_intrinsics`, which solves where the steps do not settle.
     """
-    state, setting = _solution(result)
+    state, setting = result.solution
     last = _stepped(state.only({view.name for view in views}), setting)
     if last is None:
         return adjust_intrinsics(views, board, result.camera, result.colmap_model)
@@ -324,7 +320,7 @@ def of_two_halves(result: Intrinsics, views: Sequence[ImageObservations], board:
 
     Raises ConvergenceError, DegenerateError: as :func:`of_some_views`.
     """
-    state, setting = _solution(result)
+    state, setting = result.solution
     half = [i % 2 for i in range(len(views))]
     halves = state.in_two({view.name: k for view, k in zip(views, half, strict=True)})
     last = _stepped(
@@ -333,11 +329,6 @@ def of_two_halves(result: Intrinsics, views: Sequence[ImageObservations], board:
     if last is None:
         return adjust_intrinsics(views, board, result.camera, result.colmap_model, half, result.factors)
     return _intrinsics(last, result.colmap_model, result.factors, True)
-
-
-def _solution(result: Intrinsics) -> tuple[State, Setting]:
-    assert result.solution is not None, "intrinsics of one camera"
-    return result.solution
 
 
 def _stepped(state: State, setting: Setting) -> Normal | None:
@@ -353,24 +344,9 @@ def _stepped(state: State, setting: Setting) -> Normal | None:
     return None
 
 
-def design_shapes(state: State, board: BoardDesign) -> dict[str, BoardShape]:
-    """Returns the design shape of the visible dots by folder."""
-    labels = {folder: state.models[rows[0]].labels for folder, rows in state.boards().items()}
-    return {folder: BoardShape.of(board.places_mm(own)) for folder, own in labels.items()}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
-    """Result of an adjustment; ``last`` : its normal equations; ``settled`` : whether the rounds converged."""
-
-    state: State
-    setting: Setting
-    last: Normal
-    factors: SigmaFactors
-    settled: bool
-
-
-def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFactors | None = None) -> Adjusted:
+def _adjusted(
+    state: State, setting: Setting, board: BoardDesign, colmap_model: str, known: SigmaFactors | None
+) -> Intrinsics:
     """Alternates minimisation and estimation of σ and eccentricity until these converge.
 
     ``state``, ``setting`` : start; the models of the state have the detected centres' σ; ``known`` : factors of σ;
@@ -399,7 +375,7 @@ def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFac
         if settled:
             break
     assert last is not None
-    return Adjusted(state, setting, last, factors, settled)
+    return _intrinsics(last, colmap_model, factors, settled)
 
 
 def _with_focal_length(state: State, setting: Setting) -> State:
@@ -415,21 +391,15 @@ def _with_focal_length(state: State, setting: Setting) -> State:
 
 
 def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> State:
-    models, folders, camera_numbers, instants = [], [], [], []
+    models, camera_numbers = [], []
     camera_of = {v.name: k for v, k in zip(views, camera_of_view, strict=True)}
-    poses: dict[str, tuple[Rigid, ...]] = {}
     for folder, members in by_group(views).items():
         labels = tuple(sorted({label for v in members for label in v.labels}))
         for k in sorted({camera_of[v.name] for v in members}):
             of_camera = [v for v in members if camera_of[v.name] == k]
             models.append(model_of_views(folder, labels, of_camera, board, start))
-            folders.append(folder)
             camera_numbers.append(k)
-            poses_so_far = poses.get(folder, ())
-            instants.append(len(poses_so_far) + np.arange(len(of_camera)))
-            poses[folder] = poses_so_far + models[-1].camera_from_model
-    cameras = (start,) * (max(camera_numbers) + 1)
-    return State(tuple(models), tuple(folders), tuple(camera_numbers), tuple(instants), poses, cameras)
+    return State(tuple(models), tuple(camera_numbers), (start,) * (max(camera_numbers) + 1))
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:

@@ -1,27 +1,23 @@
-"""The report of calibrated intrinsics, of one camera or of a rig."""
+"""Report of calibrated intrinsics."""
 
 import numpy as np
 
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.report.camera import distortion_figure
 from stcal.report.document import (
-    Block,
     Document,
     Section,
     Table,
     alarms,
-    bullets,
     page_only,
     plot,
     plots,
-    subheading,
 )
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
-from stcal.report.text import HEADS, number, transform_rows
+from stcal.report.text import number
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
 from stcal.sfm.camera.file import CalibrationFile
-from stcal.sfm.camera.rig import RigCalibration
 
 CELLS = (12, 8)
 """Number of cells of the figure of residuals, in x and y."""
@@ -194,113 +190,3 @@ def residual_map(result: CameraCalibration) -> Drawing:
     said = f"enlarged {times:g} times; the longest is {longest:.4f} px"
     axes.drawing.words(((axes.box[0] + axes.box[2]) / 2, 10), said, SMALL + 1)
     return axes.drawing
-
-
-CAMERA_HEADS = (
-    "<camera",
-    "<lens model",
-    "views",
-    "shared",
-    "RMS px",
-    "alone px",
-    "σ of a projection px",
-    "held out px",
-)
-
-
-def _headline(rig: RigCalibration) -> str:
-    shared = sum(len(images) > 1 for images in rig.instants.values())
-    return (
-        f"{len(rig.names)} cameras, {len(rig.instants)} instants, {shared} of them seen by several; residuals are "
-        f"{rig.factor:.3g} times those of the cameras alone"
-    )
-
-
-def _camera_rows(rig: RigCalibration) -> list[list[str]]:
-    return [
-        [
-            name,
-            camera.intrinsics.colmap_model,
-            str(len(camera.views)),
-            str(shared),
-            number(rms, 4),
-            number(alone, 4),
-            number(float(np.median(camera.projection.sigma_px)), 4),
-            number(camera.held_out.rms_px() if camera.held_out else None, 4),
-        ]
-        for name, camera, shared, rms, alone in zip(
-            rig.names, rig.cameras, rig.shared, rig.rms_of_cameras(), rig.alone_rms_px, strict=True
-        )
-    ]
-
-
-def _poses(rig: RigCalibration) -> list[tuple[str, list[list[str]]]]:
-    each = zip(rig.names[1:], rig.camera_from_first[1:], rig.covariance[1:], strict=True)
-    return [(f"{name}_from_{rig.names[0]}", transform_rows(pose, covariance)) for name, pose, covariance in each]
-
-
-def rig_report(rig: RigCalibration, where: str) -> Document:
-    """Returns the report of ``calibrate-camera --rig``."""
-    own = list(zip(rig.names, rig.cameras, strict=True))
-    left_out = [[each.camera, each.image, each.reason] for each in rig.apart]
-    left_out += [[name, each.name, each.reason] for name, camera in own for each in camera.skipped]
-    instants = [
-        [name, number(rig.rms_px[name], 4), *(images.get(camera, "") for camera in rig.names)]
-        for name, images in rig.instants.items()
-    ]
-    poses = [Table(["<" + name, *HEADS[1:]], rows) for name, rows in _poses(rig)]
-    maps: list[Block] = []
-    for name, camera in own:
-        maps += [
-            subheading(name),
-            bullets(camera.warnings),
-            plots(
-                plot(lambda camera=camera: sigma_map(camera), f"σ of a projection of {name}", css=""),
-                plot(lambda camera=camera: residual_map(camera), f"mean residuals of {name}", css=""),
-            ),
-        ]
-    return Document(
-        f"Calibration of a rig of cameras: {', '.join(rig.names)}",
-        f"{where}: {_headline(rig)}",
-        [
-            Section(
-                "Cameras",
-                [
-                    alarms(rig.warnings),
-                    Table(CAMERA_HEADS, _camera_rows(rig), css="text"),
-                    page_only(
-                        "Shared: instants that another camera saw too. Alone: residuals before the cameras were held "
-                        "to one rig. Views were held out from each camera by itself"
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Where they sit",
-                [
-                    *poses,
-                    page_only(
-                        "The pose of the first camera in the other. σ are those of rotations about the axes, and of "
-                        "translations along the axes, of the frame named first"
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Over the images",
-                [
-                    "σ of where a known direction is seen, up to a rotation of the camera; white: dots. Mean "
-                    "residuals are measured minus projected: what is alike in neighbouring cells is what the lens "
-                    "model leaves",
-                    *maps,
-                ],
-            ),
-            Section(
-                "Instants",
-                [
-                    Table(["<instant", "RMS px", *(name.replace("<", "") for name in rig.names)], instants, css="text"),
-                ],
-            ),
-            Section("Left out", [Table(["<camera", "<image or file", "<reason"], left_out, css="text")], terminal=True),
-        ],
-    )

@@ -171,7 +171,7 @@ def _require_keypoints(database: Path, copy: sqlite3.Connection, run: SavedRun, 
 def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
     """Checks that each pair matches circles of the same label, and that a small set has every pair."""
     images = {ids[image.name]: image for image in run.observations}
-    all_pairs = kind_of_graph(len(run.observations), run.options.graph) == "all"
+    all_pairs = kind_of_graph(len(run.observations)) == "all"
     wanted = (
         {(i + 1, j + 1) for i, j in image_graph(run.observations, run.board_design, "all").pairs.tolist()}
         if all_pairs

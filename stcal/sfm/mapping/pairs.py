@@ -254,7 +254,7 @@ def image_graph(
 
     ``kind`` : if None, sparse for more than ``SPARSE_FROM`` images.
     """
-    kind = kind_of_graph(len(observations), kind)
+    kind = kind or kind_of_graph(len(observations))
     sees = incidence(observations)
     shared = (sees.astype(np.float32) @ sees.T.astype(np.float32)).astype(np.int32)
     groups: dict[str, list[int]] = {}
@@ -274,9 +274,9 @@ def image_graph(
     return ImageGraph(kind, np.array(sorted(pairs), int).reshape(-1, 2), skeleton)
 
 
-def kind_of_graph(images: int, kind: GraphKind | None = None) -> GraphKind:
-    """Returns the given kind of graph, or the default for this number of images."""
-    return kind or ("sparse" if images > SPARSE_FROM else "all")
+def kind_of_graph(images: int) -> GraphKind:
+    """Returns the kind of graph for this number of images."""
+    return "sparse" if images > SPARSE_FROM else "all"
 
 
 def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:

@@ -13,7 +13,7 @@ from stcal.sfm.adjust.calibration import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.data.as_drawn import faces_in_name
 from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.mapping.pairs import GraphKind, PairOptions
+from stcal.sfm.mapping.pairs import PairOptions
 
 Compare = Literal["paper"]
 
@@ -34,9 +34,6 @@ class RunOptions:
         Whether it is corrected; if not, the run is the uncorrected control.
     reference_face : str, optional
         Id of the face whose frame is the target frame; the first face of the design if None.
-    graph : {"all", "sparse"}, optional
-        Which pairs of images are matched, see :func:`stcal.sfm.mapping.pairs.image_graph`. If None, the number of
-        images decides.
     pairs : PairOptions
         Options of the initial pair.
     ellipses : EllipseOptions
@@ -72,7 +69,6 @@ class RunOptions:
     frame: FrameKind | None = None
     eccentricity: bool = True
     reference_face: str | None = None
-    graph: GraphKind | None = None
     pairs: PairOptions = field(default_factory=PairOptions)
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
     workers: int | None = None

@@ -1,1 +1,1 @@
-"""Hand-eye calibration from files or images of any board, with a robot file if wanted, or of a rig."""
+"""Hand-eye calibration from files or images of any board, with a robot file if wanted."""

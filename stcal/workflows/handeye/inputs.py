@@ -22,14 +22,14 @@ from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
 from stcal.handeye.solve import handeye
-from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
+from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
-from stcal.workflows.board_views import Board, detect_boards, kind_of
+from stcal.workflows.board_views import detect_boards, kind_of
 from stcal.workflows.handeye.robot_at_images import Arm, Timing, read_arm, robot_at_images
 
 NOTHING_SAID = Said()
@@ -360,79 +360,6 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
     return replace(pairs, camera_from_board=Poses(given.rotation, scale * given.translation)), scale
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Photographed:
-    """The content of one camera's images.
-
-    ``names`` : images that show the board and have a pose; ``seen`` : views of the board in them; ``rows`` : (k,) their
-    robot poses, rows of ``base_from_flange``; ``covariance`` of ``base_from_flange``; ``how`` : how they were matched;
-    ``unused`` : parts of the board that were seen and not used; ``robot`` : its poses by image; the other fields are as
-    in :class:`HandEyeInput`.
-    """
-
-    names: tuple[str, ...]
-    seen: Views
-    rows: np.ndarray
-    base_from_flange: Poses
-    covariance: np.ndarray | None
-    symmetries: tuple[Rigid, ...]
-    prior: CameraPrior
-    left_out: tuple[tuple[str, str], ...]
-    how: str
-    unused: tuple[str, ...]
-    robot: RobotPoses
-    timed: Timed | None
-
-
-def photographed(
-    source: Path,
-    robot: RobotPoses,
-    model: CameraModel,
-    design: Board,
-    workers: int | None,
-    progress: Progress,
-    timing: Timing | None = WITHOUT_OPTIONS,
-) -> Photographed:
-    """Returns the corners of the board in all images that have a pose.
-
-    Raises InputError: no image shows the board, or no image has a pose.
-    """
-    files, skipped = find_images(source)
-    at_images = robot_at_images(robot, [file.name for file in files], timing)
-    robot, late = at_images.robot, dict(at_images.left_out)
-    files = [file for file in files if file.name not in late]
-    rows, missing, matching = _rows_of_images(robot, files, source)
-    with_pose = [file for file in files if file.name in rows]
-    detections = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
-    views = detections.views()
-    left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in (*skipped, *detections.skipped)]
-    left_out += [*late.items(), *_without_partner(files, rows, missing, robot.file)]
-    if not views:
-        first = f"{detections.skipped[0].name}: {detections.skipped[0].reason}"
-        raise InputError(
-            "E-IMAGES-NO-BOARD", f"image folder {source}: the board is in none of {len(with_pose)} images: {first}"
-        )
-    corners = Views(
-        detections.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in views.values())
-    )
-    rows_of_views = np.array([rows[name] for name in views])
-    prior = camera_prior(refinable(model.calibrated(detections.camera.width, detections.camera.height)))
-    return Photographed(
-        tuple(views),
-        corners,
-        rows_of_views,
-        robot.base_from_flange,
-        robot.covariance,
-        detections.symmetries,
-        prior,
-        tuple(left_out),
-        matching,
-        tuple(detections.unused()),
-        robot,
-        at_images.timed(tuple(views)),
-    )
-
-
 def _from_images(
     source: Path,
     robot: RobotPoses,
@@ -444,33 +371,47 @@ def _from_images(
     timing: Timing | None,
     arm: Arm | None = None,
 ) -> HandEyeInput:
-    """Returns the pairs of all images that show the board and have a pose."""
-    design = load_boards(board)
-    photos = photographed(source, robot, read_camera(camera), design, workers, progress, timing)
-    robot = photos.robot
-    pairs = pairs_of_views(photos.base_from_flange[photos.rows], photos.seen, photos.names, str(source))
-    if photos.covariance is not None:
-        pairs = replace(pairs, base_from_flange_covariance=photos.covariance[photos.rows])
-    understood = _robot_lines(robot, photos.how) if not robot.own else ()
-    understood += tuple(f"board: {part}" for part in photos.unused)
+    """Returns the pairs of all images that show the board and have a pose.
+
+    Raises InputError: no image shows the board, or no image has a pose.
+    """
+    design, model = load_boards(board), read_camera(camera)
+    files, skipped = find_images(source)
+    at_images = robot_at_images(robot, [file.name for file in files], timing)
+    robot, late = at_images.robot, dict(at_images.left_out)
+    files = [file for file in files if file.name not in late]
+    row_of, missing, matching = _rows_of_images(robot, files, source)
+    with_pose = [file for file in files if file.name in row_of]
+    detections = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
+    left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in (*skipped, *detections.skipped)]
+    left_out += [*late.items(), *_without_partner(files, row_of, missing, robot.file)]
+    if not (found := detections.views()):
+        first = f"{detections.skipped[0].name}: {detections.skipped[0].reason}"
+        raise InputError(
+            "E-IMAGES-NO-BOARD", f"image folder {source}: the board is in none of {len(with_pose)} images: {first}"
+        )
+    views = Views(
+        detections.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values())
+    )
+    rows = np.array([row_of[name] for name in found])
+    pairs = pairs_of_views(robot.base_from_flange[rows], views, tuple(found), str(source))
+    if robot.covariance is not None:
+        pairs = replace(pairs, base_from_flange_covariance=robot.covariance[rows])
+    understood = _robot_lines(robot, matching) if not robot.own else ()
+    understood += tuple(f"board: {part}" for part in detections.unused())
     return HandEyeInput(
         f"{source.name}, {poses.name}",
         pairs,
-        photos.seen,
-        photos.symmetries,
-        photos.prior,
-        pitch_of(design),
-        photos.left_out,
+        views,
+        detections.symmetries,
+        camera_prior(refinable(model.calibrated(detections.camera.width, detections.camera.height))),
+        next((getattr(design, key) for key in PITCHES if hasattr(design, key)), None),
+        tuple(left_out),
         understood,
         folder=source,
-        arm=arm and arm[photos.rows],
-        timed=photos.timed,
+        arm=arm and arm[rows],
+        timed=at_images.timed(tuple(found)),
     )
-
-
-def pitch_of(design: Board) -> float | None:
-    """Returns the pitch of dots or squares, mm; None for tags."""
-    return next((getattr(design, key) for key in PITCHES if hasattr(design, key)), None)
 
 
 def _rows_of_images(

@@ -7,31 +7,20 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
 from stcal.handeye.data.pairs import Loop
-from stcal.handeye.methods.bundle import RigBundle, RigCorners
+from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.reprojection import problem
 from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
 from tests.outcome import fails_with
-from tests.support.handeye import simulated_views
+from tests.support.handeye import error, normalised, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
-
-
-def error(found, truth):
-    """Of X, (6,), as its covariance states it."""
-    x, true = found.mount_from_camera, truth.mount_from_camera
-    return Poses.of([x]).difference(Poses.of([true]))[0]
 
 
 def prior(camera, model):
     """Intrinsics of a calibration of some age."""
     return camera_prior(Camera.of(camera, model))
-
-
-def normalised(errors, covariances):
-    """RMS of errors in units of their covariances."""
-    return float(np.sqrt(np.mean([e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True)]) / 6))
 
 
 @pytest.mark.parametrize(
@@ -60,9 +49,8 @@ def test_derivatives_of_the_corners(setup):
     loop = Loop.of(truth.pairs, setup)
     noise = Noise(1e-3, 0.5, corner_px=0.2, board_mm=0.1)
     flange = truth.pairs.base_from_flange
-    one, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
-    corners, cameras = RigCorners(("",), (one,)), (truth.views.camera,)
-    state = RigBundle((truth.mount_from_camera,), truth.stand_from_board, flange, one.xyz_board, cameras)
+    corners, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
+    state = Bundle(truth.mount_from_camera, truth.stand_from_board, flange, corners.xyz_board, truth.views.camera)
     assert list(corners.parts(state)) == [
         "corner_px",
         *(f"camera_{kind}" for kind in ("focal", "centre", "radial", "tangential")),
@@ -71,7 +59,7 @@ def test_derivatives_of_the_corners(setup):
         "robot_mm",
     ]
     shared = corners.places()["robot"].start
-    assert_derivatives(corners, state, (*range(shared), *range(shared, corners.count(), 9)))
+    assert_derivatives(corners, state, (*range(shared), *range(shared, corners.places()["board"].stop, 9)))
 
 
 @pytest.mark.full

@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -19,34 +18,6 @@ from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import camera_prior
 from stcal.io.files import json_text
 from tests.support.handeye import simulated, simulated_views
-
-VOID = {"meta", "img", "br"}
-
-
-class Tags(HTMLParser):
-    """Fails where tags do not close in order; collects the text."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.images, self.text = [], 0, []
-
-    def handle_starttag(self, tag, attrs):
-        self.images += tag in ("img", "image")
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text.append(data)
-
-
-def read(page: str) -> Tags:
-    tags = Tags()
-    tags.feed(page)
-    assert tags.open == []
-    return tags
 
 
 @pytest.fixture(scope="module")
@@ -115,29 +86,28 @@ def test_corners_with_sigmas_of_their_own_have_a_factor(of_views):
 
 
 @pytest.mark.slow
-def test_the_page_is_whole_and_shows_every_part(of_views, of_methods):
-    page = read(outcome_report(of_views).page())
-    assert page.images == 3
-    text = " ".join(page.text)
-    for part in ("base_from_camera", "flange_from_board", "a note with <markup> & more", "x<1>.png", "pose 10"):
-        assert part in text
-    assert "Coverage of the image" in text
-    page = read(outcome_report(of_methods).page())
-    assert page.images == 1
-    text = " ".join(page.text)
-    assert "Coverage of the image" not in text
-    assert "Overlays" not in text
-    assert "tsai-lenz" in text
-    assert "zhao finds no rotation" in text
+def test_the_page_shows_every_part(of_views, of_methods):
+    page = outcome_report(of_views).page()
+    for part in ("base_from_camera", "flange_from_board", "a note with &lt;markup&gt; &amp; more", "x&lt;1&gt;.png"):
+        assert part in page
+    for part in ("pose 10", "Coverage of the image", "Use with care", "What the verdict rests on"):
+        assert part in page
+    page = outcome_report(of_methods).page()
+    assert "Coverage of the image" not in page
+    assert "Overlays" not in page
+    assert "tsai-lenz" in page
+    assert "zhao finds no rotation" in page
+    # Of an outcome that a program made of a result alone.
+    page = outcome_report(replace(of_views, pairs=None, views=None, held_out=None)).page()
+    assert "<img" not in page
+    assert "errors on poses held out are not known" in page
 
 
-def test_an_outlier_is_marked_in_text_page_and_file(of_methods):
-    bad = np.zeros(10, bool)
-    bad[4] = True
-    outcome = replace(of_methods, result=replace(of_methods.result, outliers=bad))
-    assert "9 poses, without 1 that contradicts them: pose 5" in outcome_report(outcome).text()
-    assert "left out, contradicting the others" in " ".join(read(outcome_report(outcome).page()).text)
-    assert HandEyeFile.of(outcome).outliers == ["pose 5"]
+def test_the_verdict_stands_in_text_and_file(of_views):
+    line = outcome_report(of_views).text().splitlines()[1]
+    found = HandEyeFile.of(of_views).verdict
+    assert (found.word, f"verdict: {found.sentence}") == ("use with care", line)
+    assert [row.title for row in found.findings][-1] == "Note"
 
 
 def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_methods):
@@ -151,32 +121,6 @@ def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_method
     data = json.loads(json_text(HandEyeFile.of(of_methods, whole=True)))
     assert [row["reason"] for row in data["methods"]] == [None, None, "hand-eye: zhao finds no rotation"]
     assert "methods" not in HandEyeFile.of(of_methods).content()
-
-
-def test_methods_of_which_none_could_be_validated_are_listed(of_methods):
-    each = replace(of_methods.compared[0], held_out=None, reason="without pose 1: too few")
-    outcome = replace(of_methods, held_out=None, compared=(each,))
-    assert "tsai-lenz" in outcome_report(outcome).text()
-    assert "without pose 1: too few" in " ".join(read(outcome_report(outcome).page()).text)
-
-
-def test_a_page_without_poses_and_views_is_whole(of_views):
-    """Of an outcome that a program made of a result alone."""
-    page = read(outcome_report(replace(of_views, pairs=None, views=None, held_out=None)).page())
-    assert page.images == 0
-    assert "errors on poses held out are not known" in " ".join(page.text)
-
-
-def test_the_verdict_stands_in_text_page_and_file(of_views):
-    line = outcome_report(of_views).text().splitlines()[1]
-    assert line.startswith("verdict: use with care: ")
-    assert line.endswith("; a note with <markup> & more")
-    text = " ".join(read(outcome_report(of_views).page()).text)
-    assert "Use with care" in text
-    assert "What the verdict rests on" in text
-    found = HandEyeFile.of(of_views).verdict
-    assert (found.word, found.sentence) == ("use with care", line.removeprefix("verdict: "))
-    assert [row.title for row in found.findings][-1] == "Note"
 
 
 def test_the_chart_of_poses_has_the_names_that_tell_them_apart(of_methods):

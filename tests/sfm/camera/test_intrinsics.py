@@ -110,7 +110,7 @@ def test_a_bad_dot_is_weighed_down():
 
 def test_a_descent_that_does_not_end_begins_again_and_says_so(monkeypatch):
     views = views_of(np.random.default_rng(7))
-    plain, own, calls = calibrated(views), intrinsics.adjusted, []
+    plain, own, calls = calibrated(views), intrinsics._adjusted, []
 
     def endless_first(*given):
         calls.append(given)
@@ -118,7 +118,7 @@ def test_a_descent_that_does_not_end_begins_again_and_says_so(monkeypatch):
             raise ConvergenceError("E-NO-MINIMUM", "projections still move")
         return own(*given)
 
-    monkeypatch.setattr(intrinsics, "adjusted", endless_first)
+    monkeypatch.setattr(intrinsics, "_adjusted", endless_first)
     again = calibrated(views)
     assert (plain.restarted, again.restarted, len(calls)) == (False, True, 2)
     np.testing.assert_allclose(again.camera.parameters(), plain.camera.parameters(), rtol=1e-4)  # the same minimum

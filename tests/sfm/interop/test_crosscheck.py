@@ -184,9 +184,9 @@ def test_names_and_places_with_spaces_and_beyond_ascii(colmap, small_set, stcal_
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_page")
 def test_a_run_with_other_options(colmap, small_set, stcal_sfm):
-    """Chained, frames of three points, another reference face: the native models go through the same."""
+    """Chained, another reference face: the native models go through the same."""
     small = small_set("12", "14")
-    assert stcal_sfm(*small.arguments("--solve", "chain", "--frame", "three-point", "--reference-face", "2"))[0] == 0
+    assert stcal_sfm(*small.arguments("--solve", "chain", "--reference-face", "2"))[0] == 0
     code, _, _ = stcal_sfm("crosscheck", small.out)
     assert code == 0
     check = json.loads((small.out / "report.json").read_text(encoding="utf-8"))["crosscheck"]

@@ -502,7 +502,7 @@ USAGE = {
     "no folder": (["run", "x"], ("'--out'", "`stcal-sfm run --help`")),
     "no such option": (["run", "x", "--camra", "y"], ("--camra", "`stcal-sfm run --help`")),
     "no such command": (["calibrate"], ("'calibrate'", "`stcal-sfm --help`")),
-    "no such choice": (["run", "x", "--camera", "y", "--out", "z", "--frame", "best"], ("'--frame'", "'three-point'")),
+    "no such choice": (["run", "x", "--camera", "y", "--out", "z", "--solve", "best"], ("'--solve'", "'chain'")),
     "not a number": (["run", "x", "--camera", "y", "--out", "z", "--workers", "all"], ("'--workers'", "--help`")),
     "no workers": (["run", "x", "--camera", "y", "--out", "z", "--workers", "0"], ("'--workers'", "--help`")),
     "diameters": (

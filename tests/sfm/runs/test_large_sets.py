@@ -43,7 +43,7 @@ def crowd(labels_only):
 
 
 def solve(scene, observations, kind, out):
-    options = RunOptions(graph=kind).settled(scene.target)
+    options = RunOptions().settled(scene.target)
     graph = image_graph(observations, scene.board, kind)
     (out / "cache").mkdir(parents=True)
     folders, designs = (out / "scratch", out / "cache"), (scene.target, scene.board)

@@ -67,7 +67,6 @@ def test_the_published_method_is_settled_whole(small_set, stcal_sfm):
 def test_what_contradicts_the_published_method_is_refused(small_set, stcal_sfm):
     data = small_set("12", "14")
     for more, said in (
-        (("--solve", "paper", "--frame", "plane"), "--solve paper: three-point frames without eccentricity"),
         (("--solve", "paper", "--refine-camera"), "--refine-camera: part of the joint adjustment, the solve is paper"),
         (
             ("--solve", "chain", "--compare", "paper"),

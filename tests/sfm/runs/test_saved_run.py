@@ -30,7 +30,6 @@ OTHER = RunOptions(
     frame="three-point",
     eccentricity=False,
     reference_face="2",
-    graph="sparse",
     pairs=PairOptions(max_angle_rad=0.9),
     ellipses=EllipseOptions(min_diameter_px=7.5, max_diameter_px=321.0, min_axis_ratio=0.23, min_contrast=0.07),
     workers=3,
@@ -52,7 +51,7 @@ def written(small_dataset, small_run, tmp_path_factory):
     own_copy(small_run / "cache", folder / "run" / "cache")
     own_copy(small_run / "stcal-run.json", folder / "run")
     grey(folder / "data" / "images" / UNLABELLED)
-    options = RunOptions("chain", "three-point", True, "2", "sparse", PairOptions(np.radians(40)), workers=1)
+    options = RunOptions("chain", "three-point", True, "2", PairOptions(np.radians(40)), workers=1)
     data = folder / "data"
     files = [data / name for name in ("images", "cameras.txt")], [data / name for name in ("target.toml", "board.toml")]
     with pytest.MonkeyPatch.context() as patch:
