@@ -17,7 +17,7 @@ from ipaddress import ip_address
 import cv2
 import numpy as np
 
-from stcal.errors import ConvergenceError, InputError
+from stcal.errors import InputError, StcalError
 from stcal.io.images import Skipped, decode, stated_size
 from stcal.parallel import one_thread
 from stcal.report.document import environment
@@ -45,7 +45,7 @@ RATE_OVER = 20
 """Number of pictures over which the rate is taken."""
 LOOK_S = 0.01
 """Interval at which a page's connection looks for a newer picture, s."""
-CONNECTIONS = 32
+CONNECTIONS = 16
 """Number of connections at a time; each may hold an image of the largest size."""
 END_S = 2
 """Time in which pages receive the last picture at the end, s."""
@@ -191,25 +191,23 @@ def observed(tracker: Tracker, image: np.ndarray, name: str):
     try:
         labelled, pose = tracker.observe(image, name)
         centres, measured = labelled.observations.centre_px, outcome(name, pose, labelled.notes)
-    except ConvergenceError as error:
-        centres, measured = np.zeros((0, 2)), Skipped(name, str(error), "distortion")
+    except InputError:
+        raise
+    except StcalError as error:  # such as a distortion that cannot be inverted: the next image may do
+        centres, measured = np.zeros((0, 2)), outcome(name, error, ())
     result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
     return centres, measured, poses_file(result).content()
 
 
 def rows_of(pose: TargetPose) -> list[list[str]]:
     """Returns the rows of the page for a pose: names and values with their σ, camera_from_target in mm and degrees."""
-    turn = np.degrees(pose.camera_from_target.log()[:3])
-    sigma = pose.camera_from_target.log_sigma(pose.covariance)
-    sigma[:3] = np.degrees(sigma[:3])
+    pose_sigma = pose.camera_from_target.log_sigma(pose.covariance)
+    turn, turn_sigma = np.degrees([pose.camera_from_target.log()[:3], pose_sigma[:3]])
     rows = [["faces", ", ".join(pose.faces)], ["circles", str(len(pose.labels))]]
-    rows += [
-        [axis, f"{value:.3f} ± {s:.3f} mm"]
-        for axis, value, s in zip("xyz", pose.camera_from_target.translation, sigma[3:], strict=True)
-    ]
-    rows += [
-        [f"turn about {axis}", f"{value:.3f} ± {s:.3f}°"] for axis, value, s in zip("xyz", turn, sigma[:3], strict=True)
-    ]
+    for axis, value, sigma in zip("xyz", pose.camera_from_target.translation, pose_sigma[3:], strict=True):
+        rows.append([axis, f"{value:.3f} ± {sigma:.3f} mm"])
+    for axis, value, sigma in zip("xyz", turn, turn_sigma, strict=True):
+        rows.append([f"turn about {axis}", f"{value:.3f} ± {sigma:.3f}°"])
     return [*rows, ["residuals", f"{pose.rms_px():.3f} px RMS"]]
 
 

@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.design import KnownDistance, ScaleReference, StatedSize
-from stcal.errors import InputError
+from stcal.errors import StcalError
 from stcal.io.design import board_toml, load_board
 from stcal.io.files import RUN_MARKER, digest_of, json_text
+from stcal.labels import CircleLabel
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.file import BudgetFile, _unusual
 from stcal.sfm.budget.lengths import against_stated
@@ -20,7 +21,7 @@ from stcal.sfm.report.judgement import INVALIDATES
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile
 from stcal.sfm.runs.verify import verify
-from tests.outcome import INPUT, assert_error
+from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
 
 STATEMENT = """
@@ -124,24 +125,14 @@ def test_one_thermometer_of_both_errs_in_the_difference_of_the_expansions(saved,
     assert (source.sigma, source.unit, source.origin) == (1.0, "K", "stated")
 
 
-def test_a_date_of_toml_is_its_text(tmp_path):
+def test_one_thermometer_is_stated_before_the_tables_and_a_date_of_toml_is_its_text(saved, tmp_path):
     path = tmp_path / "lab.toml"
-    path.write_text("[fields]\ndate = 2026-11-27\nread = 2026-11-27 08:30:00\n")
-    assert (
-        statement_of(StatedSize(), path).fields.items() >= {"date": "2026-11-27", "read": "2026-11-27 08:30:00"}.items()
-    )
-
-
-def test_one_thermometer_is_stated_before_the_tables(saved, tmp_path):
-    path = tmp_path / "lab.toml"
-    path.write_text("one_thermometer = true\n[board]\ntemperature_sigma_k = 0.5\n")
+    path.write_text("one_thermometer = true\n[board]\ntemperature_sigma_k = 0.5\n[fields]\ndate = 2026-11-27\n")
     found = statement_of(StatedSize(), path)
-    assert found.one_thermometer
+    assert (found.one_thermometer, found.fields["date"]) == (True, "2026-11-27")
     (source,) = (each for each in budget_of_run(saved, found).sources if each.key == "temperature")
     assert source.origin == "not stated"
-    assert source.words == (
-        "no expansion_ppm_per_k of [board] and temperature_sigma_k of [target] and expansion_ppm_per_k of [target]"
-    )
+    assert source.words.count("expansion_ppm_per_k") == 2
 
 
 def test_rims_that_were_estimated_are_a_row(saved, plain):
@@ -176,25 +167,26 @@ WARM_TARGET = StatedSize(expansion_ppm_per_k=23.0, temperature_c=22.4)
 
 
 @pytest.mark.parametrize(
-    ("board", "target", "ppm", "temperature_c", "words"),
+    ("board", "target", "ppm", "temperature_c"),
     [
-        (WARM_BOARD, WARM_TARGET, 22.95 - 55.2, 20.0, "at 20 °C, with a correction of -32.2 ppm"),
-        (WARM_BOARD, replace(WARM_TARGET, reference_temperature_c=22.0), 22.95 - 9.2, 22.0, "at 22 °C, with"),
-        (WARM_BOARD, StatedSize(), 22.95, None, "at which the target was photographed, with a correction of +22.9 ppm"),
-        (WARM_BOARD, StatedSize(temperature_c=22.4), 22.95, 22.4, "at 22.4 °C, at which the target was photographed"),
-        (WARM_BOARD, StatedSize(temperature_c=20.0), 22.95, 20.0, "at 20 °C, with a correction of +22.9 ppm"),
-        (StatedSize(temperature_c=20.0), WARM_TARGET, -55.2, 20.0, "at 20 °C, with a correction of -55.2 ppm"),
-        (StatedSize(expansion_ppm_per_k=0.0), WARM_TARGET, -55.2, 20.0, "at 20 °C, with a correction of -55.2 ppm"),
-        (StatedSize(), WARM_TARGET, 0.0, 22.4, "without them the target's are not corrected for"),
-        (StatedSize(), StatedSize(), 0.0, None, "as far as the board's grid had the size of its file there"),
+        (WARM_BOARD, WARM_TARGET, 22.95 - 55.2, 20.0),
+        (WARM_BOARD, replace(WARM_TARGET, reference_temperature_c=22.0), 22.95 - 9.2, 22.0),
+        (WARM_BOARD, StatedSize(), 22.95, None),
+        (WARM_BOARD, StatedSize(temperature_c=22.4), 22.95, 22.4),
+        (WARM_BOARD, StatedSize(temperature_c=20.0), 22.95, 20.0),
+        (StatedSize(temperature_c=20.0), WARM_TARGET, -55.2, 20.0),
+        (StatedSize(expansion_ppm_per_k=0.0), WARM_TARGET, -55.2, 20.0),
+        (StatedSize(), WARM_TARGET, 0.0, 22.4),
+        (StatedSize(), StatedSize(), 0.0, None),
     ],
 )
-def test_lengths_hold_where_what_is_stated_leads(saved, board, target, ppm, temperature_c, words):
+def test_lengths_hold_where_what_is_stated_leads(saved, board, target, ppm, temperature_c):
     """A length at the temperature of the photographs needs the board's expansion, one at 20 °C the target's too."""
     found = conditions_of(Statement(board, target, {}, {}), saved.board_design)
     assert (found.correction, found.temperature_c) == (pytest.approx(1e-6 * ppm, abs=1e-12), temperature_c)
     assert found.size_known
-    assert words in found.words
+    if temperature_c is not None and ppm:
+        assert f"at {temperature_c:g} °C" in found.words
 
 
 def scale_of(*distances):
@@ -203,7 +195,7 @@ def scale_of(*distances):
 
 def test_a_size_of_the_target_itself_does_not_expand():
     """No board was used: what is stated of one must not change a length."""
-    known = KnownDistance(replace_label("1", "1"), replace_label("1", "2"), 100.0, 0.01)
+    known = KnownDistance(CircleLabel("1", "1"), CircleLabel("1", "2"), 100.0, 0.01)
     found = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), scale_of(known))
     assert (found.size_known, found.correction, found.temperature_c) == (True, 0.0, 20.0)
     drawn = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), scale_of(replace(known, drawn=True)))
@@ -211,33 +203,21 @@ def test_a_size_of_the_target_itself_does_not_expand():
 
 
 def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path):
-    known = KnownDistance(replace_label("1", "1"), replace_label("1", "2"), 100.0, 0.01, drawn=True)
+    known = KnownDistance(CircleLabel("1", "1"), CircleLabel("1", "2"), 100.0, 0.01, drawn=True)
     shape = replace(plain, conditions=conditions_of(plain.statement, scale_of(known)))
     file = BudgetFile.of(shape, saved, verify(saved.folder))
-    assert (file.size_known, file.reference_temperature_c, file.correction_ppm, file.distances) == (
-        False,
-        None,
-        None,
-        [],
-    )
+    assert not file.size_known
+    assert (file.reference_temperature_c, file.correction_ppm, file.distances) == (None, None, [])
     for face in file.faces.values():
         assert (face.position_mm, face.position_um, face.position_xyz_um) == (None, None, None)
         assert face.rotation_mdeg.expanded > 0
-    assert file.notes[0].startswith("Only the shape is known")
-    text = budget_report(file).text()
-    page = budget_report(file).page()
-    assert "Certificate" not in page
-    assert "Signature" not in page
-    assert "only the shape is known" in page
-    for shown in (text, page):
-        assert "hold at" not in shown
-        assert "position of face" not in shown
-        assert "longest distance" not in shown
+    for shown in (budget_report(file).text(), budget_report(file).page()):
+        assert "only the shape is known" in shown.lower()
+        assert not any(word in shown for word in ("Certificate", "hold at", "position of face", "longest distance"))
     path = tmp_path / "lengths.csv"
     path.write_text("from,to,length_mm\n1:1,1:2,100\n")
-    with pytest.raises(InputError, match="only its shape is known") as error:
+    with fails_with("E-BUDGET-NO-SIZE"):
         against_stated(shape, path)
-    assert error.value.code == "E-BUDGET-NO-SIZE"
 
 
 def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
@@ -248,15 +228,9 @@ def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
 
 
 def test_the_longest_distances_are_of_different_pairs_of_faces():
-    labels = [replace_label(face, circle) for face in "12" for circle in "ab"]
+    labels = [CircleLabel(face, circle) for face in "12" for circle in "ab"]
     xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 5, 0], [0, 7, 0.0]])
     assert longest_of(labels, xyz) == [(1, 3), (2, 3), (0, 1)]
-
-
-def replace_label(face, circle):
-    from stcal.labels import CircleLabel
-
-    return CircleLabel(face, circle)
 
 
 def test_command(stcal_sfm, small_run, tmp_path):
@@ -264,10 +238,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     path.write_text(STATEMENT)
     code, text, _ = stcal_sfm("budget", small_run, "--statement", path, "--field", "instrument=X 5", "--json", out)
     assert code == 0
-    assert "operator: A. Smith\n" in text
-    assert "instrument: X 5\n" in text
-    assert "note: taken as exact, since nothing is stated of them: intrinsics;" in text
-    assert "-14.0 ppm" in text
+    assert all(shown in text for shown in ("operator: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
     file = json.loads(out.read_text())
     marker = json.loads((small_run / "stcal-run.json").read_text())["sha256"]
     assert (file["run"]["sha256"], file["run"]["faces_sha256"]) == (marker["stcal-run.json"], marker["faces.json"])
@@ -310,8 +281,8 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     code, text, error = stcal_sfm("budget", copy)
     assert (code, "--no-strict" in error) == (4, True)
     assert title in error or "No" in error
-    assert f"note: failed checks of the run: 1, first {title}; what they found is not among the inputs" in text
-    assert f"{', '.join(INVALIDATES[report['checks'][1]['key']])} do not hold before it is put right" in text
+    assert title in text
+    assert all(what in text for what in INVALIDATES[report["checks"][1]["key"]])
     assert "expanded uncertainty U" not in text
     page, out = tmp_path / "budget.html", tmp_path / "budget.json"
     lengths = tmp_path / "lengths.csv"
@@ -321,9 +292,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     assert (code, text, error.count("\n")) == (0, "", 1)
     assert error.startswith("warning: may run ")
     html, file = page.read_text(), json.loads(out.read_text())
-    assert "do not hold before it is put right" in html
-    assert "Lengths and positions hold" not in text + html
-    assert "Certificate" not in html
+    assert not any(word in text + html for word in ("Lengths and positions hold", "Certificate"))
     assert (file["usable"], file["faces"], file["distances"], file["holds"]) == (False, {}, [], "")
     (test,) = file["length_tests"]
     assert (test["agrees"], test["beyond"], test["lengths"][0]["expanded_um"]) == (None, None, None)
@@ -333,25 +302,24 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[board]\npitch_sigma_ppm = 30e-6\n", "in ppm, so that 3e-05 as a fraction is 30, and in % 0.3;"),
-        ('[fields]\ndate = "2999-01-01"\n', "date 2999-01-01: in the future"),
-        ('[fields]\ndate = "05.01.2031"\n', "date 05.01.2031: no date as YYYY-MM-DD"),
-        ('[fields]\ndate = "2026-02-31"\n', "date 2026-02-31: no date as YYYY-MM-DD"),
-        ("[board]\npitch_sigma_ppm = 0.012\n", "in % 120;"),
-        ("[board]\ntemperature_c = 295.65\n", "295.65 K are 22.5 °C"),
+        ("[board]\npitch_sigma_ppm = 30e-6\n", "30, and in % 0.3;"),
+        ('[fields]\ndate = "2999-01-01"\n', "2999-01-01: in the future"),
+        ('[fields]\ndate = "05.01.2031"\n', "YYYY-MM-DD"),
+        ("[board]\ntemperature_c = 295.65\n", "22.5 °C"),
         ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
-        ("[target]\nexpansion_ppm_per_k = 0.000023\n", "in ppm/K, so that 2.3e-05 1/K is 23;"),
-        ("[board]\nexpansion_sigma_ppm_per_k = 1e-6\n", "in ppm/K, so that 1e-06 1/K is 1;"),
+        ("[target]\nexpansion_ppm_per_k = 0.000023\n", "2.3e-05 1/K is 23;"),
         ("[target]\npitch_sigma_ppm = 1\n", "target.pitch_sigma_ppm: unknown key"),
         ("[fields]\noperator = 3\n", "fields.operator: 3:"),
         ("operator = 'x'\n", "operator: unknown key"),
         ("[target]\none_thermometer = true\n", "move it to the top of the file"),
     ],
 )
-def test_statements_that_are_none(stcal_sfm, small_run, tmp_path, content, words):
+def test_statements_that_are_none(tmp_path, content, words):
     path = tmp_path / "lab.toml"
     path.write_text(content)
-    assert_error(stcal_sfm("budget", small_run, "--statement", path), INPUT, str(path), words)
+    with pytest.raises(StcalError) as error:
+        statement_of(StatedSize(), path)
+    assert words in str(error.value)
 
 
 def test_fields_that_are_none(stcal_sfm, small_run):

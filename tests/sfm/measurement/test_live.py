@@ -124,29 +124,23 @@ def test_a_browser_has_the_token_in_its_address(tracker):
 
 
 @pytest.mark.slow
-def test_each_picture_has_its_pose_or_the_reason_why_not(tracker, photograph):
-    service = LiveService(tracker, live=True)
-    first, dark, _ = service.follow([photograph, np.zeros_like(photograph), photograph], tracker)
-    assert [first["status"], dark["status"], service.newest["status"]] == ["certain", "no pose", "certain"]
+def test_each_message_has_a_picture_with_its_pose_or_the_reason_why_not(tracker, photograph):
+    service, frames, contents = LiveService(tracker, live=True), [photograph, np.zeros_like(photograph), photograph], []
+    for content, frame in zip(service.follow(frames, tracker), frames, strict=True):
+        contents.append(content)
+        assert {key: service.newest[key] for key in content} == content
+        shown = cv2.imdecode(np.frombuffer(base64.b64decode(service.newest["jpeg"]), np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert shown.shape[1] == WIDEST_PX
+        assert (shown.max() > 100) == (content["status"] == "certain") == (frame.max() > 100)
+    first, dark, _ = contents
     assert first["poses"]["images"][0]["image"] == "picture 1"
     assert len(first["poses"]["images"][0]["circles"]) == int(dict(first["shown"])["circles"])
-    assert "face" in dark["reason"]
     assert "mm" in line_of(first)
+    assert "face" in dark["reason"]
     assert dark["reason"] in line_of(dark)
     last, end = TestClient(service.app, f"http://{OWN}").get("/events").text.split("\n\n")[:2]
     assert json.loads(last.removeprefix("data: ")) == service.newest
     assert end.startswith("event: ended")
-
-
-@pytest.mark.slow
-def test_picture_and_pose_are_of_one_message(tracker, photograph):
-    """Of pictures that are bright or dark in turn, so that the pose tells which one it was."""
-    service, frames = LiveService(tracker, live=True), [photograph, np.zeros_like(photograph)] * 2
-    for content, frame in zip(service.follow(frames, tracker), frames, strict=True):
-        assert service.newest["poses"] == content["poses"]
-        shown = cv2.imdecode(np.frombuffer(base64.b64decode(service.newest["jpeg"]), np.uint8), cv2.IMREAD_GRAYSCALE)
-        assert shown.shape[1] == WIDEST_PX
-        assert (shown.max() > 100) == (content["status"] == "certain") == (frame.max() > 100)
 
 
 @pytest.mark.slow

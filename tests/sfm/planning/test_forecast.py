@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from stcal.io.cameras.model import CameraModel, CameraPrior, model_of
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
-from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.planning import bodies, session, views
@@ -33,6 +31,7 @@ from stcal.sfm.planning.forecast import (
     Setup,
     _rim_integrals,
     forecast,
+    nominal_poses,
     observe,
     true_models,
     variance_shares,
@@ -114,9 +113,7 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("common", "draws"), [(0.0, 5), *(pytest.param(*p, marks=pytest.mark.full) for p in ((0.0, 60), (0.99, 25)))]
-)
+@pytest.mark.parametrize(("common", "draws"), [(0.0, 60), (0.99, 25)])
 def test_forecast_is_the_spread_of_simulations(exact, common, draws):
     setup, models = setup_of(exact, common=common), models_of(exact)
     expected = forecast(models, setup)
@@ -125,16 +122,6 @@ def test_forecast_is_the_spread_of_simulations(exact, common, draws):
     for face, rows in errors.items():
         require_chi2(rows, expected.face_covariance[face])
         require_chi2(rows[:, 3:], expected.face_covariance[face][3:, 3:])
-
-
-def test_forecast_is_what_the_adjustment_states(exact):
-    setup, models = setup_of(exact), models_of(exact)
-    expected = forecast(models, setup)
-    joint = adjust_jointly(drawn(models, setup, np.random.default_rng(2)), setup.board, setup.camera)
-    stated = derivatives(joint, setup.start, setup.target, "plane").face_covariance(joint.covariance_mm2)
-    for face, covariance in expected.face_covariance.items():
-        # σ₀ of some 700 degrees of freedom is good to 2.7 %; Huber's weights take 1 %.
-        assert np.sqrt(np.diag(stated[face])) == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.08)
 
 
 def doubled(model: MetricModel) -> MetricModel:
@@ -149,15 +136,12 @@ def doubled(model: MetricModel) -> MetricModel:
     )
 
 
-@pytest.mark.parametrize(("board_sigma_mm", "low", "high"), [(1e-4, 0.707, 0.709), (1.0, 0.85, 1.0)])
-def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact, board_sigma_mm, low, high):
-    setup, models = setup_of(exact, board_sigma_mm), models_of(exact)
-    once, twice = forecast(models, setup), forecast([doubled(model) for model in models], setup)
-    if board_sigma_mm == 1.0:
-        once, twice = once.scale_sigma, twice.scale_sigma
-    else:
-        once, twice = once.worst()[1], twice.worst()[1]
-    assert low <= twice / once <= high
+def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact):
+    models = models_of(exact)
+    setups = [setup_of(exact, board_sigma_mm) for board_sigma_mm in (1e-4, 1.0)]
+    once, twice = ([forecast(m, own) for own in setups] for m in (models, [doubled(model) for model in models]))
+    assert twice[0].worst()[1] / once[0].worst()[1] == pytest.approx(0.708, abs=1e-3)
+    assert 0.85 <= twice[1].scale_sigma / once[1].scale_sigma <= 1
 
 
 def test_scale_is_as_good_as_the_plate(exact):
@@ -335,19 +319,6 @@ def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch, grid_deg, 
             assert max(view.tilts_deg.values()) < 75
 
 
-@pytest.mark.slow
-def test_advise_for_a_large_set(coarse):
-    """Fifty views of each group: a further one helps every time, but by no more than its share of the image noise."""
-    scene = make_scene(replace(SMALL, images_per_group=50, groups=(("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))))
-    known = known_from(scene)
-    advice = advise(known, 2)
-    sigma = [advice.now.worst()[1], *(choice.sigma_mm for choice in advice.choices)]
-    assert len(sigma) == 3
-    for before, after_it in pairwise(sigma):
-        # The mean one of fifty takes 1 % of σ from its group; the best, at the edge, a few times as much.
-        assert 0.96 < after_it / before < 0.998
-
-
 def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
     known = known_of(load_run(small_run))
     now = forecast(known.models, known.setup)
@@ -359,18 +330,10 @@ def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
 
 def test_advise_takes_a_run_and_its_folder(small_run, monkeypatch):
     """As :func:`stcal.sfm.load_run` returns it; what is chosen is tested with the geometry."""
-    seen = []
-
-    def stop(models, *_, **__):
-        seen.append([len(model.images) for model in models])
-        raise KeyError
-
-    monkeypatch.setattr("stcal.sfm.planning.advise.forecast", stop)
+    monkeypatch.setattr("stcal.sfm.planning.advise.forecast", lambda models, *_, **__: {}[len(models)])
     for given in (load_run(small_run), small_run, str(small_run)):
-        with pytest.raises(KeyError):
+        with pytest.raises(KeyError, match="2"):
             advise(given, 1)
-    assert seen == [seen[0]] * 3
-    assert len(seen[0]) > 1
 
 
 def test_a_plan_takes_a_camera_as_its_file():
@@ -421,8 +384,6 @@ def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
     now, then = (f"{c['worst_face']}: {c['worst_sigma_um']:.2f}" for c in (content, view))
     assert f"{now} → {then}" in text
     assert "warning" not in text
-    (head,) = (i for i, line in enumerate(text.splitlines()) if line.split()[:2] == ["group", "from"])
-    assert max(map(len, text.splitlines()[head : head + 3])) <= 80
 
 
 @pytest.mark.slow
@@ -464,8 +425,6 @@ def test_plan_command(stcal_sfm, tmp_path):
     assert content["groups"] == ["12", "14", "15", "23"]
     assert content["worst_face"] == "3"  # the only one that is two groups away from the reference
     assert "worst is face 3" in text
-    (head,) = (i for i, line in enumerate(text.splitlines()) if line.startswith("face "))
-    assert 70 < max(map(len, text.splitlines()[head : head + 6])) <= 80
     assert {row["what"] for row in content["remedies"]} >= {"twice the images", "a board of half the σ"}
 
 
@@ -512,52 +471,39 @@ def test_plan_names_what_dominates():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "code"),
     [
-        (("--noise", 0.01, "--run", "anywhere"), "both give the σ"),
-        (("--groups", "12,17"), "'17' is not a pair of faces"),
-        (("--groups", "12,34"), "no group links face 3, 4 to reference face 1"),
-        (("--run", "nowhere"), "not a run's folder"),
+        (("--noise", 0.01, "--run", "anywhere"), (2, "E-OPTION-CONFLICT")),
+        (("--groups", "12,17"), (2, "E-OPTION-VALUE")),
+        (("--groups", "12,34"), (2, "E-PLAN-UNLINKED")),
+        (("--run", "nowhere"), (2, "E-RUN-FOLDER")),
+        pytest.param(("--distance", 300, "--images", 2, "--groups", "12"), (3, "E-SCENE-VIEWS"), marks=SLOW),
     ],
 )
-def test_plan_says_what_is_wrong(stcal_sfm, arguments, message):
-    code, _, error = stcal_sfm("plan", *arguments)
-    assert (code, error.count("\n")) == (2, 1)
-    assert message in error
-
-
-@pytest.mark.slow
-def test_plan_out_of_reach(stcal_sfm):
-    code, _, error = stcal_sfm("plan", "--distance", 300, "--images", 2, "--groups", "12")
-    assert (code, error.count("\n")) == (3, 1)
-    assert "a larger distance_mm" in error
+def test_plan_says_what_is_wrong(stcal_sfm, arguments, code):
+    ended = stcal_sfm("plan", *arguments)
+    assert (ended[0], ended.error) == code
 
 
 @pytest.mark.parametrize(
     ("faces", "message"),
     [
         (None, "E-TARGET-ROUGH-POSE … rough_pose … origin_mm … --faces"),
-        ("nothing", "E-JSON-INVALID"),
         ('{"unit": "m", "target_from_face": {}}', "E-KEY-VALUE … 'm'"),
         ('{"target_from_face": {}}', "E-TARGET-NO-FACE … top"),
     ],
 )
 def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
-    from stcal.sfm.planning.forecast import nominal_poses
-
     target, _, _ = second_design()
     target = replace(target, faces=tuple(replace(face, rough_target_from_face=None) for face in target.faces))
     path = tmp_path / "faces.json"
-    if faces is not None:
-        path.write_text(faces)
+    path.write_text(faces or "")
     with fails_with(message):
-        nominal_poses(target, None if faces is None else path)
+        nominal_poses(target, path if faces else None)
 
 
 @pytest.mark.slow
 def test_plan_of_another_design_with_its_faces(tmp_path):
-    from stcal.sfm.planning.forecast import nominal_poses
-
     target, board, poses = second_design()
     path = tmp_path / "faces.json"
     path.write_text(json.dumps({"target_from_face": {face: pose.matrix().tolist() for face, pose in poses.items()}}))
@@ -566,12 +512,11 @@ def test_plan_of_another_design_with_its_faces(tmp_path):
     assert 1e-4 < result.forecast.worst()[1] < 0.02
 
 
-def test_plan_needs_the_size_of_the_camera():
-    for size in ((None, None), (2592, None), (None, 1728)):
-        focal, middle = np.array([2800.0, 2800.0]), np.array([1296.0, 864.0])
-        camera = CameraModel(focal, middle, np.zeros(8), "PINHOLE", *size, "f")
-        with fails_with("E-CAMERA-SIZE"):
-            PlanOptions(camera=camera)
+@pytest.mark.parametrize("size", [(None, None), (2592, None)])
+def test_plan_needs_the_size_of_the_camera(size):
+    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", *size, "f")
+    with fails_with("E-CAMERA-SIZE"):
+        PlanOptions(camera=camera)
 
 
 @pytest.mark.parametrize("common", [0.0, 0.99])
@@ -597,21 +542,6 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
         atol=1e-6,
     )
     assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
-
-
-@pytest.mark.slow
-def test_a_fine_board_is_planned():
-    """2500 dots in 8 images; with fewer dots on the same area the σ rise by no more than the root of their number."""
-    fine = replace(
-        reference_board(), rows=50, columns=50, pitch_mm=4.0, radius_mm=1.2, corner=None, corner_radius_mm=None
-    )
-    coarse = replace(fine, rows=10, columns=10, pitch_mm=20.0)
-    options = PlanOptions(images=4, width=2592, groups=(("1", "2"), ("1", "4")))
-    sigma = [
-        make_plan(options, reference_target(), board, reference_target().rough_poses()).forecast.worst()[1]
-        for board in (fine, coarse)
-    ]
-    assert sigma[0] < sigma[1] < 5 * sigma[0]
 
 
 @pytest.mark.parametrize(
