@@ -53,8 +53,6 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]},
 projection_matrix: {rows: 3, cols: 4, data: [900, 0, 640, -90, 0, 905, 475, 0, 0, 0, 1, 0]},
 camera_matrix_std: [0.1, 0.1, 0.2, 0.2]}
 """
-FRAMES = """{"camera_model": "OPENCV", "fl_x": 900, "fl_y": 905, "cx": 640.5, "cy": 475.5, "w": 1280, "h": 960,
-"k1": -0.1, "k2": 0.03, "p1": 0.001, "p2": -0.002, "frames": [{"file_path": "a.jpg", "transform_matrix": [[1]]}]}"""
 MRCAL = """{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [900, 905, 640, 475, -0.1, 0.03, 0.001, -0.002],
 'extrinsics': [0, 0, 0, 0.1, 0, 0], 'imagersize': [1280, 960], 'valid_intrinsics_region': [[9, 9], [99, 9], [9, 99]]}"""
 
@@ -66,7 +64,6 @@ MRCAL = """{'lensmodel': 'LENSMODEL_OPENCV4', 'intrinsics': [900, 905, 640, 475,
         (RIG, ("--name", "cam0"), ["the other camera, cam1"]),
         (ROS, (), ["projection_matrix, camera_matrix_std"]),
         (MRCAL, (), ["extrinsics", "valid_intrinsics_region"]),
-        (FRAMES, (), ["frames"]),
         ("1 OPENCV 1280 960 900 905 640.5 475.5 -0.1 0.03 0.001 -0.002\n", (), []),
     ],
 )

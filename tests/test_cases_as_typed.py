@@ -50,7 +50,6 @@ def camera(fx: float, fy: float, cx: float, cy: float, *k: float, names: str = "
 
 
 FISHEYE = "k1 k2 k3 k4"
-KITTI = (-3.728755e-01, 2.037299e-01, 2.219027e-03, 1.383707e-03, -7.233722e-02)
 CAM_TXT = camera(1502, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)
 MOVED = ("pose 2, pose 4, pose 5 and 3 more", "--undo-flips")
 HALF_A_TURN = ("all tags would fit if every tag stood half a turn the other way", "add 180 to each angle_deg")
@@ -74,7 +73,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "exif": (Typed(INPUT, "E-CAMERA-EXIF", ("5.7 mm, but no size of its pixels", "give a camera file")),),
     "interactive": (Typed(values=camera(*SAMPLES[0], *SAMPLES[1])),),
     "json_tabs": (Typed(values=camera(800, 801, 320.5, 240.5, -0.1, 0.02, 1e-4, -2e-4)),),
-    "kitti": (Typed(values=camera(984.2439, 980.8141, 690.0, 233.1966, *KITTI)),),
+    "kitti": (Typed(INPUT, "E-CAMERA-CONTENT", ("COLMAP, OpenCV, ROS", "camera_matrix")),),
     "kuka_semicolon_comma": (Typed(says=("use with care", "pose 2 contradicts the others")),),
     "loc_apriltag_ros_yaml": (Typed(COMPUTATION, says=(*HALF_A_TURN, "upright: true"), never=("accept ",)),),
     "loc_bundle": (Typed(says=("2 scenes, 2 accepted",)),),

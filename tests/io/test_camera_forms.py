@@ -23,15 +23,14 @@ LENSES = {
 SUFFIX = {form: suffix for suffix, form in reversed(SUFFIXES.items())} | {
     "ros": ".yaml",
     "kalibr": ".yaml",
-    "zhang": ".txt",
     "metashape-cameras": ".xml",
 }
 REFUSED = {
-    "OPENCV": ("zhang",),
+    "OPENCV": (),
     "PINHOLE": (),
-    "FULL_OPENCV": ("kalibr", "metashape", "metashape-cameras", "matlab", "zhang"),
-    "OPENCV_FISHEYE": ("mrcal", "matlab", "zhang"),
-    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"),
+    "FULL_OPENCV": ("kalibr", "metashape", "metashape-cameras", "matlab"),
+    "OPENCV_FISHEYE": ("mrcal", "matlab"),
+    "THIN_PRISM_FISHEYE": ("opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"),
 }
 """Forms that cannot hold a lens."""
 
@@ -158,10 +157,10 @@ def test_mrcal_is_read_with_its_comments(tmp_path):
     [
         ("c.cameramodel", "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC', 'intrinsics': [1], 'imagersize': [1, 1]}",
          "E-CAMERA-MODEL"),
-        ("c.cameramodel", "{'lensmodel': __import__('os')}", "E-CAMERA-UNREADABLE"),
+        ("c.cameramodel", "{'lensmodel': __import__('os'), 'imagersize': [1, 1]}", "E-CAMERA-UNREADABLE"),
         ("c.xml", METASHAPE.format(kind="spherical"), "E-CAMERA-MODEL … spherical"),
         ("c.xml", METASHAPE.format(kind="frame").replace("<b1>", "<b2>0.1</b2><b1>"), "E-CAMERA-MODEL … b2 … 0.1"),
-        ("c.xml", "<calibration><width>3</width></calibration>", "E-CAMERA-UNREADABLE … cameras.txt"),
+        ("c.xml", "<calibration><width>3</width></calibration>", "E-CAMERA-UNREADABLE"),
         ("cameras.bin", b"\x01" + bytes(7) + b"\x01" + bytes(30), "E-CAMERA-UNREADABLE"),
         ("cameras.bin", b"\x02" + bytes(7), "E-CAMERA-UNREADABLE"),
     ],

@@ -153,11 +153,6 @@ def test_whole_numbers_are_ids_and_lengths_too(tmp_path):
     assert (face.id, face.ids, face.x) == ("1", ("1", "2", "3", "4"), "2")
 
 
-def test_byte_order_mark_and_windows_line_ends(tmp_path):
-    content = b"\xef\xbb\xbf" + TARGET.replace("\n", "\r\n").encode()
-    assert target_of(tmp_path, content).faces[0].ids == ("1", "2", "3", "4")
-
-
 def test_a_frame_just_inside_the_smallest_angle_is_taken(tmp_path):
     def bent(sine):
         # Origin at (100, 50): the angle is at the origin circle, wherever it was drawn.
@@ -208,65 +203,37 @@ def test_no_negative_zero_is_written():
 # fmt: off
 WRONG_TARGETS = {
     "empty": ("", "E-KEY-MISSING … 1"),
-    "prose": ("hello", "E-TOML-INVALID"),
     "JSON": ('{"rows": 7}', "E-TOML-INVALID … JSON … TOML"),
     "YAML": ("board:\n  rows: 7\n", "E-TOML-INVALID … YAML … TOML"),
-    "binary": (bytes(range(256)), "E-TOML-INVALID"),
-    "NUL": ("a = \0", "E-TOML-INVALID"),
-    "5000 digits": (changed("x_mm = 40", f"x_mm = {'9' * 5000}"), "E-TOML-INVALID"),
-    "nested too deep": ("a = " + "[" * 5000, "E-TOML-INVALID"),
     "no faces": ('polarity = "dark"\nface = []\n', "E-KEY-VALUE … 1"),
     "face not a list": (changed("[[face]]", "[face]"), "E-KEY-VALUE … 'id' … '1'"),
     "three circles": (changed('  { id = "4", x_mm = 40, y_mm = 40, radius_mm = 4 },\n', ""),
                       "E-KEY-VALUE … 4"),
     "unknown key": (changed('x = "2"', 'x = "2"\ncolour = 1'), "E-KEY-UNKNOWN"),
-    "key of two lines": (changed('x = "2"', 'x = "2"\n"a\\nb" = 1'), "E-KEY-UNKNOWN"),
-    "misspelt key": (changed("polarity", "polarty"), "E-KEY-MISSING"),
     "misspelt radius": (changed("radius_mm = 4", "radius = 4"), "E-KEY-MISSING … radius_mm … unknown key radius"),
     "polarity": (changed('"bright"', '"grey"'), "E-KEY-VALUE … 'grey' … 'bright' … 'dark'"),
-    "long polarity": (changed('"bright"', f'"{"a" * 9999}"'), "E-KEY-VALUE … polarity"),
     "boolean face id": (changed('[[face]]\nid = "1"', "[[face]]\nid = true"), "E-KEY-VALUE … 1."),
-    "boolean circle id": (changed('{ id = "4"', "{ id = true"), "E-KEY-VALUE … 1. … 4."),
-    "boolean origin": (changed('origin = "1"', "origin = false"), "E-KEY-VALUE … 1."),
     "fractional id": (changed('{ id = "4"', "{ id = 1.5"), "E-KEY-VALUE … 1. … 4. … 1.5"),
-    "date as id": (changed('{ id = "4"', "{ id = 1979-05-27"), "E-KEY-VALUE"),
-    "empty id": (changed('{ id = "4"', '{ id = ""'), "E-KEY-VALUE … 1. … 4."),
-    "id with space": (changed('{ id = "4"', '{ id = "a b"'), "E-KEY-NAME … 'a b'"),
     "id with colon": (changed('{ id = "4"', '{ id = "a:b"'), "E-KEY-NAME … 'a:b'"),
     "id with slash": (changed('{ id = "4"', '{ id = "../b"'), "E-KEY-NAME … '../b'"),
-    "id with line break": (changed('{ id = "4"', '{ id = "a\\n"'), "E-KEY-NAME"),
     "id with invisible space": (changed('{ id = "4"', '{ id = "a\\u200b"'), "E-KEY-NAME"),
     "duplicate faces": (TARGET + FACE, "E-TARGET-ID … face id 1"),
     "duplicate circles": (changed('{ id = "4"', '{ id = "2"'), "E-TARGET-ID … face 1: circle id 2"),
-    "duplicate as number": (changed('{ id = "4"', "{ id = 2"), "E-TARGET-ID … face 1: circle id 2"),
     "face named board": (changed('[[face]]\nid = "1"', '[[face]]\nid = "board"'), "E-TARGET-ID … board"),
     "negative radius": (changed("radius_mm = 4", "radius_mm = -4"), "E-KEY-VALUE … radius_mm … -4 … 0"),
-    "zero radius": (changed("radius_mm = 4", "radius_mm = 0"), "E-KEY-VALUE … radius_mm … 0 … 0"),
-    "NaN radius": (changed("radius_mm = 4", "radius_mm = nan"), "E-KEY-VALUE … radius_mm"),
-    "infinite radius": (changed("radius_mm = 4", "radius_mm = inf"), "E-KEY-VALUE … radius_mm"),
     "NaN position": (changed("y_mm = 40, radius_mm = 4", "y_mm = nan, radius_mm = 4"), "E-KEY-VALUE … 4. … y_mm"),
-    "boolean position": (changed("y_mm = 40, radius_mm = 4", "y_mm = true, radius_mm = 4"), "E-KEY-VALUE … 4. … y_mm"),
     "quoted position": (changed("y_mm = 40, radius_mm = 4", 'y_mm = "40", radius_mm = 4'), "E-KEY-VALUE … y_mm … '40'"),
     "position of a kilometre": (changed("y_mm = 40, radius_mm = 4", "y_mm = 1e7, radius_mm = 4"),
                                 "E-KEY-VALUE … 4. … y_mm … 10000000.0"),
     "overlapping": (changed("x_mm = 40, y_mm = 0", "x_mm = 10, y_mm = 0"), "E-TARGET-OVERLAP … face 1 … 1 … 2"),
-    "overlapping far from zero": (changed("x_mm = 40, y_mm = 40", "x_mm = 10, y_mm = 40"),
-                                  "E-TARGET-OVERLAP … face 1 … 3 … 4"),
     "touching": (changed("x_mm = 40, y_mm = 0", "x_mm = 16, y_mm = 0"), "E-TARGET-OVERLAP … face 1 … 1 … 2"),
-    "on one another": (changed("x_mm = 40, y_mm = 0", "x_mm = 0, y_mm = 0"), "E-TARGET-OVERLAP … face 1 … 1 … 2"),
     "frame circle missing": (changed('y = "3"', 'y = "9"'), "E-TARGET-FRAME … face 1: y … 9 … 1, 2, 3, 4"),
-    "origin twice": (changed('x = "2"', 'x = "1"'), "E-TARGET-FRAME … 1 … 1 … 3"),
     "x and y the same": (changed('y = "3"', 'y = "2"'), "E-TARGET-FRAME … 1 … 2 … 2"),
     "collinear": (changed("x_mm = 0, y_mm = 40", "x_mm = 80, y_mm = 0"), "E-TARGET-FRAME … 1 … 2 … 3"),
-    "collinear, opposite": (changed("x_mm = 0, y_mm = 40", "x_mm = -80, y_mm = 0"), "E-TARGET-FRAME … 1 … 2 … 3"),
     "left-handed": (changed("x_mm = 0, y_mm = 40", "x_mm = 0, y_mm = -40"), "E-TARGET-FRAME"),
-    "left-handed by exchange": (changed('x = "2"\ny = "3"', 'x = "3"\ny = "2"'), "E-TARGET-FRAME … 3 … 2"),
     "a board": (BOARD, "E-KEY-MISSING"),
     "two faces alike": (TARGET + changed('[[face]]\nid = "1"', '[[face]]\nid = "2"', FACE),
                         "E-TARGET-LIKENESS … 1 … 2 … 0 … 0 … one of them"),
-    "two faces alike, drawn apart": (TARGET + changed("y_mm = 40, radius_mm = 8", "y_mm = 41, radius_mm = 9",
-                                                      changed('[[face]]\nid = "1"', '[[face]]\nid = "2"', FACE)),
-                                     "E-TARGET-LIKENESS … 1 … 2 … 0.638 … 1"),
     "a face at another size": (
         TARGET + FACE_OF_60, "E-TARGET-LIKENESS … 1 … 2 … 1.50 … 0"),
     "a face among more circles": (
@@ -277,24 +244,15 @@ WRONG_TARGETS = {
                                   "E-KEY-MISSING … 1. … rough_pose"),
     "rough pose with a zero": (changed('y = "3"', rough("[0, 0, 0]", "[0, 0, 1]")),
                                "E-TARGET-ROUGH-POSE … face 1 … rough_pose … [0.0, 0.0, 0.0]"),
-    "rough pose of two numbers": (changed('y = "3"', rough("[1, 0]", "[0, 0, 1]")), "E-KEY-MISSING … rough_pose"),
     "rough pose askew": (changed('y = "3"', rough("[1, 0, 1]", "[0, 0, 1]")),
                          "E-TARGET-ROUGH-POSE … face 1 … rough_pose … 45 … 5"),
 }
 WRONG_BOARDS = {
     "empty": ("", "E-KEY-MISSING … 4"),
-    "a target": (TARGET, "E-KEY-MISSING"),
-    "binary": (bytes(range(256)), "E-TOML-INVALID"),
     "one row": (changed("rows = 7", "rows = 1", BOARD), "E-KEY-VALUE … 1 … 2"),
-    "negative columns": (changed("columns = 9", "columns = -9", BOARD), "E-KEY-VALUE … -9"),
-    "boolean rows": (changed("rows = 7", "rows = true", BOARD), "E-KEY-VALUE"),
     "fractional rows": (changed("rows = 7", "rows = 7.5", BOARD), "E-KEY-VALUE … 7.5"),
-    "quoted rows": (changed("rows = 7", 'rows = "7"', BOARD), "E-KEY-VALUE … '7'"),
-    "a million rows": (changed("rows = 7", "rows = 1000000", BOARD), "E-KEY-VALUE … 1000000"),
     "negative radius": (changed("radius_mm = 7.5", "radius_mm = -1", BOARD), "E-KEY-VALUE … radius_mm … -1"),
-    "NaN radius": (changed("radius_mm = 7.5", "radius_mm = nan", BOARD), "E-KEY-VALUE … radius_mm"),
     "infinite pitch": (changed("pitch_mm = 30.0", "pitch_mm = inf", BOARD), "E-KEY-VALUE … pitch_mm"),
-    "boolean pitch": (changed("pitch_mm = 30.0", "pitch_mm = true", BOARD), "E-KEY-VALUE … pitch_mm"),
     "dots that touch": (changed("radius_mm = 7.5", "radius_mm = 15", BOARD), "E-BOARD-RADIUS … 15"),
     "zero sigma": (BOARD + "sigma_mm = 0\n", "E-KEY-VALUE … sigma_mm … 0 … 0"),
     "polarity": (changed('"bright"', '"white"', BOARD), "E-KEY-VALUE … 'white'"),
@@ -302,11 +260,8 @@ WRONG_BOARDS = {
     "corner inside": (BOARD + corner(3, 3), "E-BOARD-CORNER … 3 … 3"),
     "corner outside": (BOARD + corner(0, 9), "E-BOARD-CORNER … 0 … 9"),
     "corner negative": (BOARD + corner(-1, 0), "E-KEY-VALUE … -1 … 0"),
-    "corner boolean": (BOARD + corner("true", 0), "E-KEY-VALUE"),
-    "corner empty": (BOARD + "[corner]\n", "E-KEY-MISSING … 2"),
     "corner no larger": (BOARD + corner(0, 0, 8), "E-BOARD-CORNER … 8 … 8.625 … 22.5"),
     "corner touches": (BOARD + corner(0, 0, 22.5), "E-BOARD-CORNER … 22.5 … 8.625 … 22.5"),
-    "corner twice": (BOARD + corner() * 2, "E-TOML-INVALID … 'corner'"),
 }
 # fmt: on
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
-from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, opencv_lens
 from stcal.io.cameras.keys import pass_over
 from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
@@ -97,10 +97,7 @@ def of_colmap(model: str, width: float, height: float, params, source: str) -> C
         return camera_from_colmap("OPENCV_FISHEYE", width, height, [*focal, *others, 0, 0, 0, 0], source)
     camera_from_colmap("PINHOLE", width, height, [*focal, *others[:2]], source)  # refuses impossible values
     coefficients, centre = np.array(others[2:]), np.array(others[:2]) - COLMAP_PIXEL_ORIGIN
-    if not np.isfinite(coefficients).all():
-        raise InputError(
-            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
-        )
+    require_finite(coefficients, source)
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
@@ -115,7 +112,7 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
         return _on_plane(rays, "eucm", own)
     xy = rays[:, :2] / rays[:, 2:]
     if model == "FOV":
-        return _scaled(xy, "fov", own)
+        return _field_of_view(xy, own[0])
     r2 = (xy**2).sum(axis=1)
     if model == "DIVISION":  # ideal = distorted / (1 + k r²)
         return xy * (2 / (1 + np.sqrt(1 - 4 * own[0] * r2)))[:, None]
@@ -188,6 +185,14 @@ def one_of(names: list[str], choice: str, source: str) -> str:
     return choice or names[0]
 
 
+def require_finite(numbers, source: str) -> None:
+    """Refuse parameters of a camera that are not finite."""
+    if not np.isfinite(numbers).all():
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
+        )
+
+
 def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str) -> CameraModel | ForeignLens:
     """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
 
@@ -196,10 +201,7 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str)
     if len(given) not in (12, 14) or not given[8:].any():
         return camera_from_opencv(lens, given, False, width, height, source)
     camera_from_opencv(lens, given[:8], False, width, height, source)  # refuses impossible values
-    if not np.isfinite(given).all():
-        raise InputError(
-            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
-        )
+    require_finite(given, source)
     fx, fy, cx, cy = lens
     matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
 
@@ -296,10 +298,14 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
             "E-CAMERA-FOCAL", f"camera file {source}: focal length {focal.tolist()}; positive numbers needed"
         )
     width, height = (int(side) for side in values.get("resolution", (0, 0)))
+    fisheye, fov = distortion == "equidistant", distortion == "fov"
+    own, _ = opencv_lens(np.zeros(0) if fov else coefficients, fisheye, f"camera file {source}")
+    flat = Camera(1, 1, [1, 1], [0, 0], own, fisheye)
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return centre + focal * _kalibr_distorted(_on_plane(rays, lens, shape), distortion, coefficients)
+            xy = _on_plane(rays, lens, shape)
+            return centre + focal * (_field_of_view(xy, coefficients[0]) if fov else flat.distort(xy))
 
     return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None, source)
 
@@ -321,24 +327,10 @@ def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
     return rays[:, :2] / np.where(below > 0, below, np.nan)[:, None]
 
 
-def _kalibr_distorted(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
-    if kind != "radtan":
-        return _scaled(xy, kind, k)
-    (x, y), r2 = xy.T, (xy**2).sum(axis=1)
-    radial = xy * (1 + k[0] * r2 + k[1] * r2**2)[:, None]
-    tangential = [2 * k[2] * x * y + k[3] * (r2 + 2 * x * x), k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y]
-    return radial + np.column_stack(tangential)
-
-
-def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
-    """Return normalised coordinates (n, 2) with the radial distortion equidistant, fov, or none."""
-    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius all these models are linear
-    if kind == "fov":
-        return xy * (np.arctan(2 * r * np.tan(k[0] / 2)) / (k[0] * r))[:, None]
-    if kind == "equidistant":
-        angle = np.arctan(r)
-        return xy * (angle * (1 + angle[:, None] ** (2 * np.arange(1, 5)) @ k) / r)[:, None]
-    return xy
+def _field_of_view(xy: np.ndarray, omega: float) -> np.ndarray:
+    """Return normalised coordinates (n, 2) with the distortion of Devernay and Faugeras."""
+    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius the model is linear
+    return xy * (np.arctan(2 * r * np.tan(omega / 2)) / (omega * r))[:, None]
 
 
 def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
@@ -402,10 +394,7 @@ def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel 
             "E-CAMERA-COEFFICIENTS", f"camera file {source}: {len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed"
         )
     (fx, fy, cx, cy), (alpha, beta, *r) = numbers[:4], numbers[4:]
-    if not np.isfinite(numbers).all():
-        raise InputError(
-            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
-        )
+    require_finite(numbers, source)
     if alpha == beta == 0:
         grown = 1 + r[0]
         k1, k2 = (r[1] / grown, r[2] / grown) if grown else (0.0, 0.0)

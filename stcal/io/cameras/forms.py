@@ -29,11 +29,11 @@ from stcal.io.cameras.foreign import (
     refused,
 )
 from stcal.io.cameras.keys import pass_over, require_known
-from stcal.io.cameras.matlab import mat, zhang
+from stcal.io.cameras.matlab import mat
 from stcal.io.cameras.model import CameraModel, cameras_txt
 
 CameraForm = Literal[
-    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"
+    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"
 ]
 """Forms in which cameras are written."""
 SUFFIXES = {
@@ -64,7 +64,12 @@ class Written:
     lost: tuple[str, ...]
 
 
-def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
+def is_mrcal(text: str) -> bool:
+    """Return True if a text has the keys of a ``.cameramodel``; PhotonVision names mrcal's lens models, too."""
+    return "lensmodel" in text and "imagersize" in text
+
+
+def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
     """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined.
 
     Raises InputError: the text is no such file, or has another lens model.
@@ -172,7 +177,7 @@ def written(camera: Camera, form: str, name: str) -> Written:
         raise InputError(
             "E-CAMERA-NAME", f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0"
         )
-    lost = ["the image's size"] if form == "zhang" else []
+    lost = []
     if camera.covariance is not None and form not in SIGMA_FORMS:
         lost.append("σ and correlations of the parameters")
     if camera.covariance is not None and form == "metashape-cameras":
@@ -271,6 +276,5 @@ WRITERS: Mapping[str, Callable[[Camera, str], str | bytes]] = {
     "metashape": lambda camera, _: metashape.calibration(camera),
     "metashape-cameras": metashape.cameras,
     "matlab": mat,
-    "zhang": zhang,
 }
 """Writers by form: each returns the file of a camera and its name."""

@@ -1,53 +1,38 @@
-"""The rule for keys of camera files: each is taken, known to be harmless, or named; one that may change the projection
-is taken or refused."""
+"""Keys of camera files: a reader takes those of its format, and one rule holds for all others. A key is known to be
+harmless, or named; one that may change the projection is refused."""
 
 import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 
 import numpy as np
 
 from stcal.errors import InputError, InputNote
 
 _HARMLESS = """
-alphacerror appliedtransform boardheight boardsize boardwidth calibdate calibrationdate calibrationtime calibtime
-cameraid cameraindex cameraname cameraserial camname camoverlaps comment cornerdist createdate createdby data date
-depthscale description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
-imagetopic label localtransform make name nbcamera nframes notes nrofframes nrofimages p pattern patternsize
-projectionmatrix r ratehz rectificationmatrix ret rms rostopic sensortype serial serialnumber source squaresize stamp
-t target tbs tcamimu tcncnm1 testfilenames time timeshiftcamimu timestamp topic trainfilenames units valfilenames
+cameraid cameraindex cameraname cameraserial camname camoverlaps comment createdat createdby data description
+fileversion flags fps frameid generatedon hostname id imagename imagetopic label localtransform make name nframes notes
+nrofframes nrofimages p pattern patternsize projectionmatrix r ratehz rectificationmatrix ret rms rostopic sensortype
+serial serialnumber source squaresize stamp t target tbs tcamimu tcncnm1 time timeshiftcamimu timestamp topic units
 version
 """
 HARMLESS = frozenset(_HARMLESS.split())
 """Keys, in small letters and digits alone, that say nothing of how a ray becomes a pixel of the photograph. ``R`` and
-``P`` of ROS and KITTI are for images that are rectified afterwards."""
-HARMLESS_BEGINNINGS = (
-    *("header", "rectificationmatrix", "projectionmatrix", "extrinsic", "perview", "imagepoints", "gridpoints"),
-    *("objectpoints", "board", "imu", "tcam", "timu", "orbextractor", "viewer", "stereo", "system", "loopclosing"),
-    *("fixaspect", "fixprincipal", "zerotangent", "zeroprincipal", "avg", "mean", "reproj", "rect", "rvec", "tvec"),
-    *(
-        "date",
-        "calib",
-        "totalavg",
-        "num",
-        "acc",
-        "gyr",
-        "frames",
-        "tbc",
-        "bodyt",
-        "estimate",
-        "prect",
-        "rrect",
-        "srect",
-    ),
-)
+``P`` of ROS are for images that are rectified afterwards."""
+_BEGINNINGS = """
+acc avg bodyt board calib date estimate extrinsic fixaspect fixprincipal frames gridpoints gyr header imagepoints imu
+mean num objectpoints perview projectionmatrix rect rectificationmatrix reproj rvec stereo tbc tcam timu totalavg tvec
+zeroprincipal zerotangent
+"""
+HARMLESS_BEGINNINGS = tuple(_BEGINNINGS.split())
 """Beginnings of such keys: of poses, observations and settings of other programs."""
 HARMLESS_ENDS = ("stddev", "std", "error", "errors", "sigma", "uncertainty", "covariance", "rms", "topic")
 """Ends of such keys: uncertainties."""
 SUSPECT = re.compile(
-    r"(xi|alpha|alphac|beta|gamma[12]?|skew|shear|tau[xy]?|[kpsb]\d\d?|t\d|sk[xy]|mu|mv|mx|my|f|fx|fy|cx|cy|u0|v0|ppx|ppy)"
+    r"([kd]|type|xi|alpha|alphac|beta|gamma[12]?|skew|shear|tau[xy]?|[kpsb]\d\d?|t\d|sk[xy]|mu|mv|mx|my|f|fx|fy|cx|cy|u0|v0|ppx|ppy)"
 )
 """Names of parameters of lenses, of which a reader takes those of its format."""
 SUSPECT_PART = re.compile(
@@ -55,46 +40,8 @@ SUSPECT_PART = re.compile(
     r"|stretch|crop|binning|roi|scal|flip|zoom|resiz|affin|poly|cameratype|lens(type|param)|cameramatrix|undist"
 )
 """Parts of names of keys that may change the projection."""
-ROLES: Mapping[str, str] = {
-    name: role
-    for role, names in {
-        "matrix": "cameramatrix k m mtx cammtx cammatrix kmatrix intrinsicmatrix intrinsicsmatrix "
-        "cameraintrinsicmatrix intrinsic intrinsicmat cameramat cammat matrix",
-        "distortion": "distortioncoefficients d distcoeffs distcoeff distcoefs distortioncoeffs distortioncoefs coeffs "
-        "distortion dist distortionvector distortions distortioncoeff distortioncoef distcoef distcoefficients "
-        "distortionparams distortionparameters",
-        "lens": "intrinsics cameraintrinsics cameraintrinsic",
-        "f": "f focal focallength",
-        "fx": "fx flx focalx gamma1 focallengthx",
-        "fy": "fy fly focaly gamma2 focallengthy",
-        "centre": "principalpoint opticalcenter",
-        "cx": "cx ppx u0 principalpointx",
-        "cy": "cy ppy v0 principalpointy",
-        "skew": "skew skx",
-        "xi": "xi",
-        "width": "imagewidth width w imgwidth imwidth",
-        "height": "imageheight height h imgheight imheight",
-        "size": "imagesize resolution cameraresolution imgsize imagedimension imagedimensions size s dim",
-        "camera model": "cameramodel modeltype projectionmodel projectiontype cameratype type",
-        "model": "distortionmodel model lensmodel distortiontype",
-        "fisheye": "fisheyemodel fisheye isfisheye usefisheye",
-        **{k: k for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")},
-    }.items()
-    for name in names.split()
-}
-"""What a key holds, by its name in small letters and digits."""
-CONTAINERS = re.compile(
-    r"(camera|cam|camerainfo|cameraparameters|cameramatrix|distortion|intrinsics?|projectionparameters|calibration|d"
-    r"|distortioncoefficients|distortioncoeffs|distcoeffs|distortionparameters|mirrorparameters|intrinsicparameters"
-    r"|image|imagesize|resolution|calibdimension|fisheyeparams|focallength|principalpoint|opencvstorage|value0)\d*$"
-)
-"""Keys that hold others and add nothing to their meaning."""
 DISTORTION = re.compile(r"dist(?!anc)|coef|^kc")
 """Parts of names of lists of distortion coefficients, also of keys that begin harmlessly, as ``calib_dist`` does."""
-OF_DISTORTION = re.compile(r"distort|dist|mirror|^d$")
-"""Containers whose every key is a parameter of the lens."""
-PREFIX = re.compile(r"(camera|cam)(?=[_A-Z])")
-"""Beginning of keys that adds nothing to their meaning, as of ``cam_fx`` and ``cameraIntrinsics``."""
 COUNTS = (4, 5, 8, 12, 14)
 """Numbers of OpenCV's distortion coefficients."""
 MOST_COEFFICIENT = 100.0
@@ -128,12 +75,6 @@ def pass_over(parts: Collection[str], what: str = "") -> None:
 def plain(key: object) -> str:
     """Return a key in small letters and digits alone: programs differ in capitals, dots and underscores."""
     return re.sub(r"[^a-z0-9]", "", str(key).lower())
-
-
-def role_of(key: str) -> str | None:
-    """Return the role of a key, by :data:`ROLES`; None if it is not known."""
-    bare = plain(PREFIX.sub("", key))
-    return ROLES.get(plain(key)) or ROLES.get(f"camera{bare}") or ROLES.get(bare)
 
 
 def may_be_coefficients(value: object) -> bool:
@@ -197,8 +138,6 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
     for keys, value in leaves(unread):
         path = [part for key in keys for part in key.split(".")]
         names = [*map(plain, path), plain("".join(path))]
-        held = [key for key in path[:-1] if not CONTAINERS.match(plain(key)) or OF_DISTORTION.search(plain(key))]
-        named = [*map(plain, [*held, path[-1]]), plain("".join([*held, path[-1]]))]
         if not (HARMLESS | set(harmless)).isdisjoint(names):
             continue
         of_a_lens = bool(SUSPECT.fullmatch(plain(path[-1])))
@@ -207,7 +146,7 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
         of_a_lens |= coefficients and not uncertainty and bool(DISTORTION.search(plain(path[-1])))
         if not of_a_lens and (uncertainty or any(n.startswith(beginnings) for n in names)):
             continue
-        if not (of_a_lens or (undistorted and coefficients)) and not any(SUSPECT_PART.search(name) for name in named):
+        if not (of_a_lens or (undistorted and coefficients)) and not any(map(SUSPECT_PART.search, names)):
             unknown.append(".".join(path))
         elif not is_neutral(value):
             taken = "call it distortion_coefficients if it is OpenCV's k1, k2, p1, p2, k3 …; " if coefficients else ""
@@ -237,3 +176,80 @@ def _with_numbers(unread: Mapping) -> list[str]:
 def _short(value: object) -> str:
     text = " ".join(str(value).split())
     return text if len(text) <= 40 else f"{text[:40]} …"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keys:
+    """The keys of one camera. What a reader takes is removed from ``left``; ``source`` : camera file, for messages."""
+
+    left: dict[str, object]
+    source: str
+
+    def fault(self, code: str, text: str) -> InputError:
+        """Return an error that names the file."""
+        return InputError(code, f"camera file {self.source}: {text}")
+
+    def has(self, *names: str) -> bool:
+        """Return True if a key of these names is left."""
+        return not {plain(key) for key in self.left}.isdisjoint(map(plain, names))
+
+    def take(self, *names: str) -> object:
+        """Return the value of the key that has one of these names; None if there is none.
+
+        Raises InputError: two keys of these names differ.
+        """
+        wanted = [*map(plain, names)]
+        found = {
+            key: value for key, value in self.left.items() if plain(key) in wanted and not isinstance(value, Mapping)
+        }
+        for key in found:
+            del self.left[key]
+        if len({repr(value) for value in found.values()}) > 1:
+            raise self.fault("E-CAMERA-REPEATED", f"{' and '.join(found)} mean the same and differ; leave one in")
+        return next(iter(found.values()), None)
+
+    def numbers(self, *names: str) -> np.ndarray | None:
+        """Return the numbers of a key, flat; None if there is no such key.
+
+        Raises ValueError: a word is no number.
+        """
+        if not self.has(*names):
+            return None
+        value = self.take(*names)
+        if isinstance(value, bool):
+            raise self.fault("E-CAMERA-CONTENT", f"{names[0]} is {value}; numbers needed")
+        return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """Return one number; ``default`` where there is no such key.
+
+        Raises InputError: there is no such key and no default, or it has another count of numbers.
+        """
+        numbers = self.numbers(name)
+        if numbers is None and default is None:
+            raise self.fault("E-CAMERA-CONTENT", f"no {name}; add it")
+        if numbers is not None and numbers.size != 1:
+            raise self.fault("E-CAMERA-COEFFICIENTS", f"{name} of {numbers.size} numbers; 1 needed")
+        return float(default if numbers is None else numbers[0])  # type: ignore[arg-type]
+
+    def size(self) -> tuple[float, float, bool]:
+        """Return width and height, px, 0 if the file states none; and whether they are from a list of both.
+
+        Raises InputError: a side is no number, or two keys contradict each other.
+        """
+        stated = [self.take(f"image_{side}", side) for side in ("width", "height")]
+        if any(isinstance(side, bool) for side in stated):
+            raise self.fault("E-CAMERA-SIZE", f"image_width and image_height are {stated}; numbers of pixels needed")
+        width, height = (float(side or 0) for side in stated)  # type: ignore[arg-type]
+        both = self.numbers("image_size", "resolution", "camera_resolution", "img_size")
+        if both is None or not both.any():
+            return width, height, False
+        if both.size != 2:
+            raise self.fault("E-CAMERA-SIZE", f"size of {both.size} numbers; width and height needed")
+        if width and height and (width, height) != tuple(both):
+            raise self.fault(
+                "E-CAMERA-SIZE",
+                f"size {both[0]:g}×{both[1]:g} px, but image_width and image_height {width:g}×{height:g} px; correct "
+                "one of them",
+            )
+        return float(both[0]), float(both[1]), True

@@ -5,10 +5,11 @@ In MATLAB's toolbox the centre of the first pixel is at (1, 1); in Bouguet's it 
 
 import contextlib
 import io
+import math
 import re
-import subprocess
-import sys
+import struct
 import warnings
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -25,7 +26,8 @@ from stcal.io.cameras.model import CameraModel
 HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 PIXEL_ORIGIN = 1.0
 STRUCTURE = "RadialDistortion"
-"""Name of a field of every structure that ``toStruct`` makes of a camera."""
+MARKS = (STRUCTURE, "MappingCoefficients")
+"""Fields that tell a structure that ``toStruct`` makes of a camera, of a fisheye the second."""
 BOUGUET = ("fc", "cc", "kc")
 BOUGUET_SIGMAS = 3.0
 """Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
@@ -48,14 +50,15 @@ BOUGUET_HARMLESS = (
     *("desactivated*", "save*", "string*", "sol*", "jj*", "pp*", "aspect*", "title*", "manual*", "rosette*", "fp*"),
 )
 """Variables of Bouguet's toolbox: its settings, points and poses; ``KK`` repeats the intrinsics."""
-TRIAL = """
-import sys
-sys.path = [folder for folder in sys.path if folder]  # not the user's folder, in which any name may be a module's
-import io
-from scipy.io import loadmat
-loadmat(io.BytesIO(sys.stdin.buffer.read()))
-"""
-"""Program that reads a file and is lost with it."""
+COMPRESSED, MATRIX, OF_NUMBERS = 15, 14, (1, 2, 3, 4, 5, 6, 7, 9, 12, 13, 16, 17, 18)
+"""Types of the elements of a ``.mat`` file (MATLAB's "MAT-File Format", table 1-1)."""
+WITH_ARRAYS = (1, 2, 3, 16, 17)
+SPARSE = 5
+"""Classes of arrays that hold further arrays: cells, structures, objects, functions (table 1-3); and of sparse ones."""
+FLAGS, INT32, DIMENSION_BYTES = [6, 8], 5, 128
+"""Type and size of the first element of an array, its flags; type of the second, its size, and the longest of NumPy."""
+MOST_BYTES = 1 << 26
+"""Largest size of a variable when its compression is undone."""
 HEAD_BYTES = 116
 """Length of the text at the beginning of a file; scipy writes the time into it."""
 
@@ -74,7 +77,7 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
-        _require_survived(content)
+        _require_elements(content[128:], "<" if content[126:128] == b"IM" else ">")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)
             values = loadmat(io.BytesIO(content), simplify_cells=True)
@@ -95,13 +98,50 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
     return from_structure(structures[one_of(list(structures), choice, source)], source)
 
 
-def _require_survived(content: bytes) -> None:
-    """Raise ValueError if reading the file ends the process: SciPy follows a damaged type of data into foreign memory.
+def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
+    """Return the number of elements, each of which has a type that exists and a size that is there.
 
-    Another interpreter reads it first.
+    SciPy follows any other type into foreign memory, which ends the process. ``data`` : elements in a row; ``order`` :
+    ``<`` or ``>`` for the order of bytes; ``arrays`` : whether arrays may be among them.
+
+    Raises ValueError: an element is damaged.
     """
-    trial = subprocess.run([sys.executable, "-c", TRIAL], input=content, capture_output=True)
-    if trial.returncode < 0:
+    at = count = 0
+    while at < len(data):
+        count += 1
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        at += 8
+        if kind >> 16:  # up to 4 bytes in the tag itself
+            kind, size, at = kind & 0xFFFF, kind >> 16, at - 4
+        inner = data[at : at + size]
+        if len(inner) < size or not (kind in OF_NUMBERS or (arrays and kind in (COMPRESSED, MATRIX))):
+            raise ValueError("damaged")
+        at += size
+        if kind == COMPRESSED:
+            decompressed = zlib.decompressobj()
+            _require_elements(decompressed.decompress(inner, MOST_BYTES), order)
+            if decompressed.unconsumed_tail:
+                raise ValueError(f"a variable of more than {MOST_BYTES} bytes")
+        else:
+            at = -(-at // 8) * 8
+        if kind == MATRIX and size:
+            _require_array(inner, order)
+    return count
+
+
+def _require_array(data: bytes, order: str) -> None:
+    """Require that an array has the parts that its class needs, and no more values than bytes."""
+    *head, flags, _, dims_kind, dims_bytes = struct.unpack_from(f"{order}6I", data)
+    array_class, is_complex = flags & 0xFF, flags >> 11 & 1
+    parts = _require_elements(data, order, array_class in WITH_ARRAYS)
+    needed = (6 if array_class == SPARSE else 4) + is_complex
+    dims = struct.unpack_from(f"{order}{min(dims_bytes, DIMENSION_BYTES) // 4}I", data, 24)
+    if (
+        head != FLAGS
+        or dims_kind != INT32
+        or (array_class != SPARSE and math.prod(dims) > len(data))
+        or (array_class not in WITH_ARRAYS and parts != needed)
+    ):
         raise ValueError("damaged")
 
 
@@ -148,7 +188,7 @@ def _plain_value(value: object) -> object:
 
 def _structures(values: Mapping, where: str):
     """Yield name and structure of every camera, at any depth."""
-    if STRUCTURE in values or "MappingCoefficients" in values:
+    if not values.keys().isdisjoint(MARKS):
         yield where or "camera", values
         return
     for key, value in values.items():
@@ -201,7 +241,7 @@ def is_script(text: str) -> bool:
     return all(re.search(rf"(?m)^\s*{key}\s*=\s*\[", text) for key in BOUGUET[:2])
 
 
-def from_script(text: str, source: str) -> CameraModel | ForeignLens:
+def from_script(text: str, _: str, source: str) -> CameraModel | ForeignLens:
     """Return the camera of Bouguet's ``Calib_Results.m``; errors as :func:`from_mat`."""
     lines = "\n".join(line.split("%")[0] for line in text.splitlines())
     values: dict[str, object] = {}
@@ -245,35 +285,3 @@ def mat(camera: Camera, name: str) -> bytes:
         savemat(stream, {name: fields}, oned_as="row")
     content = stream.getvalue()
     return HEADS[0] + b", written by stcal".ljust(HEAD_BYTES - len(HEADS[0])) + content[HEAD_BYTES:]
-
-
-def is_zhang(rows: list[list[str]]) -> bool:
-    """Return True if the rows are a file of Zhang's calibration: five words, two, then rows of three, and no keys."""
-    counts = [len(row) for row in rows]
-    return counts[:2] == [5, 2] and set(counts[2:]) <= {3} and not any(":" in word for word in rows[0] + rows[1])
-
-
-def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
-    """Return the camera of α, c, β, u0, v0, then k1, k2; poses are ignored (Zhang 2000; the file of his page).
-
-    Raises InputError: a word is no number.
-    """
-    try:
-        (fx, skew, fy, cx, cy), (k1, k2) = ([float(word) for word in row] for row in rows[:2])
-    except ValueError as error:
-        raise InputError(
-            "E-CAMERA-CONTENT", f"camera file {source}: {' '.join(str(error).split())[:150]}; numbers needed"
-        ) from error
-    return of_skewed([fx, fy, cx, cy], skew, np.array([k1, k2, 0.0, 0.0]), 0.0, 0.0, source)
-
-
-def zhang(camera: Camera, _: str) -> str:
-    """Return the text of Zhang's five numbers, and k1, k2."""
-    if camera.fisheye or camera.distortion[2:].any():
-        lost = "the equidistant projection" if camera.fisheye else "more than k1, k2"
-        raise InputError(
-            "E-CAMERA-FORM", f"zhang has no place for {lost} of {camera.colmap_model}; write --form colmap"
-        )
-    (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
-    k1, k2 = camera.distortion[:2].tolist()
-    return f"{fx!r} 0 {fy!r} {cx!r} {cy!r}\n\n{k1!r} {k2!r}\n"

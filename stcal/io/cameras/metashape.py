@@ -13,7 +13,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
-from stcal.io.cameras.foreign import ForeignLens, one_of, refused
+from stcal.io.cameras.foreign import ForeignLens, one_of, refused, require_finite
 from stcal.io.cameras.keys import pass_over, require_known
 from stcal.io.cameras.model import CameraModel, camera_from_opencv
 from stcal.io.covariance import Rows, require_covariance
@@ -33,6 +33,20 @@ OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy",
 """OpenCV's names of Metashape's parameters; ``b1`` and ``f`` together are fx."""
 
 
+def is_metashape(text: str) -> bool:
+    """Return True if a text is XML with an element of Metashape around it.
+
+    Raises ElementTree.ParseError: it is broken XML.
+    """
+    return text.lstrip().startswith("<") and ElementTree.fromstring(text).tag in ("calibration", *ROOTS)
+
+
+def from_metashape(text: str, choice: str, source: str) -> CameraModel | ForeignLens:
+    """Return the camera of a calibration, or of exported cameras; errors as of the functions for them."""
+    root = ElementTree.fromstring(text)
+    return from_calibration(root, source) if root.tag == "calibration" else from_cameras(root, choice, source)
+
+
 def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | ForeignLens:
     """Return the camera of a ``<calibration>`` with frame or fisheye projection.
 
@@ -49,12 +63,6 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | Fo
     if kind not in KINDS:
         raise InputError("E-CAMERA-MODEL", f"camera file {source}: projection {kind}; frame and fisheye are read")
     names = (*NAMES, *MORE_NAMES)
-    if "fx" in texts:
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera file {source}: fx and fy, as PhotoScan before version 1.2 and Agisoft Lens wrote them, whose "
-            "other terms have another meaning; open the project in Metashape and export the calibration again",
-        )
     require_known(
         {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, source, HARMLESS
     )
@@ -75,11 +83,7 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | Fo
 def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: float, source: str) -> ForeignLens:
     """Return the lens by Metashape's formula (PhotoScan's manual, version 1.2, appendix C, with ``p3`` and ``p4``)."""
     camera = camera_from_opencv(lens, np.array([v["k1"], v["k2"], 0, 0]), False, width, height, source)
-    numbers = np.array([v[name] for name in (*NAMES, *MORE_NAMES)])
-    if not np.isfinite(numbers).all():
-        raise InputError(
-            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
-        )
+    require_finite([v[name] for name in (*NAMES, *MORE_NAMES)], source)
     matrix = np.array([[lens[0], v["b2"], lens[2]], [0, lens[1], lens[3]]])
     flat = Camera(1, 1, [1, 1], [0, 0], np.zeros(12), kind != "frame")
 

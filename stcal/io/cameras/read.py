@@ -2,7 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -16,18 +16,17 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, MAX_SIDE_PX, Camera, parameter_names
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
-from stcal.io.cameras.keyed import from_keys
+from stcal.io.cameras.keyed import READ, from_ini, from_keys
 from stcal.io.cameras.model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
 from stcal.io.cameras.photograph import is_photograph
-from stcal.io.cameras.texts import values_of, values_of_archive
+from stcal.io.cameras.texts import is_ini, values_of
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 
 SQLITE = b"SQLite format 3\0"
 """First bytes of an SQLite database."""
-ARCHIVE, PICKLE = b"PK\x03\x04", (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
-"""First bytes of NumPy's archives, and of Python's pickles."""
-
+COLMAP_LINE = re.compile(r"\A(?:[ \t]*(?:#[^\r\n]*)?[\r\n])*[ \t]*[^\s{<]+[ \t]+[A-Z][A-Z0-9_]+(?:[ \t]+\S+){3}")
+"""First line of COLMAP's ``cameras.txt`` : a number, a model, and at least three numbers."""
 
 _chosen: ContextVar[str] = ContextVar("_chosen", default="")
 """Name of the camera that is read of a file of several, where the reader is given none."""
@@ -46,7 +45,7 @@ def camera_chosen(name: str) -> Iterator[None]:
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
     """Read a camera file of any supported kind, which is recognised by the content.
 
-    ``path`` : COLMAP, OpenCV, ROS, ROS-Industrial, Kalibr, mrcal or Metashape (``data_layout.md``); ``name`` : name of
+    ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of
     the camera in a file of several.
 
     Raises InputError: the file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
@@ -80,7 +79,8 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
     Parameters
     ----------
     path : str or Path
-        File of COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape, MATLAB and others (``data_layout.md``).
+        File of COLMAP, OpenCV, ROS, Kalibr, EuRoC, MATLAB, Bouguet, Metashape, mrcal or camodocal
+        (``data_layout.md``).
     name : str
         Name of the camera in a file of several, such as ``cam1``.
     size : (int, int), optional
@@ -114,101 +114,6 @@ def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple
     return model.calibrated(width, height)
 
 
-def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
-    """Read the lens of a camera file, also of an unsupported model; arguments and errors as :func:`read_camera`."""
-    path, name = Path(path), name or _chosen.get()
-    try:
-        database = path.is_file() and _starts_with(path, SQLITE)
-        content = b"" if database else read_bytes(path, SETTINGS_BYTES)
-    except OSError as error:
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {path}: {error.strerror or error}; give a readable file"
-        ) from error
-    except ValueError as error:  # a NUL in the name
-        raise _no_text(path) from error
-    if database:
-        return of_database(path, name)
-    if matlab.is_mat(content):
-        return matlab.from_mat(content, name, str(path))
-    if forms.is_colmap_binary(content):
-        return forms.from_colmap_binary(content, name, str(path))
-    try:
-        if content.startswith(ARCHIVE):
-            return from_keys(values_of_archive(content), name, str(path))
-        return _of_text(text_of(content), name, path)
-    except InputError:
-        raise
-    except UnicodeDecodeError as error:
-        if content.startswith(PICKLE):
-            raise InputError(
-                "E-CAMERA-UNREADABLE",
-                f"camera file {path}: a pickle, which is not opened since it may contain a program; write its arrays "
-                "with numpy.savez, or as JSON",
-            ) from error
-        raise _no_text(path) from error
-    except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:150]
-        raise InputError(
-            "E-CAMERA-UNREADABLE",
-            f"camera file {path}: neither COLMAP's cameras.txt nor OpenCV's YAML or XML ({reason}); check its form",
-        ) from error
-
-
-PHOTONVISION = '"cameraIntrinsics"'
-"""Key of PhotonVision, which names mrcal's lens models, too."""
-ANEW = "calibrate with OpenCV's model, as `stcal-sfm calibrate-camera` does"
-UNREAD = (
-    (
-        r"capturingreality\.com|^#name,.*\bpx,py\b",
-        "of RealityCapture, relative to an image whose size it does not state; export the registration as COLMAP, and "
-        "give its cameras.txt",
-    ),
-    (r"\A# Bundle file", "of Bundler, without the images' size and middle; export as COLMAP, and give its cameras.txt"),
-    (r"\A# Image list", "COLMAP's images.txt, which has poses; give the cameras.txt beside it"),
-    (r"\ACalibration results\s+=", "Kalibr's report, with fewer decimals; give the camchain.yaml beside it"),
-    (r"\AF \S+\s+Px \S+|\AfileName imageWidth imageHeight", "of Pix4D; export as COLMAP, and give its cameras.txt"),
-    (r"ParGroup: Camera|^Kappa\b", f"of HALCON, in metres and by other formulas; {ANEW}"),
-    (
-        r"polynomial coefficients for the DIRECT|SCARAMUZZA",
-        f"of OCamCalib (SCARAMUZZA), a lens by polynomials of its own; {ANEW}",
-    ),
-    ("<ExportAPERO", f"of MicMac, whose distortion leads from the image to the ray; {ANEW}"),
-    ("<BlocksExchange", "of ContextCapture; export as COLMAP, and give its cameras.txt"),
-    (r'VICON_RADIAL|qtm-version=|KC1="', f"of a system of motion capture, with formulas of its own; {ANEW}"),
-    ('"CalibrationInformation"', "of Azure Kinect, in shares of a side; write what its SDK says for your images' size"),
-)
-"""Patterns that tell files of programs whose cameras are not read, and why and what to do."""
-
-
-def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
-    for pattern, why in UNREAD:
-        if re.search(pattern, text, re.MULTILINE):
-            raise InputError("E-CAMERA-MODEL", f"camera file {path}: {why}")
-    if text.lstrip().startswith("<"):
-        root = ElementTree.fromstring(text)
-        if root.tag == "calibration":
-            return metashape.from_calibration(root, str(path))
-        if root.tag in metashape.ROOTS:
-            return metashape.from_cameras(root, name, str(path))
-        return from_keys(values_of(text), name, str(path))
-    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if rows and rows[0][0].startswith("{") and "lensmodel" in text and PHOTONVISION not in text:
-        return forms.from_mrcal(text, str(path))
-    if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
-        lens = _from_colmap(rows, name, path)
-        if isinstance(lens, ForeignLens):
-            return lens
-        return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model), path))
-    if matlab.is_zhang(rows):
-        return matlab.from_zhang(rows, str(path))
-    if matlab.is_script(text):
-        return matlab.from_script(text, str(path))
-    values = values_of(text)
-    if matlab.STRUCTURE in values or "MappingCoefficients" in values:
-        return matlab.from_structure(values, str(path))
-    return from_keys(values, name, str(path))
-
-
 def _no_text(path: Path) -> InputError:
     if is_photograph(path):
         return InputError(
@@ -217,11 +122,12 @@ def _no_text(path: Path) -> InputError:
             "--refine-camera from its EXIF",
         )
     return InputError(
-        "E-CAMERA-UNREADABLE", f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML"
+        "E-CAMERA-UNREADABLE",
+        f"camera file {path}: neither text nor a binary file of COLMAP or MATLAB; give a camera file of {READ}",
     )
 
 
-def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | None:
+def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray | None:
     """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
     stated = {
         key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
@@ -241,7 +147,7 @@ def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | 
     except (InputError, ValueError) as error:
         raise InputError(
             "E-CAMERA-COVARIANCE",
-            f"camera file {path}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
+            f"camera file {source}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
             "again, or remove these comments",
         ) from error
     return covariance
@@ -265,15 +171,60 @@ def _starts_with(path: Path, head: bytes) -> bool:
         return stream.read(len(head)) == head
 
 
-def _from_colmap(rows: list[list[str]], name: str, path: Path) -> CameraModel | ForeignLens:
+def _from_colmap(text: str, name: str, source: str) -> CameraModel | ForeignLens:
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cameras = {row[0]: row[1:] for row in rows}
     if len(cameras) < len(rows):
-        raise InputError("E-CAMERA-REPEATED", f"camera file {path}: two cameras of one number; correct it")
-    model, *values = cameras[one_of(list(cameras), numbered(cameras, name), str(path))]
+        raise InputError("E-CAMERA-REPEATED", f"camera file {source}: two cameras of one number; correct it")
+    model, *values = cameras[one_of(list(cameras), numbered(cameras, name), source)]
     try:
         width, height, *params = (float(value) for value in values)
     except ValueError as error:
         raise InputError(
-            "E-CAMERA-CONTENT", f"camera file {path}: {' '.join(str(error).split())[:150]}; numbers needed"
+            "E-CAMERA-CONTENT", f"camera file {source}: {' '.join(str(error).split())[:150]}; numbers needed"
         ) from error
-    return of_colmap(model, width, height, params, str(path))
+    lens = of_colmap(model, width, height, params, source)
+    if isinstance(lens, ForeignLens):
+        return lens
+    return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model), source))
+
+
+def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
+    """Read the lens of a camera file, also of an unsupported model; arguments and errors as :func:`read_camera`."""
+    path, name = Path(path), name or _chosen.get()
+    try:
+        if path.is_file() and _starts_with(path, SQLITE):
+            return of_database(path, name)
+        content = read_bytes(path, SETTINGS_BYTES)
+        for recognised, read in BINARY_FORMATS:
+            if recognised(content):
+                return read(content, name, str(path))
+        text = text_of(content)
+        return next(read for recognised, read in TEXT_FORMATS if recognised(text))(text, name, str(path))
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(
+            "E-CAMERA-UNREADABLE", f"camera file {path}: {error.strerror or error}; give a readable file"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise _no_text(path) from error
+    except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:150]
+        raise InputError(
+            "E-CAMERA-UNREADABLE",
+            f"camera file {path}: no camera of {READ} ({reason}); check its form, or convert it",
+        ) from error
+
+
+BINARY_FORMATS = ((matlab.is_mat, matlab.from_mat), (forms.is_colmap_binary, forms.from_colmap_binary))
+"""For each binary format a test of the content and a reader, which is given the content, a name, and the file."""
+TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str, str], CameraModel | ForeignLens]], ...] = (
+    (lambda text: COLMAP_LINE.search(text) is not None, _from_colmap),
+    (metashape.is_metashape, metashape.from_metashape),
+    (forms.is_mrcal, forms.from_mrcal),
+    (matlab.is_script, matlab.from_script),
+    (is_ini, from_ini),
+    (lambda text: True, lambda text, name, source: from_keys(values_of(text), name, source)),
+)
+"""For each text format the same; what no other test recognises has keys and values."""
