@@ -39,7 +39,6 @@ class BoardSize(Part):
     scale: float
     scale_sigma: Finite
     pitch_mm: float | None
-    unit_mm: float | None = None
 
 
 class AdjustedCamera(Part):
@@ -162,7 +161,7 @@ class HandEyeFile(ResultFile):
     flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
     board: BoardSize = Field(
         description="`scale`: true size over stated size, 1 where it was not solved for; `scale_sigma`; `pitch_mm` of "
-        "dots or squares, times `scale`; null for tags and poses; `unit_mm`, only of a model of COLMAP: mm of its unit"
+        "dots or squares, times `scale`; null for tags and poses"
     )
     camera: AdjustedCamera | None = Field(
         description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
@@ -287,8 +286,7 @@ def verdict_part(found: Verdict) -> VerdictPart:
 def board_part(outcome: Outcome) -> BoardSize:
     result = outcome.result
     pitch = None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale
-    unit = {} if outcome.unit_mm is None else {"unit_mm": outcome.unit_mm * result.scale}
-    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch, **unit)
+    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch)
 
 
 def camera_part(outcome: Outcome) -> AdjustedCamera | None:
@@ -467,7 +465,7 @@ class HandEyeRigFile(ResultFile):
     base_from_board_covariance: Matrix6 | None = Field(None, description="its covariance")
     flange_from_board: Pose | None = Field(None, description="`Z` of eye-to-hand")
     flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance")
-    board: BoardSize = Field(description="`scale`, `scale_sigma`, `pitch_mm`, `unit_mm` as of `handeye`")
+    board: BoardSize = Field(description="`scale`, `scale_sigma`, `pitch_mm` as of `handeye`")
     sigma: dict[str, float] = Field(description="`robot_rad`, `robot_mm`, `board_mm`, of all cameras together")
     estimated: list[str] = Field(description="which σ were estimated, those of a camera with its name behind a colon")
     robot_poses: list[str] = Field(description="names of the robot's poses")
