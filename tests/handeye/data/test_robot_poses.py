@@ -25,7 +25,7 @@ def test_quaternions_in_the_order_of_their_columns(tmp_path):
 
 
 def test_names_without_folder_and_ending(tmp_path):
-    np.savez(tmp_path / "r.npz", poses=np.tile(np.eye(4), (3, 1, 1)), images=["0", "1", "10"])
+    np.savez(tmp_path / "r.npz", base_from_flange=np.tile(np.eye(4), (3, 1, 1)), images=["0", "1", "10"])
     found = read_robot_poses(tmp_path / "r.npz", statements=Said(length_unit="mm"))
     assert found.rows(["a/0.png", "a/10.png", "a/7.png"]) == ({"a/0.png": 0, "a/10.png": 2}, ("1",))
     with fails_with("E-IMAGE-NAME-AMBIGUOUS … pose 2 … 1 … a/1.png … b/1.png"):
