@@ -58,9 +58,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         Typed(says=("6 of 20 poses are tilted the other way", *MOVED), never=("wrong setup", "paired with another")),
     ),
     "bouguet_m": (Typed(values=camera(657.395, 657.763, 302.984, 242.617, -0.2559, 0.1276, -0.0002, 0.00003)),),
-    "camodocal": (
-        Typed(INPUT, "E-HANDEYE-CONVENTION", ("flange_from_base", "--poses-are", "--setup"), never=("column",)),
-    ),
+    "camodocal": (Typed(INPUT, "E-POSES-NOT-FOUND", ("no poses in keys frameCount, T1_0", "4×4 matrices in JSON")),),
     "colmap_300_cameras": (Typed(values=camera(1503, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)),),
     "ehe_eye_on_base_forgotten": (
         Typed(says=("do not use: the camera is 1426 mm off the flange", "give --setup eye-to-hand")),
@@ -139,7 +137,9 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "tum_lag_20ms_no_option": (
         Typed(says=("do not use", "clock is 20 ± 0.1 ms behind the camera's", "solve with --time-offset")),
     ),
-    "twelve_numbers_noheader": (Typed(says=("rows of 6 + 6 numbers", "line 2 contradicts the others")),),
+    "twelve_numbers_noheader": (
+        Typed(INPUT, "E-POSES-NOT-FOUND", ("rows of 12 numbers without a header", "a table with named columns")),
+    ),
     "ur_pendant": (Typed(says=("use with care", "pose 2 contradicts the others")),),
     "wal": (Typed(INPUT, "E-CAMERA-UNREADABLE", ("db.db-wal", "copy both")),),
     "yaml_directive_comment": (
@@ -228,7 +228,6 @@ HAND_EYE = {
     "aruco_flips_30pc": ("flange_from_camera", 0.25, 1.1, ""),
     "ehe_eye_on_base_forgotten": ("base_from_camera", 0.12, 0.9, " --setup eye-to-hand"),
     "kuka_semicolon_comma": ("flange_from_camera", 0.13, 0.8, ""),
-    "twelve_numbers_noheader": ("flange_from_camera", 0.13, 0.8, ""),
     "ur_pendant": ("flange_from_camera", 0.13, 0.8, ""),
     "tum_lag_20ms_no_option": ("flange_from_camera", 0.06, 0.5, " --time-offset --method pose --splits 0"),
 }

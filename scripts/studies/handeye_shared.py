@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
@@ -82,6 +83,17 @@ def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = 
     return scratch / "cameras.txt"
 
 
+def robot_table(folder: Path, path: Path) -> Path:
+    """Writes the robot's poses of ROS-Industrial's files, one for each image, as a table."""
+    names = [f"base_from_flange_{name}" for name in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
+    rows = [["image", *names]]
+    for file in sorted(folder.glob("*.yaml")):
+        pose = yaml.safe_load(file.read_text(encoding="utf-8"))
+        rows.append([file.stem, *(repr(float(pose[key])) for key in ("x", "y", "z", "qw", "qx", "qy", "qz"))])
+    path.write_text("".join(",".join(row) + "\n" for row in rows), encoding="utf-8")
+    return path
+
+
 def _handeye(
     folder: Path,
     scratch: Path,
@@ -95,7 +107,8 @@ def _handeye(
     """One data set; ``adjust`` : camera and size of the board too."""
     scratch.mkdir(parents=True, exist_ok=True)
     (scratch / "board.toml").write_text(board)
-    given = read_input(folder / "images", folder / "poses", camera, scratch / "board.toml", splits.workers)
+    poses = robot_table(folder / "poses", scratch / "poses.csv")
+    given = read_input(folder / "images", poses, camera, scratch / "board.toml", splits.workers)
     options = HandEyeOptions(intrinsics=given.prior if adjust else None, with_scale=adjust, symmetries=given.symmetries)
     outcome = calibrate(given, setup, method, options, splits)
     return HandEyeFile.of(outcome, whole=True).content(), outcome_report(outcome).text()

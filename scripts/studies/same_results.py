@@ -122,8 +122,19 @@ def prepare(folder: Path) -> None:
             cells += [*t.tolist(), *rotation.as_quat()[[3, 0, 1, 2]].tolist()]
         lines.append(",".join([f"{names[0]}{i}", *map(repr, cells)]))
     (folder / "handeye.csv").write_text("\n".join(lines) + "\n")
+    (folder / "charuco_poses.csv").write_text(robot_table(DATA / "charuco_handeye" / "test_set_charuco" / "poses"))
+    (folder / "dots_poses.csv").write_text(robot_table(DATA / "dotgrid_handeye" / "poses"))
     tags = "".join(f'\n[[tag]]\ndictionary = "DICT_6X6_250"\nid = {k}\nsize_mm = 18.256\n' for k in LAYOUT_TAGS)
     (folder / "layout.toml").write_text(f'type = "tags"\nname = "charuco"\norigin = 8\n{tags}')
+
+
+def robot_table(folder: Path) -> str:
+    """The robot's poses of ROS-Industrial's files, one for each image, as a table."""
+    text = "image,x_m,y_m,z_m,qw,qx,qy,qz\n".replace(",", ",base_from_flange_")
+    for file in sorted(folder.glob("*.yaml")):
+        pose = dict(line.split(": ") for line in file.read_text().splitlines() if ": " in line)
+        text += ",".join([file.stem, *(pose[key] for key in ("x", "y", "z", "qw", "qx", "qy", "qz"))]) + "\n"
+    return text
 
 
 def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
@@ -270,7 +281,7 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
         "handeye",
         folder / "images",
         "--poses",
-        folder / "poses",
+        inputs / "charuco_poses.csv",
         "--camera",
         folder / "cal_data.yaml",
         "--board",
@@ -294,7 +305,7 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
         "handeye",
         folder / "images",
         "--poses",
-        folder / "poses",
+        inputs / "dots_poses.csv",
         "--camera",
         folder / "camera_intr_calibrated.yaml",
         "--board",

@@ -2,7 +2,7 @@
 poses of the robot to take next."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -42,8 +42,8 @@ class PoseFiles:
     ] = None
     poses: Annotated[
         Path | None,
-        "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS …; or "
-        "from this folder, with a file for each image.",
+        "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices (JSON, npz, npy) or a "
+        "TUM trajectory.",
     ] = None
     camera: Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."] = None
     board: Annotated[
@@ -73,8 +73,6 @@ class PoseFiles:
     first: shared.FirstTable = None
     second: shared.SecondTable = None
     key: shared.Key = "image"
-    columns: shared.ColumnsFile = None
-    columns_a: shared.FirstColumns = None
     quaternions: shared.Quaternions = "wxyz"
     workers: shared.Workers = None
 
@@ -82,8 +80,7 @@ class PoseFiles:
         """Returns the user's statements about what the files do not state."""
         from stcal.handeye.data.formats.record import Said
 
-        said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
-        return replace(said, columns=self.columns) if self.is_folder() else said
+        return Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
 
     def is_folder(self) -> bool:
         """Returns whether the poses are found in photographs of a folder."""
@@ -93,16 +90,12 @@ class PoseFiles:
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
         from stcal.workflows.handeye.inputs import one_source
 
-        said, maps = self.statements(), (self.columns_a, self.columns)
         if self.source is None and self.first is not None and self.second is not None:
-            told, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing, maps)
+            said = self.statements()
+            told, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing)
             print_each("note", notes)
             return told
-        if self.source is not None and self.columns is not None and self.source.is_file():
-            return one_source(self.source, None, self.key, said, self.quaternions, timing, maps)[0]
-        columns = None if self.is_folder() else self.columns  # those of a folder are of the robot's poses
-        joined = shared.Joined(self.first, self.second, self.key, columns, self.columns_a)
-        return joined.table(self.source, "POSES|IMAGES")
+        return shared.Joined(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
 
     def understood(self, pairs: "Source", timing: "Timing", robot: "Robot | None") -> list[str]:
         """Returns in lines how the files are understood, without solving anything."""
@@ -127,10 +120,8 @@ class PoseFiles:
             length_unit=self.length_unit or (),
             poses_are=self.poses_are or (),
             quaternions=self.quaternions,
-            columns=self.columns if self.is_folder() else None,
             tolerance_s=timing.tolerance_s,
             image_times=timing.image_times,
-            times_columns=timing.times_columns,
             time_offset=timing.offset,
             robot=robot,
             workers=self.workers,
@@ -200,9 +191,6 @@ def handeye(
     image_times: Annotated[
         Path | None, "Read the times of the images from this file: image, time_s (CSV); if not given, from their names."
     ] = None,
-    times_columns: Annotated[
-        Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
-    ] = None,
     time_tolerance: Annotated[
         float,
         "Take the robot's nearest pose within this time, s, if none can be interpolated.",
@@ -262,12 +250,7 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    if times_columns is not None and image_times is None:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"--times-columns {times_columns}: it describes a table of image times; give --image-times",
-        )
-    timing = Timing(time_tolerance, image_times, time_offset, times_columns)
+    timing = Timing(time_tolerance, image_times, time_offset)
     pairs, folder = files.pairs(timing), files.is_folder()
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
@@ -291,7 +274,6 @@ def handeye(
         inputs = files.read(pairs, timing, robot_model, progress)
         for line in inputs.understood:
             say(line)
-        with_scale = with_scale or inputs.unit_mm is not None
         options = HandEyeOptions(
             noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolved
         )

@@ -27,8 +27,6 @@ PANELS = {
             "second",
             "key",
             "quaternions",
-            "columns",
-            "columns_a",
             "undo_flips",
             "camera_name",
             "bayer",
@@ -39,7 +37,7 @@ PANELS = {
         *("sigma_px", "sigma_mm", "sigma_rad"),
     ),
     "Cross-validation": ("held_out", "splits", "folds", "motions_held_out"),
-    "Clocks of robot and camera": ("time_offset", "image_times", "times_columns", "time_tolerance"),
+    "Clocks of robot and camera": ("time_offset", "image_times", "time_tolerance"),
     "Errors of the arm itself": ("with_kinematics", "robot_out"),
     "Files for other programs": (
         *("ros", "urdf", "opencv", "export", "parent", "child", "camera_frame", "camera_out"),

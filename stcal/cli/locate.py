@@ -124,7 +124,6 @@ def run(
     ] = None,
     robot_poses: Annotated[Path | None, "Read base_from_flange of each scene from this file (CSV)."] = None,
     key: Annotated[str, "Match scenes and rows of --robot-poses by this column."] = "scene",
-    columns: Annotated[Path | None, "Read --robot-poses with the columns, delimiter … of this file (TOML)."] = None,
     registration: Annotated[
         Path | None,
         "Add poses in the robot's base, using this result of `stcal register` (JSON), with a the camera and b the "
@@ -186,7 +185,6 @@ def run(
             robot_poses=robot_poses,
             offset=offset,
             key=key,
-            columns=columns,
             quaternions=quaternions,
         )
     target, model = load_layout(layout), read_camera(camera)

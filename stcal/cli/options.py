@@ -208,25 +208,13 @@ SecondTable = Annotated[Path | None, "Read the values that belong to the rows of
 Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]
 
 
-ColumnsFile = Annotated[
-    Path | None,
-    "Read the measurements with the columns, delimiter and skipped lines of this file (TOML); with --a and --b it is "
-    "for --b.",
-]
-
-
-FirstColumns = Annotated[Path | None, "Read the file of --a with the columns, delimiter … of this file (TOML)."]
-
-
 @dataclass(frozen=True, slots=True)
 class Joined:
-    """Options of a table in place of a command's file: two tables joined, and columns of other programs."""
+    """Options of a table in place of a command's file: two tables joined."""
 
     first: FirstTable = None
     second: SecondTable = None
     key: Key = "image"
-    columns: ColumnsFile = None
-    columns_a: FirstColumns = None
 
     def table(
         self, given: Path | None, what: str, prefixes: tuple[str, str] = ("", ""), quaternions: "Order" = "wxyz"
@@ -234,9 +222,7 @@ class Joined:
         """Returns the file given as argument, or the table of --a and --b joined. Notes on rows left out are
         printed."""
         seconds = [self.second] if self.second else []
-        tables = several_tables(
-            given, self.first, seconds, self.key, what, prefixes, quaternions, self.columns, self.columns_a
-        )
+        tables = several_tables(given, self.first, seconds, self.key, what, prefixes, quaternions)
         return tables[0] if isinstance(tables, list) else tables
 
 
@@ -251,8 +237,6 @@ def several_tables(
     what: str,
     prefixes: tuple[str, str] = ("", ""),
     quaternions: "Order" = "wxyz",
-    columns: Path | None = None,
-    columns_a: Path | None = None,
 ) -> "Path | Table | list[Table]":
     """Returns the file given as argument, or a table for each --b joined with --a.
 
@@ -261,17 +245,10 @@ def several_tables(
     if (given is None) == (first is None) or (first is None) != (not seconds):
         raise InputError("E-OPTION-FILES", f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
-        if columns_a is not None:
-            raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with --a; give --columns")
-        if columns is None:
-            return given
-        from stcal.io.join import load_table
-
-        return load_table(given, columns, quaternions, what)
+        return given
     from stcal.io.join import join_tables
 
-    of_both = key, prefixes, quaternions, columns, columns_a
-    joined = [join_tables(str(first), str(second), *of_both) for second in seconds]
+    joined = [join_tables(str(first), str(second), key, prefixes, quaternions) for second in seconds]
     print_each("note", (note for each in joined for note in each.notes))
     return [each.table for each in joined]
 

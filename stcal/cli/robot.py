@@ -320,8 +320,6 @@ def verify(
         Opt("--b", metavar="<path>"),
     ] = None,
     key: shared.Key = "pose",
-    columns_a: shared.FirstColumns = None,
-    columns: shared.ColumnsFile = None,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
@@ -330,9 +328,7 @@ def verify(
     from stcal.robot.use import verification
     from stcal.robot.use.report import verification_report
 
-    tables = shared.several_tables(
-        measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns, columns_a=columns_a
-    )
+    tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
         tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
     result = verification.verify(verification.read_measured(tables))
@@ -454,7 +450,6 @@ def from_photos(
     model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by held-out rows."] = "rigid",
     partial: Annotated[bool, "Keep parameters that the photographs do not determine nominal."] = False,
     key: Annotated[str, "Match photographs and joint values by this column."] = "image",
-    columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
     workers: shared.Workers = None,
 ) -> None:
     """Measure the target on an arm in photographs, find axes and kinematics, and compensate poses, in one folder."""
@@ -484,7 +479,6 @@ def from_photos(
             MeasureOptions(workers=workers),
             IdentifyOptions(model=model, partial=partial),
             progress,
-            columns,
         )
     print_each("note", result.notes)
     for line in story(result):

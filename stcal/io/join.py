@@ -1,4 +1,4 @@
-"""Joins of tables: rows of the same key side by side, columns renamed as a command needs them."""
+"""Joins of tables: rows of the same key side by side."""
 
 import re
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order
-from stcal.io.poses.columns import read_mapped
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
 
 _OF_POSES = re.compile(rf"([xyz]_({'|'.join(LENGTHS)})|{'|'.join((*POSE[3:], *COVARIANCE))}|common\d+_.+)")
@@ -34,17 +33,13 @@ class Joined:
 
 
 @require_arguments
-def load_table(
-    path: str | Path, columns: str | Path | None = None, quaternions: Order = "wxyz", what: str = "table"
-) -> Table:
-    """Reads a table, with any names of its columns, delimiter, decimal sign and header.
+def load_table(path: str | Path, quaternions: Order = "wxyz", what: str = "table") -> Table:
+    """Reads a table.
 
     Parameters
     ----------
     path : str or Path
         CSV or another text file.
-    columns : str or Path, optional
-        Columns, delimiter … of the file (TOML; form: ``data_layout.md``), if they are not those of stcal.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
     what : str
@@ -60,7 +55,7 @@ def load_table(
     InputError
         The file is no table, a column is missing, or a row has another length.
     """
-    return table_of(path, columns, what, quaternions)
+    return read_table(path, what, quaternions)
 
 
 @require_arguments
@@ -70,8 +65,6 @@ def join_tables(
     key: str,
     prefixes: tuple[str, str] = ("", ""),
     quaternions: Order = "wxyz",
-    columns: str | Path | None = None,
-    columns_a: str | Path | None = None,
 ) -> Joined:
     """Returns the rows of two tables that have the same key, side by side.
 
@@ -88,8 +81,6 @@ def join_tables(
         used.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
-    columns, columns_a : str or Path, optional
-        Columns, delimiter … of ``b`` and of ``a``, if they are files (TOML).
 
     Returns
     -------
@@ -102,7 +93,7 @@ def join_tables(
         A file is no table or lacks the key column, a key occurs twice, no key is common to both, or both files have
         the same pose column.
     """
-    tables = [table_of(a, columns_a, "table", quaternions), table_of(b, columns, "table", quaternions)]
+    tables = [read_table(source, "table", quaternions) for source in (a, b)]
     a, b = (source.where if isinstance(source, Table) else source for source in (a, b))
     keys = keys_of(key, tables[0])
     places = [_places(table, own, i) for i, (table, own) in enumerate(zip(tables, keys, strict=True))]
@@ -184,13 +175,6 @@ def stack_tables(
     columns[column] = [name for name, table in zip(names, tables, strict=True) for _ in range(len(table))]
     lines = [line for table in tables for line in table.lines]
     return Table(", ".join(table.where for table in tables), columns, lines, tables[0].quaternions)
-
-
-def table_of(path: str | Path | Table, columns: str | Path | None, what: str, quaternions: Order = "wxyz") -> Table:
-    """Return the table of a file, with its columns mapped if there is a file of ``columns``."""
-    if columns and not isinstance(path, Table):
-        return read_mapped(path, columns, what, quaternions)
-    return read_table(path, what, quaternions)
 
 
 def keys_of(key: str, first: Table | None = None) -> tuple[str, str]:

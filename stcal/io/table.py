@@ -134,10 +134,7 @@ class Table:
         """Return the remedy for a column ``name`` without a unit, or for any other header."""
         bare_name = name[-1:] if name[-1:] in "xyz" else name
         bare = next((column for column in self.columns if column.lower() in (name, bare_name)), None)
-        if bare is None:
-            return "; columns of other names are named in a file of --columns"
-        likely = f"{bare_name}_{next(iter(units))}"
-        return f"; the unit of {bare} is open: call it {likely} …, or give {likely} = {bare!r} … in a file of --columns"
+        return f"; the unit of {bare} is open: call it {bare_name}_{next(iter(units))} …" if bare else ""
 
     def has(self, name: str, units: dict[str, float]) -> bool:
         """Return True if there is a column ``name_unit``."""
@@ -295,8 +292,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     if 2 * sum(np.isfinite(_number(name.replace(",", "."))) for name in names) > len(names):
         raise InputError(
             "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm; or give "
-            "header = false in a file of --columns",
+            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm",
         )
     for name in names:
         if names.count(name) > 1 or not name:
@@ -307,8 +303,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
         raise InputError(
             "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is no header of the rows below it; remove it, or give skip_lines in a file of "
-            "--columns",
+            f"{where}: line {used[0][0]} is no header of the rows below it; remove it",
         )
     if len(used) == 1:
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
@@ -448,8 +443,7 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
         beside = f" beside {points[0]}" if points else ""
         raise InputError(
             "E-TABLE-DECIMAL",
-            f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands; give decimal_comma in a "
-            "file of --columns, or write points",
+            f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands; write points",
         )
     return columns | {n: [cell.replace(",", ".") for cell in cells] for n, cells in with_comma.items()}, True
 

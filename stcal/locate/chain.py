@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
-from stcal.io.join import table_of
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
 from stcal.io.quaternions import READINGS
-from stcal.io.table import LENGTHS, UNIT_WORDS
+from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
 from stcal.locate.pipeline import Located
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
@@ -196,14 +195,12 @@ def _offset(offset: Rigid | str | Path | None) -> Rigid:
     return Rigid.from_matrix(read.obj_from_goal)
 
 
-def read_robot_poses(
-    path: str | Path, quaternions: Order = "wxyz", key: str = "scene", columns: str | Path | None = None
-) -> dict[str, UncertainRigid]:
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "scene") -> dict[str, UncertainRigid]:
     """Reads base_from_flange of each scene from the columns ``x_mm … qz``, or ``base_from_flange_x_mm …``.
 
-    Column ``key`` names the scenes; ``columns`` : map of the columns.
+    Column ``key`` names the scenes.
     """
-    table = table_of(path, columns, "robot poses", quaternions)
+    table = read_table(path, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
     pose_of_scene = {}
@@ -332,7 +329,6 @@ def goal_chain(
     robot_poses: Mapping[str, Rigid] | str | Path | None = None,
     offset: Rigid | str | Path | None = None,
     key: str = "scene",
-    columns: str | Path | None = None,
     quaternions: Order = "wxyz",
 ) -> GoalChain:
     """Returns the chain base_from_goal = base_from_flange · flange_from_camera · camera_from_obj · obj_from_goal.
@@ -354,8 +350,6 @@ def goal_chain(
         obj_from_goal, mm, exact; or a file with it (JSON). The goal is the target itself by default.
     key : str
         Column of the table that names the scenes.
-    columns : str or Path, optional
-        File with the columns, delimiter … of the table (TOML).
     quaternions : {"wxyz", "xyzw"}
         Order of the table's quaternions: by the names of their columns, or x, y, z, w in the order of the columns.
 
@@ -404,7 +398,7 @@ def goal_chain(
     if robot_poses is None:
         return GoalChain(mount, moving, {}, _offset(offset), source)
     if isinstance(robot_poses, str | Path):
-        flange = read_robot_poses(robot_poses, quaternions, key, columns)
+        flange = read_robot_poses(robot_poses, quaternions, key)
         return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
     exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
     return GoalChain(mount, moving, exact, _offset(offset), source)

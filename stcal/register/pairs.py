@@ -9,8 +9,8 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.io.covariance import OF_POINT, first_fault
-from stcal.io.join import join_tables, table_of
-from stcal.io.table import LENGTHS, Table
+from stcal.io.join import join_tables
+from stcal.io.table import LENGTHS, Table, read_table
 from stcal.register.models import Model, Transform, fit, rounding_mm, squares, whitened
 
 WHAT = "point pairs"
@@ -74,8 +74,6 @@ def read_pairs(
     second: str | Path | Table | None = None,
     *,
     key: str = "name",
-    columns: str | Path | None = None,
-    columns_a: str | Path | None = None,
 ) -> Pairs:
     """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
 
@@ -87,8 +85,6 @@ def read_pairs(
         Table of the points of b alone, as ``x_mm, y_mm, z_mm``.
     key : str
         Column of both tables that names the points; or ``name=Point Name``, that of a and that of b.
-    columns, columns_a : str or Path, optional
-        Columns, delimiter … of the only file or that of b, and of that of a (TOML).
 
     Returns
     -------
@@ -100,14 +96,12 @@ def read_pairs(
         If columns are missing or a row is invalid: text, values that are not finite, a repeated pair, weights or σ that
         are not positive. The message names the line.
     """
-    if second is None and columns_a is not None:
-        raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with two files; give --columns")
     notes = ()
     if second is not None:
-        joined = join_tables(path, second, key, ("a", "b"), columns=columns, columns_a=columns_a)
+        joined = join_tables(path, second, key, ("a", "b"))
         table, notes = joined.table, joined.notes
     else:
-        table = table_of(path, columns, WHAT)
+        table = read_table(path, WHAT)
     xyz_a, xyz_b = table.points("a"), table.points("b")
     _no_pair_twice(table, np.hstack([xyz_a, xyz_b]))
     given = [

@@ -20,7 +20,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import json_text, save
 from stcal.io.images import find_images
-from stcal.io.join import join_tables, table_of
+from stcal.io.join import join_tables
 from stcal.io.json import ResultFile, require_result_written
 from stcal.io.table import POSE, Table, read_table
 from stcal.parallel import Progress
@@ -350,7 +350,6 @@ def robot_from_photos(
     measure_options: MeasureOptions | None = None,
     options: IdentifyOptions | None = None,
     progress: Progress | None = None,
-    columns: str | Path | None = None,
 ) -> FromPhotos:
     """Measures the target in photographs, identifies the arm that carried it, and compensates targets.
 
@@ -378,8 +377,6 @@ def robot_from_photos(
         Options of measuring and of identifying; the defaults if None.
     progress : callable, optional
         Called with (stage, done, total).
-    columns : str or Path, optional
-        Columns, delimiter … of ``joints`` (TOML).
 
     Returns
     -------
@@ -392,22 +389,20 @@ def robot_from_photos(
         One of its subclasses, from the step that failed, with a one-line message that says what to do.
     """
     # Both are read before the work, as both may be refused.
-    values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal, columns)
+    values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal)
     carried = dict.fromkeys(targets_of(values), Rigid())
     wanted = None if targets is None else read_targets(targets, replace(nominal, tools=carried))
     measured = measure(images, camera_model(camera), target, design, board, measure_options, progress)
     return from_measured(str(images), measured, values, nominal, wanted, options)
 
 
-def read_joints(
-    path: str | Path, key: str, photographs: Sequence[str], nominal: Robot, columns: str | Path | None = None
-) -> Table:
+def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: Robot) -> Table:
     """Returns joint values with the name of each row's photograph in the column ``image``, which replaces ``key``.
 
     Raises InputError: no such column, no row of the photographs, one twice, poses beside the joint values, or other
     joints than the robot's.
     """
-    values, nowhere = table_of(path, columns, "joints"), np.zeros(len(photographs))
+    values, nowhere = read_table(path, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
     join_tables(files, values, key)
     joint_values(values, nominal)

@@ -1,7 +1,6 @@
 """Pose pairs written as other programs write them, by hand: nothing of the readers under test is used."""
 
 import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +13,6 @@ from stcal.handeye import HandEyePoses
 
 Arguments = list[str]
 """Of ``stcal handeye``."""
-MODEL_MM = 37.0
-"""Of a unit of the model of COLMAP."""
 
 
 def matrices(poses) -> np.ndarray:
@@ -42,11 +39,6 @@ def message(matrix: np.ndarray) -> dict:
     return {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("xyzw", turn, strict=True))}
 
 
-def zivid(matrix: np.ndarray) -> str:
-    rows = ",\n".join(f"      {row}" for row in matrix.tolist())
-    return f"__version__:\n  serializer: 1\n  data: 1\nFloatMatrix:\n  Data:\n    [\n{rows}\n    ]\n"
-
-
 def opencv_arrays(folder: Path, pairs: HandEyePoses) -> Arguments:
     a, b = matrices(pairs.base_from_flange), matrices(pairs.camera_from_board)
     np.savez(
@@ -57,16 +49,6 @@ def opencv_arrays(folder: Path, pairs: HandEyePoses) -> Arguments:
         t_target2cam=b[:, :3, 3:],
     )
     return [str(folder / "pairs.npz")]
-
-
-def rotation_vectors(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """OpenCV's other way, in JSON."""
-    found = {}
-    for name, poses in (("gripper2base", pairs.base_from_flange), ("target2cam", pairs.camera_from_board)):
-        found[f"R_{name}"] = Rotation.from_matrix(np.array(poses.rotation)).as_rotvec().tolist()
-        found[f"t_{name}"] = poses.translation.tolist()
-    (folder / "pairs.json").write_text(json.dumps(found))
-    return [str(folder / "pairs.json")]
 
 
 def stacks(folder: Path, pairs: HandEyePoses) -> Arguments:
@@ -85,13 +67,6 @@ def objects(folder: Path, pairs: HandEyePoses) -> Arguments:
     ]
     (folder / "pairs.json").write_text(json.dumps(rows))
     return [str(folder / "pairs.json")]
-
-
-def json_lines(folder: Path, pairs: HandEyePoses) -> Arguments:
-    both = zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)
-    rows = [json.dumps({"T_base_gripper": a.tolist(), "T_cam_target": b.tolist()}) for a, b in both]
-    (folder / "pairs.jsonl").write_text("\n".join(rows) + "\n")
-    return [str(folder / "pairs.jsonl")]
 
 
 def moveit(folder: Path, pairs: HandEyePoses) -> Arguments:
@@ -127,20 +102,6 @@ def two(folder: Path, a: str | bytes, b: str | bytes, suffix: str = "txt") -> Ar
     return ["--a", str(paths[0]), "--b", str(paths[1])]
 
 
-def text_blocks(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Four lines for each matrix; the camera's with brackets and commas, as numpy and people print them."""
-    a = "\n\n".join("\n".join(line(row) for row in m) for m in matrices(pairs.base_from_flange))
-    b = "\n".join("\n".join(f"[{line(row, ', ')}]," for row in m) for m in matrices(pairs.camera_from_board))
-    return two(folder, a, b)
-
-
-def text_rows(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """A name and 16 numbers; the camera's in another order, with an ending."""
-    a = [f"pos{i:02d} {line(m.ravel())}" for i, m in enumerate(matrices(pairs.base_from_flange))]
-    b = [f"img{i:02d}.png {line(m.ravel())}" for i, m in enumerate(matrices(pairs.camera_from_board))]
-    return two(folder, "\n".join(a), "\n".join(b[::-1]))
-
-
 def npy(folder: Path, pairs: HandEyePoses) -> Arguments:
     for name, poses in (("robot", pairs.base_from_flange), ("camera", pairs.camera_from_board)):
         np.save(folder / f"{name}.npy", in_metres(poses))
@@ -154,46 +115,6 @@ def tum(folder: Path, pairs: HandEyePoses) -> Arguments:
     inverse = in_metres(pairs.camera_from_board.inverse())
     b = [f"{100.5 + i:.1f} {line([*m[:3, 3], *xyzw(m)])}" for i, m in enumerate(inverse)]
     return two(folder, head + "\n".join(a), head + "\n".join(b))
-
-
-def ros_csv(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """``rostopic echo -p`` of a PoseStamped and a TransformStamped; stamps that a float cannot tell apart."""
-    files = []
-    for parts, poses in (
-        (("pose.position", "pose.orientation"), pairs.base_from_flange),
-        (("transform.translation", "transform.rotation"), pairs.camera_from_board),
-    ):
-        names = [f"field.{parts[0]}.{c}" for c in "xyz"] + [f"field.{parts[1]}.{c}" for c in "xyzw"]
-        rows = [",".join(["%time", "field.header.seq", "field.header.stamp", *names])]
-        for i, m in enumerate(in_metres(poses)):
-            rows.append(f"17,{i},160906036346935{i:04d},{line([*m[:3, 3], *xyzw(m)], ',')}")
-        files.append("\n".join(rows) + "\n")
-    return two(folder, *files, suffix="csv")
-
-
-def plotjuggler(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Both topics in one file."""
-    topics = ("/robot_pose/pose", "/aruco/marker/pose")
-    names = [
-        f"{t}/{part}/{c}" for t in topics for part, axes in (("position", "xyz"), ("orientation", "xyzw")) for c in axes
-    ]
-    rows = [",".join(["__time", *names])]
-    for i, (a, b) in enumerate(zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)):
-        rows.append(f"{i}.5,{line([*a[:3, 3], *xyzw(a), *b[:3, 3], *xyzw(b)], ',')}")
-    (folder / "bag.csv").write_text("\n".join(rows) + "\n")
-    return [str(folder / "bag.csv")]
-
-
-def rostopic_echo(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """YAML documents, a message each."""
-    files = []
-    for poses in (pairs.base_from_flange, pairs.camera_from_board):
-        messages = [
-            {"header": {"seq": i, "stamp": {"secs": 100 + i, "nsecs": 5}, "frame_id": "base"}, "transform": message(m)}
-            for i, m in enumerate(in_metres(poses))
-        ]
-        files.append("".join(f"{yaml.safe_dump(each)}---\n" for each in messages))
-    return two(folder, *files, suffix="yaml")
 
 
 def euler_columns(folder: Path, pairs: HandEyePoses) -> Arguments:
@@ -231,8 +152,19 @@ def of_ur(folder: Path, pairs: HandEyePoses) -> Arguments:
     """Lines p[x, y, z, rx, ry, rz] in metres."""
     turns = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_rotvec()
     rows = [f"p[{line([*t / 1000, *w], ', ')}]" for t, w in zip(pairs.base_from_flange.translation, turns, strict=True)]
-    b = "\n".join(line(m.ravel(), "\t") for m in in_metres(pairs.camera_from_board))
-    return [*two(folder, "\n".join(rows), b), "--rotation", "ur-rotvec"]
+    (folder / "robot.txt").write_text("\n".join(rows))
+    np.save(folder / "camera.npy", in_metres(pairs.camera_from_board))
+    return ["--a", str(folder / "robot.txt"), "--b", str(folder / "camera.npy"), "--rotation", "robot=ur-rotvec"]
+
+
+def file_storage(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """A matrix for each pose, by OpenCV's own writer."""
+    for name, poses in (("robot", pairs.base_from_flange), ("camera", pairs.camera_from_board)):
+        storage = cv2.FileStorage(str(folder / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
+        for i, matrix in enumerate(matrices(poses)):
+            storage.write(f"image_{i}", matrix)
+        storage.release()
+    return ["--a", str(folder / "robot.yml"), "--b", str(folder / "camera.yml")]
 
 
 def kuka_export(folder: Path, pairs: HandEyePoses) -> Arguments:
@@ -256,177 +188,69 @@ def tab_export(folder: Path, pairs: HandEyePoses) -> Arguments:
     return ["--a", str(folder / "robot.txt"), "--b", str(folder / "camera.npy"), *given]
 
 
-def capital_columns(folder: Path, pairs: HandEyePoses) -> Arguments:
-    turns = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_rotvec()
-    rows = [line(row, ",") for row in np.hstack([pairs.base_from_flange.translation, turns])]
-    (folder / "robot.csv").write_text("\n".join(["X_mm,Y_mm,Z_mm,RX,RY,RZ", *rows]) + "\n")
-    np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
-    return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.npy"), "--rotation", "robot=ur-rotvec"]
-
-
-def kinova(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Angles about the fixed axes X, Y, Z, in this order, degrees; places in metres."""
-    angles = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_euler("xyz", degrees=True)
-    rows = [line(row, ",") for row in np.hstack([pairs.base_from_flange.translation / 1000, angles])]
-    head = "x_m,y_m,z_m,theta_x_deg,theta_y_deg,theta_z_deg"
-    (folder / "robot.csv").write_text("\n".join([head, *rows]) + "\n")
-    np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
-    return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.npy")]
-
-
-def both_in_a_row(commas: bool = False) -> Callable:
-    """Six numbers of the robot's pose and six of the camera's in each line, metres, with decimal commas or without."""
-
-    def write(folder: Path, pairs: HandEyePoses) -> Arguments:
-        sides = [
-            np.hstack([p.translation / 1000, Rotation.from_matrix(np.array(p.rotation)).as_rotvec()])
-            for p in (pairs.base_from_flange, pairs.camera_from_board)
-        ]
-        rows = [line(row, ";" if commas else ",") for row in np.hstack(sides)]
-        text = "# both\n" + "\n".join(rows) + "\n"
-        (folder / "both.csv").write_text(text.replace(".", ",") if commas else text)
-        return [str(folder / "both.csv"), "--rotation", "rotvec-rad"]
-
-    return write
-
-
-def quaternions_in_a_row(folder: Path, pairs: HandEyePoses) -> Arguments:
-    both = zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)
-    rows = [line([*a[:3, 3], *xyzw(a), *b[:3, 3], *xyzw(b)]) for a, b in both]
-    (folder / "both.txt").write_text("\n".join(rows) + "\n")
-    return [str(folder / "both.txt"), "--rotation", "xyzw"]
-
-
-def counted(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """The number of matrices before them, and a number before each."""
-    parts = [str(len(pairs))]
-    for i, m in enumerate(matrices(pairs.camera_from_board)):
-        parts += [str(i), *(line(row) for row in m)]
-    (folder / "camera.txt").write_text("\n".join(parts) + "\n")
-    named = {str(i): m.tolist() for i, m in enumerate(matrices(pairs.base_from_flange))}
-    (folder / "robot.json").write_text(json.dumps(named))
-    return ["--a", str(folder / "robot.json"), "--b", str(folder / "camera.txt")]
-
-
-def count_alone(folder: Path, pairs: HandEyePoses) -> Arguments:
-    blocks = [str(len(pairs)), *(line(row) for m in matrices(pairs.base_from_flange) for row in m)]
-    rows = [str(len(pairs)), *(line(m.ravel()) for m in matrices(pairs.camera_from_board))]
-    return two(folder, "\n".join(blocks), "\n".join(rows))
-
-
-def camodocal(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """What handeye_calib_camodocal records, by OpenCV's FileStorage."""
-    storage = cv2.FileStorage(str(folder / "pairs.yml"), cv2.FILE_STORAGE_WRITE)
-    storage.write("frameCount", len(pairs))
-    both = zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)
-    for i, (tip, tag) in enumerate(both):
-        storage.write(f"T1_{i}", tip)
-        storage.write(f"T2_{i}", tag)
-    storage.release()
-    return [str(folder / "pairs.yml")]
-
-
-def zivid_folders(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """A file for each pose: Zivid's for the robot, OpenCV's FileStorage for the camera."""
-    for name in ("robot", "camera"):
-        (folder / name).mkdir()
-    for i, m in enumerate(matrices(pairs.base_from_flange)):
-        (folder / "robot" / f"pos{i + 1:02d}.yaml").write_text(zivid(m))
-    for i, m in enumerate(matrices(pairs.camera_from_board)):
-        numbers = f"rows: 4\n   cols: 4\n   dt: d\n   data: [ {line(m.ravel(), ', ')} ]"
-        (folder / "camera" / f"board_{i + 1}.yml").write_text(f"%YAML:1.0\n---\nPose: !!opencv-matrix\n   {numbers}\n")
-    return ["--a", str(folder / "robot"), "--b", str(folder / "camera")]
-
-
-def colmap_lines(pairs: HandEyePoses, unit_mm: float) -> str:
-    rows = ["# Image list with two lines of data per image:"]
-    for i, m in enumerate(matrices(pairs.camera_from_board)):
-        x, y, z, w = xyzw(m)
-        rows += [f"{i + 1} {line([w, x, y, z, *m[:3, 3] / unit_mm])} 1 a/{i} b.png", "" if i % 2 else "1.5 2.5 -1"]
-    return "\n".join(rows) + "\n"
-
-
-def colmap_text(folder: Path, pairs: HandEyePoses, unit_mm: float = 1000.0) -> Arguments:
-    (folder / "model").mkdir()
-    (folder / "model" / "images.txt").write_text(colmap_lines(pairs, unit_mm))
-    rows = [f"a/{i} b.png {line(m.ravel())}" for i, m in enumerate(matrices(pairs.base_from_flange))]
-    (folder / "robot.txt").write_text("\n".join(rows).replace(" b.png", ".png"))
-    named = {f"a/{i} b.png": m.tolist() for i, m in enumerate(matrices(pairs.base_from_flange))}
-    (folder / "robot.json").write_text(json.dumps(named))
-    return ["--a", str(folder / "robot.json"), "--b", str(folder / "model"), "--length-unit", "camera=m"]
-
-
-def colmap_binary(folder: Path, pairs: HandEyePoses, unit_mm: float = 1000.0) -> Arguments:
-    arguments = colmap_text(folder, pairs, unit_mm)
-    (folder / "model" / "images.txt").unlink()
-    parts = [struct.pack("<Q", len(pairs))]
-    for i, m in enumerate(matrices(pairs.camera_from_board)):
-        x, y, z, w = xyzw(m)
-        parts.append(struct.pack("<I7dI", i + 1, w, x, y, z, *(m[:3, 3] / unit_mm), 1))
-        parts.append(f"a/{i} b.png".encode() + b"\0" + struct.pack("<Q", i) + struct.pack("<2dq", 1.5, 2.5, -1) * i)
-    (folder / "model" / "images.bin").write_bytes(b"".join(parts))
-    return arguments
-
-
-def kitti(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Twelve numbers in a row, as KITTI's odometry has them."""
-    both = (in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board))
-    return two(folder, *("\n".join(line(m[:3].ravel()) for m in side) for side in both))
-
-
-def named_elements(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """Columns T[0][0] … T[3][3] of the robot, and r11 … r33, t1 … t3 of the camera, mm."""
-    heads = (
-        [f"T[{i}][{j}]" for i in range(4) for j in range(4)],
-        [
-            *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
-            *("t1", "t2", "t3"),
-        ],
-    )
-    a = [line(m.ravel(), ",") for m in matrices(pairs.base_from_flange)]
-    b = [line([*m[:3, :3].ravel(), *m[:3, 3]], ",") for m in matrices(pairs.camera_from_board)]
-    return two(folder, "\n".join([",".join(heads[0]), *a]), "\n".join([",".join(heads[1]), *b]), "csv")
-
-
 FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "OpenCV's arrays": opencv_arrays,
-    "OpenCV's rotation vectors": rotation_vectors,
     "npz": stacks,
     "JSON": objects,
-    "JSON lines": json_lines,
     "MoveIt": moveit,
     "easy_handeye": easy_handeye,
     "easy_handeye of ROS 1": easy_handeye_of_ros1,
-    "text": text_blocks,
-    "rows of text": text_rows,
     "npy": npy,
+    "OpenCV's FileStorage": file_storage,
     "TUM": tum,
-    "ROS bag": ros_csv,
-    "PlotJuggler": plotjuggler,
-    "rostopic": rostopic_echo,
     "columns of angles": euler_columns,
     "KUKA": robots("kuka-abc", "ZYX", ("a", "b", "c")),
     "Fanuc": robots("fanuc-wpr", "xyz", ("w", "p", "r")),
     "Stäubli": robots("staubli", "XYZ", ("rx", "ry", "rz")),
     "Yaskawa": robots("yaskawa", "xyz", ("rx", "ry", "rz"), "deg"),
     "Kawasaki": robots("kawasaki-oat", "ZYZ", ("o", "a", "t")),
+    "Kinova": robots("kinova", "xyz", ("theta_x", "theta_y", "theta_z"), "deg"),
     "roll, pitch, yaw": robots("rpy", "xyz", ("roll", "pitch", "yaw"), "rad"),
     "zyx by axis": robots("zyx", "zyx", ("rx", "ry", "rz"), "rad"),
     "rotation vector": robots("rotvec", "rotvec", ("rx", "ry", "rz"), "rad"),
+    "rotation vector in capitals": robots("ur-rotvec", "rotvec", ("RX", "RY", "RZ")),
     "UR": of_ur,
     "KUKA's export": kuka_export,
     "tabs and decimal commas": tab_export,
-    "columns in capitals": capital_columns,
-    "Kinova": kinova,
-    "rows of 6 + 6": both_in_a_row(),
-    "rows of 6 + 6, decimal commas": both_in_a_row(commas=True),
-    "rows of 7 + 7": quaternions_in_a_row,
-    "numbered matrices": counted,
-    "count of matrices": count_alone,
-    "camodocal": camodocal,
-    "KITTI": kitti,
-    "columns of matrices": named_elements,
-    "Zivid and OpenCV folders": zivid_folders,
-    "COLMAP text": colmap_text,
-    "COLMAP binary": colmap_binary,
 }
+EYE = "1 0 0 0.1\n0 1 0 0.2\n0 0 1 0.3\n0 0 0 1\n"
+LISTED = [[1, 0, 0, 0.1], [0, 1, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+MESSAGE = "{translation: {x: 0.1, y: 0.2, z: 0.3}, rotation: {x: 0.0, y: 0.0, z: 0.0, w: 1.0}}"
+MATRIX = f"!!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n   data: [ {', '.join(EYE.split())} ]\n"
+SIX, SEVEN = "0.1 0.2 0.3 0.1 0.2 0.3", "0.1 0.2 0.3 0 0 0 1"
+REFUSED = {
+    "matrices as text": EYE,
+    "matrices in brackets": "[[1, 0, 0, 0.1],\n [0, 1, 0, 0.2],\n [0, 0, 1, 0.3],\n [0, 0, 0, 1]],\n" * 2,
+    "a matrix in a row": " ".join(EYE.split()),
+    "a name and a matrix": "a.png " + " ".join(EYE.split()),
+    "KITTI": " ".join(EYE.split()[:12]),
+    "a count before": f"2\n{EYE}{EYE}",
+    "rows of 6": SIX,
+    "rows of 7": SEVEN,
+    "a name and six numbers": f"a.png {SIX}",
+    "rows of 6 + 6": f"{SIX} {SIX}",
+    "rows of 7 + 7": f"{SEVEN} {SEVEN}",
+    "decimal commas": SIX.replace(" ", ";").replace(".", ","),
+    "EuRoC's ground truth": "#timestamp [ns]\n" + ",".join(["1403636579763555584", *SEVEN.split(), *9 * ["0"]]),
+    "JSON lines": f'{{"base_from_flange": {LISTED}, "camera_from_board": {LISTED}}}\n' * 2,
+    "matrices 3×4 in JSON": str([LISTED[:3]] * 2),
+    "rows of 6 in JSON": str([[float(v) for v in SIX.split()]] * 2),
+    "rotations and translations of each pose": '[{"R": [[1,0,0],[0,1,0],[0,0,1]], "t": [1,2,3]}]',
+    "rotation vectors in JSON": '{"R_gripper2base": [[0.1,0.2,0.3]], "t_gripper2base": [[1,2,3]]}',
+    "rostopic echo": f"transform: {MESSAGE}\n---\ntransform: {MESSAGE}\n---\n",
+    "messages of ROS": f"- {MESSAGE}\n- {MESSAGE}\n",
+    "ROS bag": "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,field.pose.orientation.x,"
+    "field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w\n1,0.1,0.2,0.3,0,0,0,1\n",
+    "columns of matrices": ",".join(f"m{i}{j}" for i in range(4) for j in range(4)) + "\n" + ",".join(EYE.split()),
+    "ROS-Industrial": "x: 0.1\ny: 0.2\nz: 0.3\nqw: 1.0\nqx: 0.0\nqy: 0.0\nqz: 0.0\n",
+    "list of ROS-Industrial": "- {image: a.png, pose: 0.yaml}\n- {image: b.png, pose: 1.yaml}\n",
+    "Zivid": f"__version__:\n  serializer: 1\nFloatMatrix:\n  Data: {LISTED}\n",
+    "camodocal": f"%YAML:1.0\n---\nframeCount: 1\nT1_0: {MATRIX}T2_0: {MATRIX}",
+    "COLMAP": "# Image list\n1 1 0 0 0 0.1 0.2 0.3 1 a.png\n1.5 2.5 -1\n",
+    "KUKA's program": "&ACCESS RVP\nDEFDAT P\nDECL E6POS XP1={X 1.0,Y 2.0,Z 3.0,A 4.0,B 5.0,C 6.0}\nENDDAT\n",
+    "FANUC's program": "/PROG  A\n/POS\nP[1]{\n   GP1:\n\tX = 1.0  mm,\tY = 2.0  mm,\tZ = 3.0  mm,\n};\n/END\n",
+    "ABB's program": "MODULE m\n  CONST robtarget p1:=[[1.0,2.0,3.0],[1,0,0,0],[0,0,0,0],[9E9]];\nENDMODULE\n",
+    "Doosan's program": "posx(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)\nposx(1.5, 2.5, 3.5, 4.5, 5.5, 6.5)\n",
+    "Epson's points": "Point1 {\n\trX=1.0\n\trY=2.0\n\trZ=3.0\n\trU=4.0\n\trV=5.0\n\trW=6.0\n}\n",
+}
+"""Poses in formats that are not read."""

@@ -36,21 +36,16 @@ def test_rows_of_one_key_stand_side_by_side(tmp_path):
 
 def test_pairs_of_two_files(tmp_path):
     a = written(tmp_path / "a.csv", "name,x_mm,y_mm,z_mm\np1,1,2,3\np2,4,5,6\np9,0,0,0\n")
-    b = written(tmp_path / "b.csv", "P;X\np2;1\np1;2\n")
-    columns = written(
-        tmp_path / "b.toml", 'delimiter = "semicolon"\n[columns]\nname = "P"\nx_m = "X"\ny_m = "X"\nz_m = "X"\n'
-    )
-    pairs = register.read_pairs(a, b, columns=columns)
+    b = written(tmp_path / "b.csv", "P;x_m;y_m;z_m\np2;1;1;1\np1;2;2;2\n")
+    pairs = register.read_pairs(a, b, key="name=P")
     assert np.allclose(pairs.xyz_a, [[1, 2, 3], [4, 5, 6]])
     assert np.allclose(pairs.xyz_b, [[2000] * 3, [1000] * 3])
     assert pairs.notes == (f"1 rows of {a} have no partner: name p9",)
-    table = stcal.load_table(b, columns)
-    joined = stcal.join_tables(a, table, "name", ("a", "b"))
+    table = stcal.load_table(b)
+    joined = stcal.join_tables(a, table, "name=P", ("a", "b"))
     assert np.array_equal(register.read_pairs(joined.table).xyz_b, pairs.xyz_b)
     both = stcal.stack_tables([table, table], ["first", "second"])
     assert both.text("set") == ["first", "first", "second", "second"]
-    with fails_with("E-OPTION-NEEDS … only with two files"):
-        register.read_pairs(a, columns_a=columns)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from stcal.handeye.data.inputs import read_pairs, require_own
 from stcal.handeye.data.robot_poses import read_robot_poses
 from stcal.io.design import load_target
 from stcal.io.files import text_of
-from stcal.io.poses.columns import read_mapped
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
 from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -133,12 +132,6 @@ def of_conf(path: Path) -> np.ndarray:
     return np.array(robot_toml(robot_of_conf(text, str(path), None, "standard")).splitlines())
 
 
-def of_columns(path: Path) -> np.ndarray:
-    (path.parent / "data.csv").write_text("A;B\n1,5;2\n3;4\n")
-    table = read_mapped(path.parent / "data.csv", path, "points")
-    return np.column_stack([table.numbers("x_mm"), table.numbers("y_mm")])
-
-
 def of_statement(path: Path) -> np.ndarray:
     return np.array([repr(statement_of(StatedSize(), path))])
 
@@ -221,42 +214,24 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         ),
         of_robot_poses,
     ),
-    "poses, rows of KITTI": (
-        "".join(f"1.0 0.0 0.0 0.{i} 0.0 {c} {-s} 0.2 0.0 {s} {c} 0.3\n" for i, s, c in SINES),
-        of_robot_poses,
-    ),
-    "poses, table of matrices": (
-        ",".join(["image", *(f"T[{i}][{j}]" for i in range(3) for j in range(4))])
-        + "\n"
-        + "".join(f"{i}.png,1,0,0,0.{i},0,{c},{-s},0.2,0,{s},{c},0.3\n" for i, s, c in SINES),
-        of_robot_poses,
-    ),
     "poses, table of rotations": (
-        ",".join(["image", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "t1", "t2", "t3"])
+        ",".join(["image", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "x", "y", "z"])
         + "\n"
         + "".join(f"{i}.png,1,0,0,0,{c},{-s},0,{s},{c},0.{i},0.2,0.3\n" for i, s, c in SINES),
         of_robot_poses,
     ),
     "URDF": (URDF, of_urdf),
     "calibration.conf": (CONF, of_conf),
-    "map of columns": (
-        'delimiter = "semicolon"\ndecimal_comma = true\n\n[columns]\nx_mm = "A"\ny_mm = "B"\n',
-        of_columns,
-    ),
     "statement": ('[fields]\noperator = "A"\n\n[board]\ntemperature_c = 21.5\n', of_statement),
     "poses, JSON": (json.dumps({"base_from_flange": MATRICES, "units": "m"}, indent=1), of_robot_poses),
     "poses, MoveIt": (
         "".join(f"- effector_wrt_world: {each}\n  object_wrt_sensor: {each}\n" for each in MATRICES),
         of_pairs,
     ),
-    "poses, KUKA": (
-        "".join(f"DECL E6POS XP{i}={{X {i}00.5,Y 20,Z 30,A {10 * i},B 20,C 30}}\n" for i in range(1, 4)),
-        of_robot_poses,
-    ),
     "layout": (LAYOUT, lambda path: np.array([repr(load_plan(path))])),
 }
 OF_YAML = [name for name in READERS if name.startswith(("Kalibr", "easy", "apriltag_ros", "Universal"))]
-OF_ROWS = [name for name in READERS if "table" in name or "rows" in name or name in ("SpatialAnalyzer", "poses, KUKA")]
+OF_ROWS = [name for name in READERS if "table" in name or "rows" in name or name == "SpatialAnalyzer"]
 WITH_SETTINGS = ("easy_handeye", "apriltag_ros", "URDF", "calibration.conf", "poses, JSON", "poses, MoveIt")
 """Their other keys are settings of their programs, or properties of other parts of the robot, and change nothing."""
 OF_KEYS = [name for name in READERS if name not in OF_ROWS]

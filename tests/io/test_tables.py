@@ -1,4 +1,4 @@
-"""Tables of other programs without a map: separators, decimal commas, units in brackets, SpatialAnalyzer."""
+"""Tables of other programs: separators, decimal commas, units in brackets, SpatialAnalyzer."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_a_comma_behind_the_last_column_is_none(tmp_path):
 
 def test_rows_without_a_header_are_named(tmp_path):
     """Not the two columns that happen to be equal."""
-    with fails_with("E-TABLE-HEADER … line 1 … numbers … header = false"):
+    with fails_with("E-TABLE-HEADER … line 1 … numbers"):
         table(tmp_path, "PT0;10.5;2000.25;-3.125;0;0;1\nPT1;11.5;2000.25;-3.5;0;0;1\n")
 
 
@@ -72,7 +72,7 @@ def test_the_case_of_turned_axes_stays(tmp_path):
     ],
 )
 def test_commas_that_may_be_of_thousands(tmp_path, text, named):
-    with fails_with(f"E-TABLE-DECIMAL … {named} … decimal_comma"):
+    with fails_with(f"E-TABLE-DECIMAL … {named}"):
         table(tmp_path, text)
 
 
@@ -122,7 +122,7 @@ def test_what_comments_say_of_units(tmp_path, comment, axis):
 
 
 def test_a_unit_that_nothing_states_is_asked_for(tmp_path):
-    with fails_with("E-TABLE-COLUMN-MISSING … X … open … x_mm = 'X' … --columns"):
+    with fails_with("E-TABLE-COLUMN-MISSING … X … open … x_mm …"):
         table(tmp_path, "Point Name;X;Y;Z\np0;1,5;2,5;3,5\n").quantity("x", LENGTHS)
 
 
@@ -133,18 +133,6 @@ def test_key_columns_of_two_names(tmp_path):
     np.testing.assert_array_equal(found.numbers("x_mm"), [2.5, 1.5])
     with fails_with("E-TABLE-COLUMN-MISSING … b.csv … image … image=NAME"):
         join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image")
-
-
-def test_both_files_with_a_map(tmp_path):
-    (tmp_path / "a.csv").write_text("Nr;J1\n1;10,5\n")
-    (tmp_path / "b.csv").write_text("Nr\tX\n1\t1.5\n", encoding="utf-8")
-    (tmp_path / "a.toml").write_text(
-        'delimiter = "semicolon"\ndecimal_comma = true\n[columns]\nimage = "Nr"\nq1_deg = "J1"\n'
-    )
-    (tmp_path / "b.toml").write_text('delimiter = "tab"\n[columns]\nimage = "Nr"\nx_m = "X"\n')
-    maps = {"columns": tmp_path / "b.toml", "columns_a": tmp_path / "a.toml"}
-    found = join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image", **maps).table
-    assert (found.numbers("q1_deg")[0], found.quantity("x", LENGTHS)[0]) == (10.5, 1500.0)
 
 
 @pytest.mark.parametrize("units", ["mm", "[mm]", "(mm)", " mm "])
@@ -160,9 +148,9 @@ def test_units_behind_a_slash(tmp_path):
 
 
 def test_a_line_that_is_no_header_is_named(tmp_path):
-    with fails_with("E-TABLE-HEADER … line 1 … skip_lines … --columns"):
+    with fails_with("E-TABLE-HEADER … line 1 … no header"):
         table(tmp_path, "My measurement\nname,x_mm,y_mm\nA,1,2\n")
-    with fails_with("E-TABLE-HEADER … line 1 … header = false … --columns"):
+    with fails_with("E-TABLE-HEADER … line 1"):
         table(tmp_path, "P1 1.5 2.5 3.5\nP2 4 5 6\n")
 
 

@@ -122,25 +122,6 @@ def test_options_that_make_no_sense(stcal, files, arguments, reason):
     assert error.count("\n") == 1
 
 
-def test_the_order_of_the_robots_quaternions_is_an_option(stcal, files, tmp_path):
-    x, y, z, qw, qx, qy, qz = pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))
-    (tmp_path / "robot.csv").write_text(",".join(["scene", *POSE]) + "\n" + ",".join(["good", x, y, z, qx, qy, qz, qw]))
-    words = [
-        "locate",
-        "run",
-        files / "scenes/good",
-        "--layout",
-        files / "layout.toml",
-        "--camera",
-        files / "cameras.txt",
-    ]
-    words += ["--hand-eye", files / "he.json", "--out"]
-    robots = {"a": (files / "robot.csv",), "b": (tmp_path / "robot.csv", "--quaternions", "xyzw")}
-    for name, robot in robots.items():
-        assert stcal(*words, tmp_path / name, "--robot-poses", *robot)[0] == 0
-    assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text()
-
-
 def test_schedule(stcal):
     assert stcal("locate", "schedule", "1", "100", "3")[1] == "1\n10\n100\n"
     assert stcal("locate", "schedule", "3", "1", "3")[0] == 2

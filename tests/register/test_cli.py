@@ -95,18 +95,6 @@ def test_two_motions_are_refused_unless_allowed(run, tmp_path):
     assert other["apart_mm"] == pytest.approx(9, abs=0.5)
 
 
-@pytest.mark.parametrize(
-    "model", [*(pytest.param(m, marks=pytest.mark.slow) for m in ("rigid", "similarity")), "affine"]
-)
-def test_models(run, tmp_path, model):
-    code, printed, _ = run(
-        written(tmp_path, rows_of(*points())), "--model", model, "--folds", 0, "--out", tmp_path / "o.json"
-    )
-    assert code == 0
-    assert f"30 point pairs, {model}, robust" in printed
-    assert json.loads((tmp_path / "o.json").read_text())["model"] == model
-
-
 @pytest.mark.slow
 def test_methods_and_threshold(run, tmp_path):
     a, b = points(60)
@@ -190,32 +178,6 @@ def test_bad_rows_are_named_by_line(run, tmp_path, kind, says):
     assert says in err
     assert len(err.splitlines()) == 1
     assert not out.exists()
-
-
-def test_rows_in_another_unit_are_named_by_line(run, tmp_path):
-    """Three rows of b in metres among millimetres: outliers, and the reason."""
-    a, b = points(40)
-    for row in (3, 11, 25):
-        b[row] /= 1000
-    code, printed, _ = run(written(tmp_path, rows_of(a, b)))
-    assert code == 0
-    assert {int(n) for n in re.findall(r"line (\d+) +OUTLIER", printed)} == {5, 13, 27}
-    note = next(line for line in printed.splitlines() if line.startswith("warning") and " m" in line)
-    assert all(f"line {n}" in note or f" {n}" in note for n in (5, 13, 27))
-
-
-def test_a_whole_frame_in_another_unit_is_refused(run, tmp_path):
-    a, b = points()
-    code, _, err = run(written(tmp_path, rows_of(a, b / 1000)))
-    assert code == 2
-    assert "bx_m" in err or "metres" in err or "_m" in err
-
-
-def test_a_left_handed_frame_is_refused(run, tmp_path):
-    a, b = points()
-    code, _, err = run(written(tmp_path, rows_of(a, b * [1, 1, -1])))
-    assert code in (2, 3)
-    assert "left-handed" in err or "mirrored" in err
 
 
 @pytest.mark.parametrize(

@@ -38,8 +38,6 @@ def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
     assert json.loads(json_text(found.file)) == answer
     assert found.file.fields["operator"] == "A"
     assert "A" in found.document().text()
-    with fails_with("E-OPTION-NEEDS … --columns … --check-lengths"):
-        sfm.uncertainty_budget(small_run, columns=tmp_path / "columns.toml")
     with fails_with("E-OPTION-VALUE … 62"):
         sfm.uncertainty_budget(small_run, fields={61 * "n": ""})
 

@@ -108,7 +108,15 @@ QUICK = [
 ]
 
 
-@pytest.mark.parametrize("name", QUICK)
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow)
+    for name in MISTAKES
+    if name not in QUICK and name.startswith(("identify", "axes", "compensate", "verify", "locate", "register"))
+]
+"""Mistakes with robots, instruments and located targets, which no other test tells."""
+
+
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_a_mistake_is_told(stock, tmp_path, name):
     assert name in MISTAKES
     assert mistaken(stock, tmp_path / "case", name).failures == ()

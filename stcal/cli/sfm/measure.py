@@ -48,7 +48,6 @@ def measure(
     joints: Annotated[
         Path | None, "Add the columns of this file to the table, such as joint values; it needs a column image (CSV)."
     ] = None,
-    columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
     board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
     previous: Annotated[bool, "Decide between two solutions by the previous image, assuming small motions."] = False,
     sequence: Annotated[
@@ -100,7 +99,7 @@ def measure(
     target = _design_beside(faces) if target is None else target
     if serve or live:
         mode = "--live" if live else "--serve"
-        alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--columns": columns}
+        alone = {"--serve": serve and live, "--report": report, "--joints": joints}
         alone |= {
             "--out": out != TABLE,
             "IMAGES": images if serve else None,
@@ -130,15 +129,11 @@ def measure(
                 f"{images}: a file, and no image; for the pose in each picture of a video give --live --json -, or "
                 "give the folder of its frames",
             )
-        if columns is not None and joints is None:
-            raise InputError(
-                "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of joint values; give it with --joints"
-            )
         shared.load_ahead(workers)
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
-    from stcal.io.join import table_of
+    from stcal.io.table import read_table
     from stcal.sfm.measurement import images as work
     from stcal.sfm.measurement import report as output
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
@@ -157,7 +152,7 @@ def measure(
         limits = {"token": token, "max_megabytes": max_megabytes}
         _serve((replace(circles, design=design), model, *others), source, host, port, limits, json_file is not None)
         return
-    table = table_of(joints, columns, "joints") if joints else None
+    table = read_table(joints, "joints") if joints else None
     options = work.MeasureOptions(PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, workers)
     told = shared.designs_told(target, board, with_board=False)
     with told, shared.handed_over(scheduler, send_images), StageProgress() as progress:

@@ -194,7 +194,6 @@ def budget(
         Path | None,
         "Compare distances between circles with the lengths in this file (CSV: from, to, length_mm, sigma_mm).",
     ] = None,
-    columns: Annotated[Path | None, "Read --check-lengths with the columns, delimiter … of this file (TOML)."] = None,
     lengths: Annotated[Path | None, "Compare the longest distances with the second calibration in this folder."] = None,
     lengths_statement: Annotated[
         Path | None, "Read the statement of that second calibration from this file; if not given, --statement is used."
@@ -212,7 +211,7 @@ def budget(
     if pdf:
         _require_pdf(page, run)
     fields = fields_of(field or ())
-    result = uncertainty_budget(run, statement, fields, check_lengths, columns, lengths, lengths_statement)
+    result = uncertainty_budget(run, statement, fields, check_lengths, lengths, lengths_statement)
     document = result.document()
     say(document.text())
     write_if(out, lambda: result.file, "as JSON")

@@ -9,13 +9,12 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.formats.numeric import read_columns, todays
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
+from stcal.handeye.data.formats.tables import read_columns, todays
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance, inverse_jacobian
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
-from stcal.io.poses.columns import read_mapped
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
 
 METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
@@ -31,8 +30,8 @@ class Posed:
     """Poses of one side in the direction that is needed, mm.
 
     ``names`` : image or timestamp of each pose, or none; ``places`` : place of each pose in its file; ``understood`` :
-    how the file was read; ``scaled`` : whether lengths have no unit; ``guessed`` : the unit that was guessed from the
-    size of lengths, empty where it is known; ``common`` : (m, 6, k) errors that the poses have in common.
+    how the file was read; ``guessed`` : the unit that was guessed from the size of lengths, empty where it is known;
+    ``common`` : (m, 6, k) errors that the poses have in common.
     """
 
     poses: Poses
@@ -41,7 +40,6 @@ class Posed:
     covariance: np.ndarray | None
     where: str
     understood: str
-    scaled: bool = False
     guessed: str = ""
     common: np.ndarray | None = None
 
@@ -55,14 +53,12 @@ class Posed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``scaled`` : whether the
-    camera's lengths have no unit; ``left_out`` : (name, why); ``timed`` : where the robot's poses were taken by
-    time."""
+    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``left_out`` :
+    (name, why); ``timed`` : where the robot's poses were taken by time."""
 
     pairs: HandEyePoses
     understood: tuple[str, ...]
     setup: str | None = None
-    scaled: bool = False
     left_out: tuple[tuple[str, str], ...] = ()
     timed: Timed | None = None
 
@@ -77,19 +73,6 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
     """
     content = read_content(path, statements, key, quaternions)
     return None if content is None else _told(content, path, statements)
-
-
-def mapped_pairs(path: Path, columns: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Told:
-    """Returns the pose pairs of a table with a map of its ``columns``; errors as :func:`read_pairs`."""
-    return _told(mapped_content(path, columns, statements, key, quaternions), path, statements)
-
-
-def mapped_content(path: Path, columns: Path, statements: Said, key: str, quaternions: Order) -> Content:
-    """Returns the poses of a table with a map of its ``columns``.
-
-    Raises InputError: the map does not fit the table, or there are no poses in its columns.
-    """
-    return _of_table(read_mapped(path, columns, "table", quaternions), statements, key)
 
 
 def _told(content: Content, path: Path, statements: Said) -> Told:
@@ -109,7 +92,7 @@ def _told(content: Content, path: Path, statements: Said) -> Told:
         )
     rows = list(range(len(robot)))
     names = robot.names or camera.names or robot.places
-    return Told(_pairs(robot, camera, rows, rows, names, path.name), _both(robot, camera), content.setup, camera.scaled)
+    return Told(_pairs(robot, camera, rows, rows, names, path.name), _both(robot, camera), content.setup)
 
 
 def read_two(
@@ -120,22 +103,19 @@ def read_two(
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
-    columns: tuple[Path | None, Path | None] = (None, None),
 ) -> Told | None:
     """Returns the robot's poses and the camera's, from two files, as pairs.
 
     The result is None where both files are the package's own tables. The rows are joined by image or time, or by their
     order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
-    are those at the camera's times, within ``tolerance_s``. ``columns`` : maps of the columns of both files.
+    are those at the camera's times, within ``tolerance_s``.
 
     Raises InputError: the message says what is wrong with a file, or that no rows belong together.
     """
     keys = keys_of(key)
     contents = [
         read_content(path, statements.of(role), own, quaternions)
-        if form is None
-        else mapped_content(path, form, statements.of(role), own, quaternions)
-        for role, path, form, own in zip(FRAMES, (first, second), columns, keys, strict=True)
+        for role, path, own in zip(FRAMES, (first, second), keys, strict=True)
     ]
     if contents[0] is None and contents[1] is None:
         return None
@@ -159,7 +139,7 @@ def read_two(
     left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
     where = f"{first.name} with {second.name}"
     pairs = _pairs(robot, camera, a, b, names, where)
-    return Told(pairs, (*_both(robot, camera), *notes), setup, camera.scaled, tuple(left_out), stamped)
+    return Told(pairs, (*_both(robot, camera), *notes), setup, tuple(left_out), stamped)
 
 
 def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
@@ -175,14 +155,11 @@ def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
 
 
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
-    """Returns the robot's poses of a file or folder; None where it is one of the package's own tables.
+    """Returns the robot's poses of a file; None where it is one of the package's own tables.
 
-    Raises InputError: the message says what is wrong with the file or folder.
+    Raises InputError: the message says what is wrong with the file.
     """
-    if statements.columns is not None:
-        content = mapped_content(path, statements.columns, statements.of("robot"), key, quaternions)
-    else:
-        content = read_content(path, statements.of("robot"), key, quaternions)
+    content = read_content(path, statements.of("robot"), key, quaternions)
     return None if content is None else settled(_side(content, "robot", path), "robot", content, path, statements)
 
 
@@ -211,7 +188,7 @@ def require_own(path: Path, quaternions: Order = "wxyz") -> None:
 
 
 def _of_table(table: Table, statements: Said, key: str) -> Content:
-    """Returns the poses of one side in a table: a mapped one, or one of the package's own."""
+    """Returns the poses of one side in a table of the package's own."""
     content = read_columns(table, key, statements)
     if content is None:
         raise _no_poses(table)
@@ -222,7 +199,7 @@ def _no_poses(table: Table) -> InputError:
     return InputError(
         "E-POSES-NOT-FOUND",
         f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
-        f"a, b, c …) needed; the header is {table.header()}; rename them, or map them by --columns",
+        f"a, b, c …) needed; the header is {table.header()}; rename them",
     )
 
 
@@ -261,7 +238,7 @@ def _by_time(
         else ()
     )
     lines = (*_both(robot, camera), taken.said, *dropped)
-    return Told(pairs, lines, setup, camera.scaled, left_out, Timed(stream, seconds[rows]))
+    return Told(pairs, lines, setup, left_out, Timed(stream, seconds[rows]))
 
 
 def _side(content: Content, role: Role, path: Path) -> Side:
@@ -303,8 +280,7 @@ def settled(side: Side, role: Role, content: Content, path: Path, statements: Sa
     if content.passed_over:
         ellipsis = " …" if len(content.passed_over) > SHOWN else ""
         parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{ellipsis}")
-    scaled = side.scaled and statements.length_unit is None
-    return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), scaled, guessed, common)
+    return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), guessed, common)
 
 
 def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
@@ -335,8 +311,6 @@ def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, s
         return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
     if statements.length_unit is not None:
         return LENGTHS[statements.length_unit], f"{statements.length_unit} as you say", ""
-    if side.scaled:
-        return 1.0, "lengths without a unit, whose scale is solved for", ""
     if stated is not None:
         return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
     distances = np.linalg.norm(side.translation, axis=1)

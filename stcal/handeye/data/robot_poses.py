@@ -1,26 +1,19 @@
 """Reader of the robot's poses at which images were taken."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.formats.recognise import SUFFIXES, NotToldError
 from stcal.handeye.data.formats.record import Said, require_each_once
 from stcal.handeye.data.inputs import partners, read_robot, require_own, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
-from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.quaternions import require_unit
 from stcal.io.table import LENGTHS, read_table
-from stcal.io.toml import load_yaml
 
-YAML = (".yaml", ".yml")
 TIME = "time_s"
 """Column of a stream of poses, in place of ``image``."""
-INDUSTRIAL = "poses of ROS-Industrial; base_from_flange by default; quaternions by name; m as in ROS"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +34,7 @@ class RobotPoses:
 
     @property
     def file(self) -> str:
-        """Name of the file or folder, without its parent folders."""
+        """Name of the file, without its folders."""
         return Path(self.where.removeprefix("robot poses ")).name
 
     def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
@@ -112,43 +105,24 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
 
     A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
-    ROS-Industrial's calibration data are read too: a folder of YAML files, one for each image, of the same name, with
-    ``x, y, z`` in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
     ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
     ``statements`` : the user's statements about what a file of another program does not state itself.
 
     Raises InputError: missing columns, values that are not finite or quaternions that are not of unit length, named by
-    line, or an image that has two rows; another order of quaternions than their names say, in YAML.
+    line, or an image that has two rows.
     """
     path, statements = Path(path), statements or Said()
-    if (poses_of_others := _of_others(path, statements, quaternions)) is not None:
-        return poses_of_others
+    poses = read_robot(path, statements, "image", quaternions)
+    where = f"robot poses {path}"
+    if poses is not None:
+        return RobotPoses(poses.names, poses.poses, poses.covariance, poses.places, where, poses.understood, own=False)
     if statements.options():
-        if path.is_file() and path.suffix.lower() not in YAML:
-            require_own(path, quaternions)
+        require_own(path, quaternions)
         raise InputError(
             "E-OPTION-NEEDS",
-            f"robot poses {path}: the names of its columns or keys state unit and rotation; leave "
-            f"{', '.join(statements.options())} out, and rename those that are wrong (x_m in place of x_mm)",
+            f"{where}: the names of its columns state unit and rotation; leave {', '.join(statements.options())} out, "
+            "and rename those that are wrong (x_m in place of x_mm)",
         )
-    if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"robot poses {path}: --quaternions {quaternions} is of a CSV file's columns; YAML gives each "
-            "of qx, qy, qz, qw by its name; correct the names",
-        )
-    if path.is_dir():
-        files = sorted(path.glob("*.yaml")) + sorted(path.glob("*.yml"))
-        if not files:
-            raise InputError(
-                "E-ROBOT-POSES-FORM",
-                f"robot poses {path}: a folder without *.yaml; a CSV file, or a YAML file for each image",
-            )
-        read = _from_yaml([(file.stem, file) for file in files], f"robot poses {path}")
-        return replace(read, understood=f"{path.name}: folder of {len(files)} {INDUSTRIAL}", own=False)
-    if path.suffix.lower() in YAML:
-        read = _from_yaml(_listed(path), f"robot poses {path}")
-        return replace(read, understood=f"{path.name}: list of {len(read.images)} {INDUSTRIAL}", own=False)
     table = read_table(path, "robot poses", quaternions)
     timed = "image" not in table and TIME in table
     images, places = table.text(TIME if timed else "image"), tuple(f"line {line}" for line in table.lines)
@@ -157,77 +131,3 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
     frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
     understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
     return RobotPoses(tuple(images), poses, covariance, places, table.where, understood, timed=timed)
-
-
-def _of_others(path: Path, statements: Said, quaternions: Order) -> RobotPoses | None:
-    """Returns poses from formats of other programs. Returns None for tables, and for data of ROS-Industrial, whose
-    readers follow."""
-    if path.is_dir() and _industrial(path):
-        return None
-    try:
-        poses = read_robot(path, statements, "image", quaternions)
-    except NotToldError:
-        if path.suffix.lower() in YAML:  # a list of images and files
-            return None
-        raise
-    if poses is None:
-        return None
-    where = f"robot poses {path}"
-    return RobotPoses(poses.names, poses.poses, poses.covariance, poses.places, where, poses.understood, own=False)
-
-
-def _industrial(folder: Path) -> bool:
-    """True if a file of the folder has a pose as ROS-Industrial writes it, and all files are YAML."""
-    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES]
-    if any(file.suffix.lower() not in YAML for file in files):
-        return False
-    for file in files:
-        try:
-            content = load_yaml(read_bytes(file, SETTINGS_BYTES).decode("utf-8"))
-        except (OSError, yaml.YAMLError, ValueError, RecursionError):
-            continue
-        if isinstance(content, dict) and {"x", "y", "z"} <= content.keys():
-            return True
-    return False
-
-
-def _listed(path: Path) -> list[tuple[str, Path]]:
-    """Returns the images and pose files in a list of both, alone or under ``data``."""
-    content = _yaml(path, f"robot poses {path}")
-    rows = content.get("data") if isinstance(content, dict) else content
-    form = f"robot poses {path}: no list of pairs `image:` and `pose:`; give these, or the folder of the poses"
-    if not isinstance(rows, list) or not rows:
-        raise InputError("E-ROBOT-POSES-FORM", form)
-    for row in rows:
-        if not (isinstance(row, dict) and isinstance(row.get("image"), str) and isinstance(row.get("pose"), str)):
-            raise InputError("E-ROBOT-POSES-FORM", form)
-    return [(Path(row["image"]).name, path.parent / row["pose"]) for row in rows]
-
-
-def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
-    """Returns one pose from each file, by the name of its image."""
-    names, values = [file.name for _, file in files], []
-    require_each_once([image for image, _ in files], names, where, "image ")
-    for _, file in files:
-        pose = _yaml(file, f"{where}: {file.name}")
-        keys = ("x", "y", "z", "qw", "qx", "qy", "qz")
-        row = [pose.get(key) if isinstance(pose, dict) else None for key in keys]
-        for key, value in zip(keys, row, strict=True):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-                raise InputError("E-POSE-VALUE", f"{where}: {file.name}: {key} is {value!r}, a finite number needed")
-        values.append(row)
-    flat = np.array(values, float)
-    require_unit(flat[:, 3:], names.__getitem__, where, "correct it")
-    poses = Poses.from_quaternions(flat[:, 3:], LENGTHS["m"] * flat[:, :3])
-    return RobotPoses(tuple(image for image, _ in files), poses, None, tuple(names), where)
-
-
-def _yaml(path: Path, where: str):
-    try:
-        return load_yaml(read_bytes(path, SETTINGS_BYTES).decode("utf-8"))
-    except OSError as error:
-        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; give a readable file") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError(
-            "E-YAML-INVALID", f"{where}: not YAML ({' '.join(str(error).split())[:100]}); correct it"
-        ) from error

@@ -36,7 +36,6 @@ class BoardSize(Part):
     scale: float
     scale_sigma: Finite
     pitch_mm: float | None
-    unit_mm: float | None = None
 
 
 class AdjustedCamera(Part):
@@ -159,7 +158,7 @@ class HandEyeFile(ResultFile):
     flange_from_board_covariance: Matrix6 | None = Field(None, description="its covariance, likewise")
     board: BoardSize = Field(
         description="`scale`: true size over stated size, 1 where it was not solved for; `scale_sigma`; `pitch_mm` of "
-        "dots or squares, times `scale`; null for tags and poses; `unit_mm`, only of a model of COLMAP: mm of its unit"
+        "dots or squares, times `scale`; null for tags and poses"
     )
     camera: AdjustedCamera | None = Field(
         description="with `--refine-camera`: COLMAP `model`; `parameters` fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, "
@@ -284,8 +283,7 @@ def verdict_part(found: Verdict) -> VerdictPart:
 def board_part(outcome: Outcome) -> BoardSize:
     result = outcome.result
     pitch = None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale
-    unit = {} if outcome.unit_mm is None else {"unit_mm": outcome.unit_mm * result.scale}
-    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch, **unit)
+    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch)
 
 
 def camera_part(outcome: Outcome) -> AdjustedCamera | None:

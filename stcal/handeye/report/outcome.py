@@ -56,7 +56,6 @@ class Outcome:
     views : the corners after the same repair, if there were images
     folder : folder of the images; the pairs hold their names
     understood : how files of other programs were interpreted
-    unit_mm : unit that was assumed for a model without a unit, in mm: the camera's lengths were multiplied by it
     arm : the arm's parameters, if they were solved for
     time_offset : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ
     """
@@ -76,7 +75,6 @@ class Outcome:
     views: Views | None = None
     folder: Path | None = None
     understood: tuple[str, ...] = ()
-    unit_mm: float | None = None
     arm: ArmFound | None = None
     time_offset: TimeOffset | None = None
 

@@ -74,9 +74,6 @@ SIGMA_NAMES = {
 def scale_text(outcome: Outcome, sigma_scale: float) -> str:
     """Returns the estimated size of the board and its σ, in words."""
     result = outcome.result
-    if outcome.unit_mm is not None:
-        unit, sigma = outcome.unit_mm * result.scale, outcome.unit_mm * sigma_scale
-        return f"model: its unit is {unit:.6g} ± {sigma:.2g} mm"
     text = f"board: {result.scale:.5f} ± {sigma_scale:.5f} times its stated size"
     if outcome.pitch_mm is None:
         return text

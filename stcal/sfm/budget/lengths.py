@@ -13,8 +13,7 @@ from scipy.stats import norm
 
 from stcal.design import BoardDesign
 from stcal.errors import InputError
-from stcal.io.join import table_of
-from stcal.io.table import LENGTHS
+from stcal.io.table import LENGTHS, read_table
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
@@ -77,18 +76,17 @@ class LengthTest:
         return all(abs(length.e_n) <= self.limit * (1 + 1e-9) for length in self.lengths)
 
 
-def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> LengthTest:
+def against_stated(budget: Budget, path: Path) -> LengthTest:
     """Tests the run against lengths of a CSV file.
 
     Its columns are ``from``, ``to`` (circles as ``face:circle``), ``length_mm``, and ``sigma_mm``, the standard
-    uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact. ``columns`` : map of the columns, see
-    :func:`~stcal.io.poses.columns.read_mapped`.
+    uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact.
 
     Raises InputError if the file is not a table of lengths, a circle is not in the run, a length or σ is invalid, or
     the size of the run is not known.
     """
     _require_size(budget)
-    table = table_of(path, columns, WHAT)
+    table = read_table(path, WHAT)
     ends = list(zip(table.text("from"), table.text("to"), strict=True))
     length = table.quantity("length", LENGTHS)
     known = table.has("sigma", LENGTHS)

@@ -40,7 +40,6 @@ def uncertainty_budget(
     statement: str | Path | None = None,
     fields: Mapping[str, str] | None = None,
     check_lengths: str | Path | None = None,
-    columns: str | Path | None = None,
     lengths: AnyRun | None = None,
     lengths_statement: str | Path | None = None,
 ) -> UncertaintyBudget:
@@ -56,8 +55,6 @@ def uncertainty_budget(
         Fields of the head by name, such as ``{"operator": "A. Smith"}``; they override those of ``statement``.
     check_lengths : str or Path, optional
         File of lengths with which distances between circles are compared (CSV: from, to, length_mm, sigma_mm).
-    columns : str or Path, optional
-        Columns, delimiter … of ``check_lengths`` (TOML).
     lengths : str, Path, SavedRun or RunResult, optional
         A second calibration of the target, with which the longest distances are compared.
     lengths_statement : str or Path, optional
@@ -74,10 +71,6 @@ def uncertainty_budget(
         The run states no covariance or is damaged, a file is not of the required form, or an argument comes without the
         one that it belongs to.
     """
-    if columns is not None and check_lengths is None:
-        raise InputError(
-            "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of lengths; give it with --check-lengths"
-        )
     if lengths_statement is not None and lengths is None:
         raise InputError(
             "E-OPTION-NEEDS",
@@ -87,7 +80,7 @@ def uncertainty_budget(
     stated = statement_of(saved.board_design.stated, _path(statement), fields)
     budget, tests, others = budget_of_run(saved, stated), [], []
     if check_lengths is not None:
-        tests.append(against_stated(budget, Path(check_lengths), _path(columns)))
+        tests.append(against_stated(budget, Path(check_lengths)))
     if lengths is not None:
         second = saved_run(lengths)
         others.append(second)

@@ -110,10 +110,9 @@ def calibrate_handeye(
         As of :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     setup, options, offset = given.setup or "eye-in-hand", options or HandEyeOptions(), None
-    with_scale = options.with_scale or given.unit_mm is not None
     camera = given.prior if refine_camera else options.camera
-    options = replace(options, camera=camera, with_scale=with_scale, symmetries=given.symmetries)
-    if method is None and not (refine_camera or camera is not None or with_scale or options.four_dof):
+    options = replace(options, camera=camera, symmetries=given.symmetries)
+    if method is None and not (refine_camera or camera is not None or options.with_scale or options.four_dof):
         method = AUTO
     if time_offset:
         given, options, offset = at_offset(given, setup, options)
@@ -226,7 +225,6 @@ def calibrate(
             motions,
             solution.choice,
             understood=given.understood,
-            unit_mm=given.unit_mm,
             pairs=pairs,
             views=views,
             folder=given.folder,
@@ -510,7 +508,7 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
         For the reasons given in :func:`stcal.handeye.handeye`.
     """
     setup = given.setup or "eye-in-hand"
-    options = HandEyeOptions(with_scale=given.unit_mm is not None, symmetries=given.symmetries)
+    options = HandEyeOptions(symmetries=given.symmetries)
     result = handeye(given.pairs, setup, None, given.views, options)
     camera = outline = None
     if given.views is not None:

@@ -9,18 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.several import load_boards
-from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.inputs import Told, mapped_pairs, own_told, read_pairs, read_two, require_own
+from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
-from stcal.handeye.methods import closed_form
 from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
@@ -38,7 +37,6 @@ PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | Told
-Maps = tuple[Path | None, Path | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,10 +45,9 @@ class HandEyeInput:
 
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : where a file states it; ``unit_mm`` : approximate unit of a
-    model without a unit, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint
-    values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's
-    stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
+    file that is not a table of the package; ``setup`` : where a file states it; ``folder`` : of the images; ``arm`` :
+    at the joint values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in
+    the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
     """
 
     where: str
@@ -62,7 +59,6 @@ class HandEyeInput:
     left_out: tuple[tuple[str, str], ...] = ()
     understood: tuple[str, ...] = ()
     setup: Setup | None = None
-    unit_mm: float | None = None
     folder: Path | None = None
     arm: Arm | None = None
     timed: Timed | None = None
@@ -76,27 +72,23 @@ def one_source(
     statements: Said,
     quaternions: Order = "wxyz",
     timing: Timing = WITHOUT_OPTIONS,
-    columns: Maps = (None, None),
 ) -> tuple[Source, tuple[str, ...]]:
     """Returns the poses of two files, the robot's and the camera's, or of one, as one source; and notes on rows left
     out.
 
-    Two tables of the package's own are joined as tables. ``columns`` : maps of the columns of both files, or the second
-    that of the only one, where they are tables of other programs.
+    Two tables of the package's own are joined as tables.
 
     Raises InputError: as in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
     if second is None:
-        if columns[1] is not None and source.is_file():
-            return mapped_pairs(source, columns[1], statements, key, quaternions), ()
         return source, ()
-    told = read_two(source, second, statements, key, quaternions, timing.tolerance_s, timing.offset, columns)
+    told = read_two(source, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
     if told is not None:
         return told, ()
     for path in (source, second):
         require_own(path, quaternions)
     _require_unsaid(statements, f"{source}, {second}")
-    joined = join_tables(str(source), str(second), key, PREFIXES, quaternions, columns[1], columns[0])
+    joined = join_tables(str(source), str(second), key, PREFIXES, quaternions)
     return joined.table, joined.notes
 
 
@@ -125,11 +117,8 @@ def read_handeye(
     length_unit: Sequence[str] = (),
     poses_are: Sequence[str] = (),
     quaternions: Order = "wxyz",
-    columns: str | Path | None = None,
-    columns_a: str | Path | None = None,
     tolerance_s: float = TOLERANCE_S,
     image_times: str | Path | None = None,
-    times_columns: str | Path | None = None,
     time_offset: bool = False,
     robot: Robot | None = None,
     workers: int | None = None,
@@ -142,7 +131,7 @@ def read_handeye(
     source : str, Path or Table
         Folder of the photographs; a file of pairs of poses; or a file of the robot's poses, with ``second``.
     poses : str or Path, optional
-        The robot's poses at the photographs: a file, or a folder with a file for each.
+        The robot's poses at the photographs.
     camera, board : str or Path, optional
         Files of the camera and of the board, or boards, in the photographs.
     second : str or Path, optional
@@ -161,13 +150,10 @@ def read_handeye(
         ``camera_from_board`` or ``board_from_camera``.
     quaternions : {"wxyz", "xyzw"}
         As columns of quaternions are named, or x, y, z, w in the order in which they stand.
-    columns, columns_a : str or Path, optional
-        Columns, delimiter … (TOML) of the robot's poses beside photographs, of the only file, or of ``second``; and of
-        the first of two files.
     tolerance_s : float
         Time within which the nearest of the robot's poses is taken where none can be interpolated, s.
-    image_times, times_columns : str or Path, optional
-        Table of the times of photographs, and its columns (TOML).
+    image_times : str or Path, optional
+        Table of the times of photographs.
     time_offset : bool
         Whether the offset of the two clocks is to be estimated.
     robot : Robot, optional
@@ -189,15 +175,10 @@ def read_handeye(
         A file is missing or not of the required form, one file too many was given, or no image shows the board.
     """
     statements = Said.of_options(rotation, length_unit, poses_are, setup)
-    timing = Timing(tolerance_s, _path(image_times), time_offset, _path(times_columns))
+    timing = Timing(tolerance_s, _path(image_times), time_offset)
     place, told, notes = Path(source) if isinstance(source, str) else source, progress or (lambda *_: None), ()
-    if isinstance(place, Path) and place.is_dir():
-        statements = replace(statements, columns=_path(columns))
-    elif second is None and columns_a is not None:
-        raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with two files; give --columns")
-    elif isinstance(place, Path):
-        maps = _path(columns_a), _path(columns)
-        place, notes = one_source(place, _path(second), key, statements, quaternions, timing, maps)
+    if isinstance(place, Path) and not place.is_dir():
+        place, notes = one_source(place, _path(second), key, statements, quaternions, timing)
     files = _path(poses), _path(camera), _path(board)
     given = read_input(place, *files, workers, told, quaternions, statements, timing, robot)
     chosen = given.setup if setup is None else setup_of(statements, given.setup, given.where)
@@ -326,38 +307,15 @@ def setup_of(statements: Said, told: str | None, where: str) -> Setup:
 
 
 def _from_told(told: Told, statements: Said) -> HandEyeInput:
-    """Returns the input. Lengths of a model without a unit are brought to mm, approximately, by the robot's motions."""
-    setup, pairs, unit, understood = (
-        setup_of(statements, told.setup, told.pairs.where),
-        told.pairs,
-        None,
-        told.understood,
-    )
-    if told.scaled:
-        pairs, unit = _about_mm(pairs, setup)
-        understood = (*understood, "the model has no unit: --with-scale is implied; give --length-unit if it is metric")
+    setup = setup_of(statements, told.setup, told.pairs.where)
     return HandEyeInput(
-        pairs.where,
-        pairs,
+        told.pairs.where,
+        told.pairs,
         left_out=told.left_out,
-        understood=understood,
+        understood=told.understood,
         setup=setup if told.setup else None,
-        unit_mm=unit,
         timed=told.timed,
     )
-
-
-def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
-    """Returns the pairs with the camera's lengths in mm, and the factor, which is found from the robot's motions."""
-    scale = closed_form.robust(Loop.of(pairs, setup), True)[2]
-    if not scale > 0:
-        raise DegenerateError(
-            "E-HANDEYE-MODEL-SCALE",
-            f"{pairs.where}: the model's lengths do not follow the robot's motions; check that images and poses belong "
-            "together, and move the flange farther",
-        )
-    given = pairs.camera_from_board
-    return replace(pairs, camera_from_board=Poses(given.rotation, scale * given.translation)), scale
 
 
 def _from_images(
@@ -459,8 +417,6 @@ def dry_run(
     setup = setup_of(statements, inputs.setup, inputs.where)
     origin = "as you say" if statements.setup else "as the file says" if inputs.setup else "by default"
     lines += [f"setup: {setup}, {origin}", f"pairs: {len(inputs.pairs)}"]
-    if inputs.unit_mm is not None:
-        lines.append(f"scale: a unit of the model is about {inputs.unit_mm:.6g} mm by the robot's motions")
     lines += spread_text(inputs.pairs.base_from_flange, setup)
     return lines + [f"left out {name}: {reason}" for name, reason in inputs.left_out]
 

@@ -13,7 +13,6 @@ from stcal.handeye.data.formats.record import require_each_once
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
-from stcal.io.join import table_of
 from stcal.io.table import read_table
 from stcal.robot import Robot
 from stcal.robot.kinematics.dh import robot_from_chain
@@ -26,12 +25,11 @@ from stcal.robot.kinematics.model import Chain
 class Timing:
     """``tolerance_s`` : within which the nearest sample replaces a pose that cannot be interpolated; ``image_times`` :
     file with ``image`` and ``time_s``, where names of images are not times; ``offset`` : whether the clocks' offset is
-    estimated; ``times_columns`` : map of the columns of ``image_times``."""
+    estimated."""
 
     tolerance_s: float = TOLERANCE_S
     image_times: Path | None = None
     offset: bool = False
-    times_columns: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +119,7 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
     if timing.image_times is None:
         times = stamps_of(names)
         return None if times is None else dict(zip(names, times, strict=True))
-    table = table_of(timing.image_times, timing.times_columns, "image times")
+    table = read_table(timing.image_times, "image times")
     stated = dict(zip(table.text("image"), table.text("time_s"), strict=True))
     if len(stated) < len(table):
         raise InputError("E-TABLE-ROW-REPEATED", f"{table.where}: an image in two rows; one each needed")

@@ -201,13 +201,6 @@ def test_orientations_that_are_not_the_robots_are_refused_though_positions_fit(w
     start(robot, replace(data, rotations=third))  # the fit gives such rows no weight
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (0.1, "centimetres"), (1 / 25.4, "inches")])
-def test_another_unit_of_lengths_is_named(factor, unit):
-    data = seen(2, 30)
-    with fails_with(f"E-IDENTIFY-MISFIT … lengths are {unit} in columns of mm"):
-        start(mh80(), replace(data, positions=data.positions * factor))
-
-
 def test_rows_that_repeat_a_position_are_named():
     data = seen(2, 40)
     still = data.positions.copy()

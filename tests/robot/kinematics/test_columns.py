@@ -147,27 +147,18 @@ def test_notes_of_sweeps(data, stcal_robot):
 
 
 def test_a_trackers_file_beside_joint_values(data, stcal_robot):
-    """Semicolons, a name of another's for each column, metres."""
+    """Semicolons, another name for the key, metres."""
     names = [f"p{i}" for i in range(40)]
     rows = [
         [name, *map(repr, (position / 1000).tolist())]
         for name, position in zip(names, data.seen.positions, strict=True)
     ]
-    text = "\n".join(["Leica", "Name;East;North;Up", *map(";".join, rows)])
+    text = "\n".join(["Name;X [m];Y [m];Z [m]", *map(";".join, rows)])
     (data.folder / "tracker.txt").write_text(text)
-    keys = ('image = "Name"', 'x_m = "East"', 'y_m = "North"', 'z_m = "Up"')
-    (data.folder / "map.toml").write_text("\n".join(['delimiter = "semicolon"', "skip_lines = 1", "[columns]", *keys]))
     joints = [[name, *joint_cells(data.true, q)] for name, q in zip(names, data.seen.q, strict=True)]
     lines = [["image", *joint_columns(data.true)], *joints]
     (data.folder / "joints.csv").write_text("\n".join(map(",".join, lines)))
-    files = (
-        "--a",
-        data.folder / "joints.csv",
-        "--b",
-        data.folder / "tracker.txt",
-        "--columns",
-        data.folder / "map.toml",
-    )
+    files = ("--a", data.folder / "joints.csv", "--b", data.folder / "tracker.txt", "--key", "image=Name")
     code, printed, _ = stcal_robot("identify", *files, "--robot", data.folder / "robot.toml", "--folds", 0)
     assert code == 0
     assert "40 positions from joints.csv with tracker.txt, 27 parameters determined" in printed

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.quaternions import INVERTED
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
@@ -50,29 +48,6 @@ def rolled(poses: Poses) -> Poses:
 
 def times(poses: Poses, factor: float) -> Poses:
     return Poses(poses.rotation, factor * poses.translation)
-
-
-MISTAKES = {
-    "metres": (lambda p, q: (times(p, 1e-3), q), "mm if lengths were metres; call the columns x_m …"),
-    "inches": (lambda p, q: (times(p, 1 / 25.4), q), "mm if lengths were inches; call the columns x_in …"),
-    "inverse": (lambda p, q: (p.inverse(), q), "poses were inverse"),
-    "radians": (lambda p, q: (p, np.radians(q)), "joint values were radians in columns of degrees"),
-    "rows": (lambda p, q: (p, np.roll(q, 1, axis=0)), "joint values stood in other rows"),
-    "xyzw": (lambda p, q: (rolled(p), q), "x, y, z, w in the order of their columns; give --quaternions xyzw"),
-    "conjugated": (lambda p, q: (INVERTED.poses(p), q), "quaternions were conjugated"),
-}
-
-
-@pytest.mark.parametrize("name", MISTAKES)
-@pytest.mark.parametrize("seed", range(3))
-def test_joint_values_prove_what_is_wrong(name, seed):
-    nominal = arm(seed, size=(0.2, 1.0, 1.5)[seed])
-    wrong, says = MISTAKES[name]
-    poses, q = wrong(*reversed(commanded(nominal, 9, seed)))
-    for robot in (nominal, made(nominal, np.random.default_rng(seed))):
-        with pytest.raises(InputError, match="allowed") as caught:
-            on_targets(robot, targets(poses, q))
-        assert says in str(caught.value)
 
 
 @pytest.mark.slow

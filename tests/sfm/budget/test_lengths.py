@@ -56,21 +56,6 @@ def test_errors_over_their_uncertainty(budget, tmp_path, off_u, rows, beyond, ag
     assert against_stated(at_20, tmp_path / "lengths.csv").notes == ()
 
 
-def test_a_table_of_another_program_is_read_by_its_columns(budget, tmp_path):
-    lines = lengths_csv(tmp_path / "lengths.csv", budget, 0.5, 4).read_text().splitlines()[1:]
-    theirs = tmp_path / "theirs.txt"
-    theirs.write_text(
-        "made by a machine\nA;B;L;u\n" + "".join(f"{x}\n".replace(",", ";").replace(".", ",") for x in lines)
-    )
-    columns = tmp_path / "columns.toml"
-    columns.write_text(
-        'delimiter = "semicolon"\nskip_lines = 1\ndecimal_comma = true\n[columns]\nfrom = "A"\nto = "B"\n'
-        'length_mm = "L"\nsigma_mm = "u"\n'
-    )
-    found = against_stated(budget, theirs, columns)
-    assert [each.e_n for each in found.lengths] == pytest.approx([0.5] * 4, abs=1e-5)
-
-
 def test_lengths_without_sigma_are_exact(budget, tmp_path):
     path = lengths_csv(tmp_path / "lengths.csv", budget, 0.9, sigma_mm=0.0, head="from,to,length_mm")
     found = against_stated(budget, path)

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -21,7 +20,7 @@ FRAMES: dict[Role, tuple[str, str]] = {
 }
 """The transform that is needed for each side, and its inverse."""
 EVERY_FRAME = tuple(name for names in FRAMES.values() for name in names)
-MATRICES, MATRICES_3X4 = "4×4 matrices", "3×4 matrices"
+MATRICES = "4×4 matrices"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,6 @@ class Side:
     unit, frames : None where the file does not say
     names : image or timestamp of each pose; empty where there are none
     trajectory : whether poses are those of a moving body in a world, as in files of trajectories
-    scaled : whether the lengths have no unit at all, like those of a COLMAP model
     covariance : (m, 6, 6) covariances of the transforms of ``frames``, mm and rad
     common : (m, 6, k) errors that these transforms have in common, contained in their covariances
     """
@@ -72,7 +70,6 @@ class Side:
     frames: Frames | None = None
     names: tuple[str, ...] = ()
     trajectory: bool = False
-    scaled: bool = False
     covariance: np.ndarray | None = None
     common: np.ndarray | None = None
 
@@ -112,8 +109,7 @@ class Said:
 
     ``rotation`` : a name of :data:`stcal.io.poses.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
     :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup``;
-    ``own`` : rotation and unit of one role's poses, where they differ; ``columns`` : map of the columns of the robot's
-    poses beside images.
+    ``own`` : rotation and unit of one role's poses, where they differ.
     """
 
     rotation: str | None = None
@@ -121,7 +117,6 @@ class Said:
     frames: tuple[str, ...] = ()
     setup: str | None = None
     own: tuple[tuple[Role, str, str], ...] = ()
-    columns: Path | None = None
 
     @classmethod
     def of_options(
@@ -158,7 +153,7 @@ class Said:
         """Returns the statements that hold for poses of this role."""
         values = {name: value for entry_role, name, value in self.own if entry_role == role}
         rotation, unit = values.get("rotation", self.rotation), values.get("length_unit", self.length_unit)
-        return Said(rotation, unit, self.frames, self.setup, columns=self.columns)
+        return Said(rotation, unit, self.frames, self.setup)
 
     def options(self) -> list[str]:
         """Returns the names of the options that were given."""
@@ -186,12 +181,12 @@ class Said:
 
 
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rotations and translations of homogeneous matrices (m, 4, 4), or (m, 3, 4) without the last row.
+    """Returns the rotations and translations of homogeneous matrices (m, 4, 4).
 
     Raises InputError: a last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
     """
     require_finite(matrices, places, where)
-    bad = np.flatnonzero(np.abs(matrices[:, 3:] - [0, 0, 0, 1]).max(axis=(1, 2), initial=0.0) > 0)
+    bad = np.flatnonzero(np.abs(matrices[:, 3:] - [0, 0, 0, 1]).max(axis=(1, 2)) > 0)
     if len(bad):
         i = bad[0]
         turned = " (the last column is: the matrix is transposed)" if not matrices[i, :3, 3].any() else ""

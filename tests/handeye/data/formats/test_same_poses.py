@@ -1,13 +1,16 @@
-"""The same poses, written in each format, are read as the same poses."""
+"""The same poses, written in each format, are read as the same poses; other formats are refused."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stcal.errors import InputError
 from stcal.handeye.data.formats.record import Said
+from stcal.handeye.data.robot_poses import read_robot_poses
 from stcal.workflows.handeye.inputs import one_source, read_input
-from tests.handeye.written import FORMATS
+from tests.handeye.written import FORMATS, REFUSED
+from tests.outcome import fails_with
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 7).pairs
@@ -37,4 +40,31 @@ def test_every_format_gives_the_same_poses(name, tmp_path):
     ):
         assert np.abs(got.difference(wanted)).max() < ROUNDING
     assert len(found.understood) >= 2
-    assert (found.left_out, found.unit_mm) == ((), None)
+    assert found.left_out == ()
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_other_formats_are_refused_in_a_line(name, tmp_path):
+    """As the robot's poses beside images, as one of two files, and as pairs."""
+    path = tmp_path / "poses"
+    path.write_text(REFUSED[name])
+    np.save(tmp_path / "b.npy", np.array([pose.matrix() for pose in PAIRS.camera_from_board])[:1])
+    for call in (
+        lambda: read_robot_poses(path),
+        lambda: one_source(path, tmp_path / "b.npy", "image", Said(rotation="rotvec-rad", length_unit="m")),
+        lambda: read_input(path),
+    ):
+        with pytest.raises(InputError) as caught:
+            call()
+        message = str(caught.value)
+        assert "\n" not in message
+        assert str(path) in message
+
+
+def test_what_is_read_is_named_where_a_file_is_not_understood(tmp_path):
+    (tmp_path / "poses").write_text(REFUSED["camodocal"])
+    named = "frameCount, T1_0 … table … TUM … JSON, npy, npz … FileStorage … easy_handeye … MoveIt … p[x, y, z"
+    with fails_with(f"E-POSES-NOT-FOUND … {named}"):
+        read_robot_poses(tmp_path / "poses")
+    with fails_with("E-POSES-NOT-FOUND … a folder … a table"):
+        read_robot_poses(tmp_path)
