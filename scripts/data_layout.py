@@ -23,7 +23,7 @@ FILES = Path(__file__).resolve().parents[1] / "docs" / "reference" / "files"
 BLOCK = re.compile(r"(<!-- made by scripts/data_layout\.py: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 MODULES = (
     "stcal.sfm.adjust.file",
-    "stcal.sfm.runs.transaction",
+    "stcal.sfm.runs.marker",
     "stcal.sfm.runs.report",
     "stcal.sfm.measurement.report",
     "stcal.sfm.report.compare",

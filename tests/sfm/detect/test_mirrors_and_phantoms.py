@@ -71,8 +71,7 @@ def two_groups(scene, labels_only):
 
 
 def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_groups):
-    """It moves with the real one in all images. A face in it reads as face 3, turned from its rough pose; the board is in
-    view twice."""
+    """It moves with the real one. A face in it reads as face 3, turned from its rough pose; the board is seen twice."""
     own = two_groups[0]
     group = scene.groups["12"]
     up = group.axes[1]

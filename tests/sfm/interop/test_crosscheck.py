@@ -38,7 +38,7 @@ INSTALL = "install it with `sudo apt-get install colmap`"
 
 def state_of(folder) -> dict[str, str]:
     """Every file below a folder, and a digest of its content; the cache is no result."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.parent != folder / "cache"]
+    files = [path for path in folder.rglob("*") if path.is_file() and ".stcal/cache" not in path.as_posix()]
     return {path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files}
 
 
@@ -129,7 +129,7 @@ def test_only_the_report_and_its_hashes_change(checked):
     assert {name for name in after if after[name] != before.get(name)} == {"report.json", "report.html", RUN_MARKER}
     assert verify(run).notes() == []
     assert after.keys() == before.keys()
-    assert after["database.db"] == before["database.db"]
+    assert after["colmap/database.db"] == before["colmap/database.db"]
 
 
 def test_the_report_has_the_section_and_the_rest_stays(checked, small_run):
@@ -567,25 +567,25 @@ def never(tmp_path) -> Path:
 
 
 def test_a_database_in_use(own_run, refused, tmp_path):
-    with closing(sqlite3.connect(own_run / "database.db")) as other:
+    with closing(sqlite3.connect(own_run / "colmap/database.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
-        refused(never(tmp_path), INPUT, f"{own_run / 'database.db'}: in use by another program", "close it")
+        refused(never(tmp_path), INPUT, f"{own_run / 'colmap/database.db'}: in use by another program", "close it")
 
 
 def test_the_database_of_another_run(own_run, refused, tmp_path):
-    with closing(sqlite3.connect(own_run / "database.db")) as opened, opened:
+    with closing(sqlite3.connect(own_run / "colmap/database.db")) as opened, opened:
         opened.execute("PRAGMA journal_mode = DELETE")
         (data,) = opened.execute("SELECT data FROM keypoints WHERE image_id = 6").fetchone()
         opened.execute("UPDATE keypoints SET data = ? WHERE image_id = 6", [data[4:] + data[:4]])
-    where = f"{own_run / 'database.db'}: its keypoints of 14/IMG_1001.jpg are not those of"
+    where = f"{own_run / 'colmap/database.db'}: its keypoints of 14/IMG_1001.jpg are not those of"
     refused(never(tmp_path), INPUT, where, "labels.csv (up to", "px off, 0.002 allowed); run again")
 
 
 def test_a_database_with_other_images(own_run, refused, tmp_path):
-    with closing(sqlite3.connect(own_run / "database.db")) as opened, opened:
+    with closing(sqlite3.connect(own_run / "colmap/database.db")) as opened, opened:
         opened.execute("PRAGMA journal_mode = DELETE")
         opened.execute("UPDATE images SET name = 'other.jpg' WHERE image_id = 6")
-    refused(never(tmp_path), INPUT, f"{own_run / 'database.db'}: its keypoints of ", "run again")
+    refused(never(tmp_path), INPUT, f"{own_run / 'colmap/database.db'}: its keypoints of ", "run again")
 
 
 def test_a_run_that_is_none(own_run, stcal_sfm, tmp_path):

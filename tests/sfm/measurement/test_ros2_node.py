@@ -70,7 +70,7 @@ def node_module(monkeypatch):
 def server(small_run, small_scene):
     target = read_target(small_run / "faces.json", small_scene.target)
     object.__setattr__(target, "design", small_scene.target)
-    service = MeasureService(Setting(target, read_camera(small_run / "cameras.txt")), 1)
+    service = MeasureService(Setting(target, read_camera(small_run / "inputs/cameras.txt")), 1)
     with MeasureServer(service, ServeOptions(port=0)) as running:
         threading.Thread(target=running.serve_forever, daemon=True).start()
         yield running

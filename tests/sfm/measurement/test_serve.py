@@ -44,7 +44,7 @@ PATIENCE_S = 60.0
 def known(small_run, small_scene):
     target = read_target(small_run / "faces.json", small_scene.target)
     object.__setattr__(target, "design", small_scene.target)
-    return target, read_camera(small_run / "cameras.txt")
+    return target, read_camera(small_run / "inputs/cameras.txt")
 
 
 @pytest.fixture(scope="module")
@@ -484,7 +484,7 @@ def test_a_port_that_is_taken(server, known):
 
 @pytest.mark.parametrize(("words", "other"), [(["images"], "IMAGES"), (["--previous"], "--previous")])
 def test_what_belongs_to_a_folder_is_refused(small_run, stcal_sfm, words, other):
-    files = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json"]
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
     code, _, err = stcal_sfm("measure", *words, *files, "--serve")
     assert (code, err) == (
         2,
@@ -494,8 +494,8 @@ def test_what_belongs_to_a_folder_is_refused(small_run, stcal_sfm, words, other)
 
 @pytest.mark.slow
 def test_the_command_serves_this_machine_until_interrupted(small_run, photographs):
-    words = ["measure", "--serve", "--port", 0, "--workers", 1, "--camera", small_run / "cameras.txt"]
-    words += ["--faces", small_run / "faces.json", "--target", small_run / "target.toml"]
+    words = ["measure", "--serve", "--port", 0, "--workers", 1, "--camera", small_run / "inputs/cameras.txt"]
+    words += ["--faces", small_run / "faces.json", "--target", small_run / "inputs/target.toml"]
     program = [sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()", *map(str, words)]
     with subprocess.Popen(program, stdout=-1, stderr=-1, text=True) as running:
         line = running.stdout.readline()
