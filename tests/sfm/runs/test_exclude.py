@@ -11,7 +11,7 @@ from stcal.io.images import chosen_images
 from stcal.sfm.checks.verdict import Check, ranked
 from stcal.sfm.report.judgement import _first
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.text import _faces, _noted
+from stcal.sfm.runs.text import _noted
 from tests.outcome import INPUT, assert_error, fails_with
 
 CHECKS_FAILED = 4
@@ -100,17 +100,6 @@ def test_images_in_which_something_was_left_out_are_named():
         "report says what and why"
     )
     assert list(_noted(images[:3])) == lines[:3]
-
-
-def test_the_table_of_faces_fits_into_80_columns(small_result):
-    lines = list(_faces(small_result))
-    assert len(lines) > 3
-    assert max(map(len, lines)) <= 80
-    (name, x, y, z, *sigma) = lines[2].split()
-    assert len(sigma) == 6
-    assert [float(v) for v in (x, y, z)] == [
-        round(v, 4) for v in small_result.target.target_from_face[name].translation.tolist()
-    ]
 
 
 def test_of_failed_checks_those_that_name_an_image_come_first():
