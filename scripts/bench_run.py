@@ -236,7 +236,9 @@ def timed_calibration(out: Path) -> float:
 
     run = load_run(out)
     ids, px = image_ids(run.observations), run.corrected_px
-    models = [m for g in run.groups() for m in read_model(out / "models" / g, run.observations, ids, px).groups]
+    models = [
+        m for g in run.groups() for m in read_model(out / "colmap" / "models" / g, run.observations, ids, px).groups
+    ]
     prior = camera_prior(run.camera)
     start = time.perf_counter()
     calibrate(models, run.camera, run.target_design, run.board_design, run.options.adjustment(run.target_design), prior)

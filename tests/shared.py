@@ -91,8 +91,8 @@ def unsealed_copy(run: Path, to: Path, ignore: Callable | None = None) -> Path:
 
 def unseal(run: Path) -> None:
     """Remove the hashes of a run's files, so that edited ones are read."""
-    marker = json.loads((run / "stcal-run.json").read_text(encoding="utf-8"))
-    (run / "stcal-run.json").write_text(json.dumps(marker | {"sha256": None}), encoding="utf-8")
+    marker = json.loads((run / ".stcal/run.json").read_text(encoding="utf-8"))
+    (run / ".stcal/run.json").write_text(json.dumps(marker | {"sha256": None}), encoding="utf-8")
 
 
 @contextmanager

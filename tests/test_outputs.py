@@ -111,6 +111,7 @@ def test_calls_that_write_nothing_ask_for_nothing(tmp_path, monkeypatch):
 
 def test_a_file_beside_a_runs_own_is_written_again(tmp_path):
     for name in (RUN_MARKER, "advice.json", "faces.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("{}")
     keep_apart([("--json", tmp_path / "advice.json")], [("run", tmp_path)])
     for name in RUN_ENTRIES:

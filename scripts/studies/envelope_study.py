@@ -555,7 +555,7 @@ def board_turns(data: RenderedSet, mirrored: bool) -> list[np.ndarray]:
 
 def judge_labels(data: RenderedSet, pictures: dict[str, Picture], run: Path) -> dict:
     """Counts of circles and dots found, of those that must be, and of wrong labels, with examples."""
-    measured = read_detections(run / "detections.csv")
+    measured = read_detections(run / "labels.csv") or read_detections(run / "detections.csv")
     total = dict.fromkeys(("found", "must", "dots", "must_dots", "wrong"), 0)
     examples: list[str] = []
     for group in data.truth["groups"]:

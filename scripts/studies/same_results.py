@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 KEPT = {".json", ".csv", ".toml", ".txt", ".out"}
-PASSED_OVER = {"stcal-run.json", "cache", "overlays", "points3D.txt", "images.txt", "frames.txt"}
+PASSED_OVER = {".stcal", "overlays", "points3D.txt", "images.txt", "frames.txt"}
 LAYOUT_TAGS = range(17)
 
 CHARUCO = """type = "charuco"
@@ -171,7 +171,7 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
     add("plan", "sfm", "plan", "--images", "6", "--json", "@/plan.json")
     for kind in ("colmap-txt", "nvm", "bundler"):
         add(f"export_{kind}", "sfm", "export-model", sample, "@/model", "--format", kind)
-    add("faces", "sfm", "faces", demo / "run" / "models", "--run", demo / "run", "--out", "@/faces.json")
+    add("faces", "sfm", "faces", demo / "run" / "colmap" / "models", "--run", demo / "run", "--out", "@/faces.json")
     add("crosscheck", "sfm", "crosscheck", demo / "run")
 
     add(

@@ -69,35 +69,32 @@ def _too_large(path: str | Path, most: int) -> OSError:
     return OSError(errno.EFBIG, f"{size}, at most {most // MB} MB are read", str(path))
 
 
-RUN_MARKER = "stcal-run.json"
-"""Name of the file that marks the folder of a run."""
-CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
-"""Names of the copies of a run's inputs."""
-REFINED_CAMERA = "refined_cameras.txt"
-"""Name of the camera file with the intrinsics that a run refined, and their σ."""
-REPORT_PDF = "report.pdf"
-"""Name of the optional PDF of a run's report.html."""
+INTERNAL = ".stcal"
+"""Hidden folder in a run's folder: its marker, the cache for later runs, and results that are being written."""
+RUN_MARKER, CACHE = f"{INTERNAL}/run.json", f"{INTERNAL}/cache"
+"""File that marks the folder of a run, and what later runs use again."""
+CAMERA, TARGET, BOARD = "inputs/cameras.txt", "inputs/target.toml", "inputs/board.toml"
+"""Copies of a run's inputs."""
+DATABASE, MODELS, TARGET_MODEL = "colmap/database.db", "colmap/models", "colmap/target_model"
+"""COLMAP's database, its models by group, and the final model in mm in the target frame."""
+REFINED_CAMERA = "colmap/refined_cameras.txt"
+"""Camera file with the intrinsics that a run refined, and their σ."""
+REPORT_PDF, COMPARISON = "report.pdf", "compare.json"
+"""What `report --pdf` and `compare` add."""
 RUN_ENTRIES = (
-    RUN_MARKER,
     "faces.json",
     "report.json",
     "report.html",
     REPORT_PDF,
+    COMPARISON,
     "labels.csv",
     "detections.csv",
-    "database.db",
-    CAMERA,
-    REFINED_CAMERA,
-    TARGET,
-    BOARD,
-    "models",
-    "target_model",
     "overlays",
+    "colmap",
+    "inputs",
+    INTERNAL,
 )
-"""Files and folders of a run, in the order in which they are put in place; the marker file describes the others."""
-UNFINISHED, ADDED, READY, CACHE = "unfinished", "added", "ready", "cache"
-"""Folders inside a run's folder: files of an unfinished run, files that a command adds to a finished run, results that
-are ready to be put in place, and the cache for later runs."""
+"""Files and folders of a run or, ``detections.csv`` and ``overlays``, of a detection alone."""
 NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
 """Suffixes of outputs that no command reads from a folder. Besides a run's entries, commands read images, YAML poses,
 and COLMAP's models and databases from folders."""
@@ -239,10 +236,12 @@ def require_unchanged(path: str | Path) -> None:
     Files elsewhere, and those of runs without hashes, pass.
     """
     path = Path(path)
+    run = path.parent if (path.parent / RUN_MARKER).is_file() else path.parent.parent
+    name = path.relative_to(run).as_posix()
     try:
-        marker = json.loads(text_of(read_bytes(path.parent / RUN_MARKER, TABLE_BYTES)))
-        known = marker["sha256"][path.name]
-        found = own_digest(marker) if path.name == RUN_MARKER else digest_of(path)
+        marker = json.loads(text_of(read_bytes(run / RUN_MARKER, TABLE_BYTES)))
+        known = marker["sha256"][name]
+        found = own_digest(marker) if name == RUN_MARKER else digest_of(path)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return
     if found != known:
@@ -332,5 +331,5 @@ def _is_ours(place: Path, folder: Path) -> bool:
     a page.
     """
     if (folder / RUN_MARKER).exists():
-        return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, ADDED, READY, CACHE}
+        return place.relative_to(folder).parts[0] not in RUN_ENTRIES
     return place.name not in RUN_ENTRIES and place.suffix.lower() in NEVER_READ

@@ -49,6 +49,7 @@ from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.folder import overlays_beside, write_run
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -71,7 +72,7 @@ from stcal.sfm.runs.solve import (
     usable_groups,
     wrong_file,
 )
-from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
+from stcal.sfm.runs.transaction import frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""

@@ -11,7 +11,7 @@ from tests.fuzzing.judged import failures, hashes, in_process, lay_out
 from tests.fuzzing.mutations import MAY_BE_READ, REFUSED, mutations_of, not_permitted, pick
 from tests.shared import own_copy
 
-UNREAD = ("report.html", "detections.csv", "overlays", "compare.json", "no-colmap", "cache")
+UNREAD = ("report.html", "detections.csv", "overlays", "compare.json", "no-colmap", ".stcal/cache")
 """Of a run's folder: read by people alone, or by the next run alone."""
 BRIEF_S = 1.0
 """Processor time of a call up to which it is made with any mutation where time counts; else with one of ``REFUSED``."""
@@ -120,13 +120,13 @@ def _files(read: Path) -> list[Path]:
 
 def _kept(written: Path) -> list[Path]:
     """What an earlier run keeps for the next one."""
-    return sorted(written.glob("*/cache/*.npz"))
+    return sorted(written.glob("*/.stcal/cache/*.npz"))
 
 
 def _comes_first(path: Path, read: Path, call: Call) -> bool:
     """Whether a command that takes long says what is wrong with this file before its work."""
     own = read in path.parents and str(path.relative_to(read)) in call.inputs
-    return own or path.name in ("stcal-run.json", "faces.json")
+    return own or path.name in ("run.json", "faces.json")
 
 
 def _other_camera(stock: Path, read: Path, rng: np.random.Generator) -> None:

@@ -211,7 +211,7 @@ def _whole(written: Path, by_force: bool) -> list[tuple[str, str]]:
     """Every result that stands under its name is complete; what is left of a killed write has another name."""
     found = []
     for path in sorted(written.rglob("*")):
-        inside = {"unfinished", "ready", "cache", "scratch"} & set(path.relative_to(written).parts)
+        inside = {".stcal"} & set(path.relative_to(written).parts)
         if path.is_file() and not inside and not path.name.endswith(".partial") and path.read_bytes() != b"":
             reason = broken(path) if path.suffix in (".json", ".csv", ".html", ".svg", ".urdf") else ""
             if reason and path.read_text(errors="replace") != "of an earlier call\n":

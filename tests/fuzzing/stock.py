@@ -23,10 +23,12 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
+from stcal.sfm.data.model import detections_csv
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.pattern import make_pattern, sides_of
 from stcal.sfm.pipeline import RunOptions, run
-from stcal.sfm.runs.transaction import MarkerFile
+from stcal.sfm.runs.marker import MarkerFile
+from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph
@@ -103,11 +105,12 @@ def _of_runs(folder: Path) -> None:
     (folder / "faces.json").write_text(json.dumps({"format": "stcal faces 1"} | placed_faces, indent=1))
     export_model(folder / "run", folder / "model-txt", "colmap-txt")
     (folder / "detected").mkdir()
-    own_copy(folder / "run/cache", folder / "detected/cache")
-    own_copy(folder / "run/detections.csv", folder / "detected")
+    own_copy(folder / "run/.stcal/cache", folder / "detected/.stcal/cache")
+    seen = [image for group in load_run(folder / "run").groups().values() for image in group]
+    (folder / "detected/detections.csv").write_text(detections_csv(seen))
     marker = MarkerFile.of(folder / "data/images", None)
     sealed = marker.sealed({"detections.csv": digest_of(folder / "detected/detections.csv")})
-    (folder / "detected/stcal-run.json").write_text(json.dumps(sealed.content()))
+    (folder / "detected/.stcal/run.json").write_text(json.dumps(sealed.content()))
     (folder / "no-colmap").write_text("no program\n")
     own = make_pattern(sides_of((90.0, 80.0, 70.0))[:2], 9, 3.0, "dark", 1, "two plates").target
     (folder / "own.toml").write_text(target_toml(own))

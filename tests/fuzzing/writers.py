@@ -14,8 +14,8 @@ from tests.commands import Call
 TO_LOOK_AT = {".html", ".pdf", ".svg", ".png", ".jpg", ".gltf", ".glb"}
 """Suffixes of pages, drawings and scenes, from which no number is taken."""
 OF_A_RUN = {
-    *("stcal-run.json", "report.json", "labels.csv", "detections.csv", "database.db"),
-    *("models", "target_model", "overlays", "cache", "detections", "lock", "truth.json"),
+    *("report.json", "labels.csv", "detections.csv", "colmap", "inputs"),
+    *("overlays", ".stcal", "detections", "truth.json"),
 }
 """Files of a run that later commands of the same program read; COLMAP's are read again by the stage that writes them,
 and the faces are in ``faces.json``."""

@@ -44,7 +44,7 @@ def test_groups_and_order(tmp_path):
     for name in ("b/2.JPG", "b/1.png", "a ä/x y.tiff", "top.bmp", "b/notes.txt", ".hidden", "b/.DS_Store"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"x")
-    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / RUN_MARKER).parent.mkdir(parents=True)
     (tmp_path / "run" / RUN_MARKER).write_text("{}")
     (tmp_path / "run" / "picture.jpg").write_bytes(b"x")
     files, skipped = find_images(tmp_path)

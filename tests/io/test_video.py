@@ -140,7 +140,7 @@ def test_a_cube_that_turns_before_a_camera_is_calibrated(tmp_path):
     video = clip_of(frames, tmp_path / "clip.mp4")
     write_body(tmp_path / "set", replace(scene, camera_from_target=()))
     result = pipeline.run(video, None, tmp_path / "run", tmp_path / "set/target.toml")
-    numbers = [int(path.stem[-6:]) for path in sorted((tmp_path / "run/cache/frames").iterdir())]
+    numbers = [int(path.stem[-6:]) for path in sorted((tmp_path / "run/.stcal/cache/frames").iterdir())]
     assert 15 < len(numbers) < 60
     assert all(number % 3 for number in numbers)
     assert len(result.target.target_from_face) == 6

@@ -100,8 +100,8 @@ def small_set(small_dataset, small_run, tmp_path):
         for name in ("cameras.txt", "target.toml", "board.toml", "truth.json"):
             own_copy(small_dataset / name, own.folder / name)
         if detected:
-            own_copy(small_run / "cache", own.out / "cache")
-            own_copy(small_run / "stcal-run.json", own.out)
+            own_copy(small_run / ".stcal/cache", own.out / ".stcal/cache")
+            own_copy(small_run / ".stcal/run.json", own.out / ".stcal")
         return own
 
     return copy

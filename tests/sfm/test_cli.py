@@ -1,5 +1,6 @@
 """The commands as a user types them."""
 
+import csv
 import json
 import sys
 
@@ -217,8 +218,13 @@ def test_simulate_detect_run_compare(command, tmp_path):
     code, text, _ = command("run", data / "images", *files, "--out", out)
     assert code == 0
     assert "faces.json" in text
-    # Detection alone writes the same file as the whole run.
-    assert (tmp_path / "detect" / "detections.csv").read_text() == (out / "detections.csv").read_text()
+    # Detection alone finds the same circles as the whole run.
+    places = tmp_path / "detect" / "detections.csv", out / "labels.csv"
+    looked, used = (list(csv.DictReader(path.read_text().splitlines())) for path in places)
+    assert [(row["image"], row["label"]) for row in looked] == [(row["image"], row["label"]) for row in used]
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        [".stcal", "colmap", "faces.json", "inputs", "labels.csv", "overlays", "report.html", "report.json"]
+    )
     faces = json.loads((out / "faces.json").read_text())
     assert faces["unit"] == "mm"
     assert set(faces["target_from_face"]) == {"top", "left", "right"}
@@ -229,9 +235,9 @@ def test_simulate_detect_run_compare(command, tmp_path):
     assert "left" in text
     assert 0 < errors["worst"]["translation_um"] < 60
     # The same inputs again: nothing is detected anew, and the answer is the same to the last digit.
-    before = {p.name: p.stat().st_mtime_ns for p in (out / "cache").glob("*.npz")}
+    before = {p.name: p.stat().st_mtime_ns for p in (out / ".stcal/cache").glob("*.npz")}
     assert command("run", data / "images", *files, "--out", out)[0] == 0
-    assert {p.name: p.stat().st_mtime_ns for p in (out / "cache").glob("*.npz")} == before
+    assert {p.name: p.stat().st_mtime_ns for p in (out / ".stcal/cache").glob("*.npz")} == before
     assert json.loads((out / "faces.json").read_text()) == faces
 
 
@@ -269,5 +275,5 @@ def test_without_a_camera_the_board_tells_it(stcal_sfm, small_dataset, small_run
     code, told, _ = stcal_sfm("detect", small_dataset / "images", *designs, "--out", tmp_path / "look")
     assert code == 0
     assert "note: no --camera: found by the dots of the board, f " in told
-    with_camera = (small_run / "detections.csv").read_text().splitlines()
+    with_camera = (small_run / "labels.csv").read_text().splitlines()
     assert len((tmp_path / "look/detections.csv").read_text().splitlines()) == len(with_camera)

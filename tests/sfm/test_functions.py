@@ -104,8 +104,8 @@ def test_noise_of_run(small_run):
 
 def test_calibrate_models(stcal_sfm, small_run, tmp_path):
     one, two = tmp_path / "one.json", tmp_path / "two.json"
-    assert stcal_sfm("faces", small_run / "models", "--run", small_run, "--out", one)[0] == 0
-    found = sfm.calibrate_models(small_run / "models", small_run, out=two)
+    assert stcal_sfm("faces", small_run / "colmap/models", "--run", small_run, "--out", one)[0] == 0
+    found = sfm.calibrate_models(small_run / "colmap/models", small_run, out=two)
     assert one.read_bytes() == two.read_bytes()
     assert json.loads(one.read_text(encoding="utf-8"))["reference_face"] == found.target.reference_face
 

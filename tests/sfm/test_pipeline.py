@@ -69,22 +69,21 @@ def test_every_promised_file_is_there_and_agrees(small_result):
     for face_id, pose in result.target.target_from_face.items():
         np.testing.assert_array_equal(faces["target_from_face"][face_id], pose.matrix())
     np.testing.assert_allclose(faces["circles"]["1:1"], 0, atol=0.01)
-    with open(out / "detections.csv", newline="") as stream:
+    with open(out / "labels.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert list(rows[0]) == ["image", "label", "x_px", "y_px", "sigma_px"]
     assert len(rows) == sum(len(o) for o in result.observations())
     report = json.loads((out / "report.json").read_text())
     assert report["summary"]["images_mapped"] == 8
     assert len(report["groups"][0]["pairs"]) == 6
     assert (out / "report.html").stat().st_size > 100_000
-    assert {p.name for p in (out / "models").iterdir()} == {"12", "14"}
+    assert {p.name for p in (out / "colmap/models").iterdir()} == {"12", "14"}
     assert not list(out.rglob("*.partial"))
     assert not (out / "scratch").exists()
 
 
 def test_the_database_holds_corrected_centres_and_the_file_beside_it_both(small_result, tmp_path):
     result = small_result
-    own = own_copy(result.out / "database.db", tmp_path)  # pycolmap changes what it opens
+    own = own_copy(result.out / "colmap/database.db", tmp_path)  # pycolmap changes what it opens
     with open(result.out / "labels.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     moved = [
@@ -107,7 +106,7 @@ def test_any_colmap_makes_an_unbiased_model_of_the_database(small_result, tmp_pa
     ids = image_ids(observations)
     group = [o for o in observations if o.group == "12"]
     pairs = rank_pairs(group, result.camera, PairOptions())
-    own = own_copy(result.out / "database.db", tmp_path)  # pycolmap changes what it opens
+    own = own_copy(result.out / "colmap/database.db", tmp_path)  # pycolmap changes what it opens
     mapping = map_group(own, tmp_path / "scratch", group, list(ids), ids, pairs, result.camera)
     ours = next(s.model for s in result.solutions if s.model.group == "12")
     from dataclasses import replace

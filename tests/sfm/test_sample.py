@@ -111,7 +111,7 @@ def test_poses_of_the_target_are_as_far_off_as_they_say(calibrated, tmp_path):
     printed(
         *("measure", calibrated.images, "--camera", calibrated.truth.parent / "cameras.txt"),
         *("--faces", out / "faces.json"),
-        *("--board", out / "board.toml", "--out", tmp_path / "poses.csv", "--json", tmp_path / "poses.json"),
+        *("--board", out / "inputs/board.toml", "--out", tmp_path / "poses.csv", "--json", tmp_path / "poses.json"),
         *("--workers", 1),
     )
     poses = true_poses(calibrated.content())
@@ -155,7 +155,7 @@ def test_the_report_says_what_the_files_say(calibrated):
 def test_detections_are_where_the_truth_has_them(calibrated):
     """Ellipse centres against images of circle centres: eccentricity makes r²cosθ/D of difference, 0.1 px at most here
     (r = 7.5 mm, 1 m, f = 1678 px), noise a hundredth."""
-    with open(calibrated.out / "detections.csv", newline="", encoding="utf-8") as stream:
+    with open(calibrated.out / "labels.csv", newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if not row["label"].startswith("board")]
     images = {name: each for g in calibrated.content()["groups"].values() for name, each in g["images"].items()}
     true = np.array([images[row["image"]]["circles"][row["label"]]["centre_px"] for row in rows])

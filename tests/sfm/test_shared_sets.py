@@ -45,12 +45,12 @@ def test_no_label_is_wrong_and_the_visible_circles_are_found(rendered):
 def test_a_wrong_label_would_be_seen(rendered, tmp_path):
     """Two circles of one image swapped in a copy of the run: both are counted."""
     _, folder, out, _, _ = rendered
-    for file in ("faces.json", "detections.csv"):
+    for file in ("faces.json", "labels.csv"):
         (tmp_path / file).write_bytes((out / file).read_bytes())
-    rows = (tmp_path / "detections.csv").read_text().splitlines()
+    rows = (tmp_path / "labels.csv").read_text().splitlines()
     a, b = rows[1].split(","), rows[2].split(",")
-    rows[1], rows[2] = ",".join([a[0], b[1], *a[2:]]), ",".join([b[0], a[1], *b[2:]])
-    (tmp_path / "detections.csv").write_text("\n".join(rows))
+    rows[1], rows[2] = ",".join([*a[:4], b[4], *a[5:]]), ",".join([*b[:4], a[4], *b[5:]])
+    (tmp_path / "labels.csv").write_text("\n".join(rows))
     assert compare(tmp_path, folder / "truth.json").content()["labels"]["wrong"] == 2
 
 
@@ -91,7 +91,7 @@ def test_the_native_program_agrees(rendered):
         pytest.skip("native colmap is not on PATH")
     if name != "clean":
         pytest.skip("asked of the clean set")
-    before = hashlib.sha256((out / "database.db").read_bytes()).hexdigest()
+    before = hashlib.sha256((out / "colmap/database.db").read_bytes()).hexdigest()
     check = crosscheck(load_run(out)).model_dump()
     for key in ("mapping", "result"):
         assert check[key]["faces"].keys() == {"1", "2", "3", "4", "5"}
@@ -102,7 +102,7 @@ def test_the_native_program_agrees(rendered):
     assert check["images"]["native"] == check["images"]["pycolmap"] == 24
     # Two programs, not one twice: their iterations end at other places.
     assert max(row["translation_um"] for row in check["mapping"]["faces"].values()) > 1e-3
-    assert hashlib.sha256((out / "database.db").read_bytes()).hexdigest() == before
+    assert hashlib.sha256((out / "colmap/database.db").read_bytes()).hexdigest() == before
 
 
 @pytest.mark.slow

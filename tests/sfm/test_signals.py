@@ -128,7 +128,7 @@ def test_during_a_run(small_set, small_run, number, said, code, seconds):
     own_copy(small_run, small.out)
     command = [*SFM, *map(str, small.arguments()), "--workers", "2"]
     before = (small.out / "faces.json").read_bytes()
-    for path in (small.out / "cache").glob("*.npz"):
+    for path in (small.out / ".stcal/cache").glob("*.npz"):
         path.unlink()
     process = subprocess.Popen([*SFM_SAYING_ON, *command[len(SFM) :]], stdout=-1, stderr=-1, text=True)
     assert process.stdout.readline() == "on\n"  # until then a signal ends Python itself, with 1 and its own words
@@ -140,5 +140,5 @@ def test_during_a_run(small_set, small_run, number, said, code, seconds):
         assert lines[0].startswith(said)
     assert (small.out / "faces.json").read_bytes() == before
     subprocess.run(command, check=True, capture_output=True)
-    assert not (small.out / "unfinished").exists()
+    assert not (small.out / ".stcal/unfinished").exists()
     assert (small.out / "faces.json").read_bytes() == before

@@ -25,7 +25,7 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
-from stcal.io.files import RUN_MARKER, json_text, real_place, save
+from stcal.io.files import COMPARISON, RUN_MARKER, json_text, real_place, save
 
 if TYPE_CHECKING:
     from stcal.design import BoardDesign, TargetDesign
@@ -286,7 +286,7 @@ def compare(
     """Compare a run, or measured poses, with the known truth, as a table and as JSON."""
     from stcal.sfm.report.compare import compare as against
     from stcal.sfm.report.compare import compare_poses, comparison_table, poses_table
-    from stcal.sfm.runs.transaction import COMPARISON, added_results
+    from stcal.sfm.runs.transaction import added_results
 
     if run.suffix.lower() == ".csv":
         of_poses = compare_poses(run, truth)

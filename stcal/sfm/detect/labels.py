@@ -29,10 +29,11 @@ from stcal.sfm.detect.defocus import Focus, correct_defocus
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.group_geometry import (
     MAX_SHIFT_PITCHES,
+    MAX_TURN_RAD,
     Arrangement,
     across_groups,
     arrange,
-    mirrored_images,
+    as_drawn,
 )
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.outliers import outlying_circles
@@ -211,9 +212,10 @@ def without_defocus(
 def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
     """Returns the faces of a single image, for a target that may move from image to image."""
     labels, rows = detection.labelled_rows(target)
-    repeated = [f"{what} found more than once; left out" for what in detection.repeated]
     unnamed = [open_face_note(len(faces[0].rows), (each.face for each in faces)) for faces in detection.open_faces]
-    return labelled_image(name, group, labels, detection.centres.select(rows), [*detection.notes, *unnamed, *repeated])
+    return labelled_image(
+        name, group, labels, detection.centres.select(rows), [*detection.notes, *unnamed, *_repeated(detection)]
+    )
 
 
 def label_images(
@@ -360,38 +362,29 @@ def label_groups(
     focal_px: float,
 ) -> list[tuple[list[LabelledImage], Arrangement]]:
     """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels."""
-    patterns = patterns_of(target, board)
     step = step_mm(target, board)
     readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
-    reach = MAX_SHIFT_PITCHES * step
-    alone = [_arranged(readings_of_group, patterns, step, focal_px) for readings_of_group in readings]
-    mirrored = [mirrored_images(*each, patterns, reach) for each in zip(alone, readings, strict=True)]
-    for group, mirrored_rows in enumerate(mirrored):
-        if mirrored_rows:
-            readings[group] = [[] if i in mirrored_rows else each for i, each in enumerate(readings[group])]
-            alone[group] = _arranged(readings[group], patterns, step, focal_px)
-    labelled_groups = []
-    for images, readings_of_group, mirrored_rows, arrangement in zip(
-        groups, readings, mirrored, across_groups(alone, patterns, reach), strict=True
-    ):
-        labelled = [
-            _mirrored(*each, "the board")
-            if i in mirrored_rows
-            else _labelled(*each, likely_views(readings_of_group[i]), arrangement, i)
-            for i, each in enumerate(images)
-        ]
-        labelled_groups.append((labelled, arrangement))
-    return labelled_groups
+    alone = [as_drawn(_arranged(own, step, focal_px), target.rough_poses()) for own in readings]
+    return [
+        (
+            [
+                _labelled(*image, likely_views(own), arrangement, i)
+                for i, (image, own) in enumerate(zip(images, readings_of_group, strict=True))
+            ],
+            arrangement,
+        )
+        for images, readings_of_group, arrangement in zip(
+            groups, readings, across_groups(alone, MAX_SHIFT_PITCHES * step), strict=True
+        )
+    ]
 
 
-def _arranged(
-    readings: list[list[Readings]], patterns: dict[str, Pattern], step: float, focal_px: float
-) -> Arrangement:
+def _arranged(readings: list[list[Readings]], step: float, focal_px: float) -> Arrangement:
     """Returns the arrangement of one group. Readings with covered dots are used only if they explain more circles."""
-    likely = arrange([likely_views(each) for each in readings], patterns, step, focal_px)
+    likely = arrange([likely_views(each) for each in readings], step, focal_px)
     if not any(likely.contradicted.values()):
         return likely
-    every = arrange(readings, patterns, step, focal_px)
+    every = arrange(readings, step, focal_px)
     return every if every.explained() > likely.explained() else likely
 
 
@@ -415,13 +408,16 @@ def _labelled(
     image: int,
 ) -> LabelledImage:
     if detection.mirrored:
-        return _mirrored(name, group, detection, f"face {', '.join(detection.mirrored)}")
-    notes = list(detection.notes)
+        note = (
+            f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does; left out, turn it "
+            "back, or use the file that the camera wrote"
+        )
+        return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), [*detection.notes, note])
+    notes = [*detection.notes, *_repeated(detection)]
     if image in arrangement.views:
         views = list(arrangement.views[image])
         notes += [_contradiction(each) for each in arrangement.contradicted.get(image, ())]
         notes += [_open(each) for each in arrangement.open.get(image, ())]
-        notes += [_reflection(each) for each in arrangement.reflected.get(image, ())]
         notes += [_foreign(each) for each in arrangement.foreign.get(image, ())]
     else:
         views = [each[0] for each in readings if len(each) == 1 and each[0].named and _once(each[0], readings)]
@@ -432,12 +428,8 @@ def _labelled(
     return labelled_image(name, group, [labels[k] for k in order], detection.centres.select(rows[order]), notes)
 
 
-def _mirrored(name: str, group: str, detection: ImageDetection, shown: str) -> LabelledImage:
-    note = (
-        f"the image is mirrored: it shows {shown} as a mirror does; left out, turn it back, or use the file "
-        "that the camera wrote"
-    )
-    return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), [*detection.notes, note])
+def _repeated(detection: ImageDetection) -> list[str]:
+    return [f"{what} found more than once; left out, one may be a reflection" for what in detection.repeated]
 
 
 def _once(view: PlaneView, readings: list[Readings]) -> bool:
@@ -473,14 +465,9 @@ def _open(views: Readings) -> str:
     )
 
 
-def _reflection(view: PlaneView) -> str:
-    if view.plane == BOARD:
-        return f"a board of {len(view.rows)} dots: the image of the board in a mirror; left out"
-    return f"a pattern like face {view.plane}: the image of another face in a mirror; left out"
-
-
 def _foreign(view: PlaneView) -> str:
     return (
-        f"a pattern like face {view.plane}: not where other groups see that face against the others; left out, it is a "
-        "reflection or another object, or the image is mirrored"
+        f"a pattern like face {view.plane}: not where other groups see that face against the others, or turned from "
+        f"its rough_pose by more than {np.degrees(MAX_TURN_RAD):.0f}°; left out, it is a reflection or another object, "
+        "the image is mirrored, or rough_pose is wrong"
     )

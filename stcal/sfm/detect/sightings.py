@@ -13,7 +13,6 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label
 from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
 from stcal.sfm.data.model import Centres
-from stcal.sfm.data.patterns import Pattern
 
 SECOND_BOARD_SHARE = 0.8
 """Smallest number of dots of a second board, as a share of the dots of the first."""
@@ -142,14 +141,18 @@ Readings = list[PlaneView]
 
 
 def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
-    """Returns the readings of one image with their poses. Patterns with too few circles for a pose are omitted."""
+    """Returns the readings of one image with their poses.
+
+    Patterns with too few circles for a pose are omitted, and those that are in view twice: one may be a reflection.
+    """
     readings = []
-    for each in detection.faces:
+    ids = [each.face for each in detection.faces]
+    for each in (each for each in detection.faces if ids.count(each.face) == 1):
         readings.append([_face_view(each, target, detection, named=True)])
     for faces in detection.open_faces:
         candidates_of_pattern = [_face_view(each, target, detection, named=False) for each in faces]
         readings.append([view for view in candidates_of_pattern if view is not None])
-    if board is not None:
+    if board is not None and BOARD not in detection.repeated:
         for each in detection.boards:
             readings.append(_board_views(each, each.numberings, board, detection))
             covered = _board_views(each, each.unlikely, board, detection)
@@ -167,15 +170,6 @@ def _board_views(
 ) -> list[PlaneView | None]:
     labels = [tuple(DotLabel(*cell) for cell in cells.tolist()) for cells in numberings]
     return [_view(BOARD, own, each.rows, board.places_mm(own)[:, :2], detection) for own in labels]
-
-
-def flipped_pose(view: PlaneView, design_mm: np.ndarray) -> Rigid | None:
-    """Returns the pose of a board that appears mirrored, for a camera with reversed X; None if there is no pose.
-
-    ``design_mm`` : (m, 2) all dots of the board.
-    """
-    xy_mm = np.column_stack([design_mm[:, 0].min() + design_mm[:, 0].max() - view.xy_mm[:, 0], view.xy_mm[:, 1]])
-    return _pose(xy_mm, view.xy * [-1, 1])
 
 
 def _face_view(each: FaceSighting, target: TargetDesign, detection: ImageDetection, named: bool) -> PlaneView | None:
@@ -310,11 +304,9 @@ def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
     return {face: others for face, others in found.items() if others}
 
 
-def mirrored_as(face: FaceDesign | Pattern, other: FaceDesign | Pattern) -> tuple[np.ndarray, ...]:
+def mirrored_as(face: FaceDesign, other: FaceDesign) -> tuple[np.ndarray, ...]:
     """Returns the circles of a face's mirror image that pass for circles of another, see
     :func:`~stcal.lookalikes.mirrored_circles`.
-
-    This rule serves for a design before photographs are taken, and for the faces of a group.
     """
     return _mirrored_as(*(a.tobytes() for a in (face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)))
 

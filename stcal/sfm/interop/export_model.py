@@ -15,6 +15,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
+from stcal.io.files import TARGET_MODEL
 from stcal.io.json import Part
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
@@ -134,7 +135,6 @@ def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel
 ModelFormat = Literal["colmap-bin", "colmap-txt", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")
 """Formats of several files, for which OUT is a folder. The others are a file, with ``OUT.labels.csv`` beside it."""
-TARGET_MODEL = "target_model"
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 
 

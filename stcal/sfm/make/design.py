@@ -16,7 +16,6 @@ from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.design import load_board, save_design
-from stcal.io.files import BOARD, TARGET
 from stcal.parallel import Progress
 from stcal.sfm.data.patterns import MAX_TILT_RAD
 from stcal.sfm.detect.circles.candidates import EllipseOptions, diameter_limits_px
@@ -354,7 +353,7 @@ def _free(out: str | Path | None) -> tuple[Path | None, Path | None]:
     """Returns the places of the two files in a folder, in which there must be no target yet."""
     if out is None:
         return None, None
-    target_file = Path(out) / TARGET
+    target_file = Path(out) / "target.toml"
     if os.path.lexists(target_file):
         raise InputError("E-OUTPUT-EXISTS", f"{target_file}: exists; move it away, or give another folder")
-    return target_file, Path(out) / BOARD
+    return target_file, Path(out) / "board.toml"

@@ -21,7 +21,8 @@ from stcal.report.text import NONE, number, text_table
 from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
 
 FACES = "faces.json"
-DETECTIONS = "detections.csv"
+LABELS = ("labels.csv", "detections.csv")
+"""Labels of a run, and of a detection alone."""
 NEAR_PX = 1.5
 """Largest distance of a label's ellipse centre from the image of the circle's centre, in px, at which the label is
 right. Eccentricity makes 0.2."""
@@ -153,7 +154,10 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         for face_id in known.target_from_face
         if face_id in answer.target_from_face
     }
-    labels = _labels(run / DETECTIONS, known.circles, known.groups) if run.is_dir() and known.groups else None
+    labels = None
+    if run.is_dir() and known.groups:
+        own = next((run / name for name in LABELS if (run / name).exists()), run / LABELS[0])
+        labels = _labels(own, known.circles, known.groups)
     worst = {
         name: max((value for errors in faces.values() if (value := getattr(errors, name)) is not None), default=None)
         for name in LargestErrors.model_fields
@@ -269,7 +273,7 @@ def _require_same_unit(where: str, kind: str, true: float, measured: float, side
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
-    """Counts the labels of ``detections.csv`` against the truth.
+    """Counts the labels of a run or a detection against the truth.
 
     A board's numbers are known up to its own symmetry, but only for a whole group at once.
     """

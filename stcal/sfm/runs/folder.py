@@ -22,11 +22,14 @@ from stcal.io.cameras.write import save_camera
 from stcal.io.files import (
     BOARD,
     CAMERA,
+    DATABASE,
+    MODELS,
     REFINED_CAMERA,
     REPORT_PDF,
     RUN_MARKER,
     TABLE_BYTES,
     TARGET,
+    TARGET_MODEL,
     json_text,
     read_bytes,
     save,
@@ -111,13 +114,6 @@ def overlay_path(out: Path, name: str) -> Path:
     return out / "overlays" / f"{group}{slash}{file_name}{suffix}"
 
 
-def _overlay_in(run: Path, name: str) -> Path:
-    """Returns the path of an overlay in a finished run; earlier versions wrote ``.jpg`` after the suffix of a JPEG."""
-    path = overlay_path(run, name)
-    earlier = path.with_name(f"{path.name}.jpg")
-    return earlier if earlier.is_file() else path
-
-
 def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     """Writes database, models, faces and report into a folder that holds the overlays; returns the judgement.
 
@@ -127,13 +123,14 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
     corrected = _corrected_px(models, observations)
-    write_database(out / "database.db", result.camera, observations, result.graph.pairs, corrected)
+    (out / DATABASE).parent.mkdir()
+    write_database(out / DATABASE, result.camera, observations, result.graph.pairs, corrected)
     save(out / "labels.csv", labels_csv(observations, corrected, residuals_px(result)))
     for name, model in models.items():
-        folder = out / "models" / name  # "models/." where the images lie directly in their folder
+        folder = out / MODELS / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera)
     adjusted = Camera.of(result.calibration.camera, result.camera.colmap_model)
-    write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
+    write_model(out / TARGET_MODEL, result.calibration.models, observations, ids, adjusted)
     save_camera(out / CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
         save_camera(out / REFINED_CAMERA, refined)
@@ -147,6 +144,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
         save(out / "faces.json", json_text(faces.content()))
         require_faces_written(out / "faces.json", result.target)
     write_report(out, report, out)
+    (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
     progress("report", 1, 1)
     return Judgement.model_validate(report["judgement"])
 
@@ -215,12 +213,7 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
     if pdf:
         require_pdf()
     complete_interrupted(run)
-    try:
-        notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
-    except InputError as error:
-        if error.code != "E-RUN-UNFINISHED":  # without hashes nothing can be compared
-            raise
-        notes = ()
+    notes = tuple(verify(run).notes(but=("report.html", REPORT_PDF)))
     if out is not None:
         return ReportAgain(*_page_and_pdf(run, pdf, out), notes)
     with added_results(run) as stage:
@@ -238,7 +231,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
         raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     with _as_written(path):
         shown = shown_overlays(report)
-        overlays = {name: overlay.read_bytes() for name in shown if (overlay := _overlay_in(run, name)).is_file()}
+        overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
     with _as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
@@ -251,17 +244,17 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
 
 
 def _report_page(run: Path, report: dict) -> bytes:
-    overlays = {name: _overlay_in(run, name).read_bytes() for name in shown_overlays(report)}
+    overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
     return report_html(report, overlays, _residuals(run, list(overlays))).encode("utf-8", "backslashreplace")
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
-    """Returns centres and residuals of these images from ``labels.csv``; empty if an older version kept none."""
+    """Returns centres and residuals of these images from ``labels.csv``."""
     path = run / "labels.csv"
     rows: dict[str, list[list[float]]] = {name: [] for name in names}
     try:
         for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
-            if row["image"] in rows and row.get("residual_x_px"):
+            if row["image"] in rows and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
                 rows[row["image"]].append(values)
     except (LookupError, TypeError, ValueError, csv.Error) as error:

@@ -20,7 +20,17 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
-from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes, require_unchanged
+from stcal.io.files import (
+    BOARD,
+    CAMERA,
+    DATABASE,
+    RUN_MARKER,
+    TABLE_BYTES,
+    TARGET,
+    TARGET_MODEL,
+    read_bytes,
+    require_unchanged,
+)
 from stcal.io.json import Part, checked, read_json
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
@@ -33,10 +43,11 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, read_model
 from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.transaction import MarkerFile, complete_interrupted
+from stcal.sfm.runs.transaction import complete_interrupted
 
 AGAIN = "run it again"
 ReportPart = TypeVar("ReportPart", bound=Part)
@@ -68,7 +79,7 @@ class SavedRun(Brief):
     @property
     def database(self) -> Path:
         """Path of COLMAP's database."""
-        return self.folder / "database.db"
+        return self.folder / DATABASE
 
     @property
     def target(self) -> CalibratedTarget:
@@ -191,7 +202,7 @@ def load_run(folder: str | Path) -> SavedRun:
         TARGET,
         *(() if without_board else (BOARD,)),
         "labels.csv",
-        "database.db",
+        DATABASE,
         "report.json",
         "faces.json",
     )
@@ -223,7 +234,7 @@ def load_run(folder: str | Path) -> SavedRun:
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
         board = with_edge_sigma(board, observations)
     for name in (RUN_MARKER, *needed):
-        if name != "database.db":  # SQLite writes to it when it is read
+        if name != DATABASE:  # SQLite writes to it when it is read
             require_unchanged(folder / name)
     return SavedRun(
         folder=folder,
@@ -325,7 +336,7 @@ def read_target_model(run: SavedRun) -> ReadModel:
     Raises InputError: it is missing or damaged.
     """
     ids = image_ids(run.observations)
-    return read_model(run.folder / "target_model", run.observations, ids, run.corrected_px, corrected_again=True)
+    return read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
 
 
 def adjusted_run(run: SavedRun) -> AdjustedRun:
@@ -334,7 +345,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     Raises
     ------
     InputError
-        The run's ``target_model`` is missing or damaged.
+        The run's final model is missing or damaged.
     ConvergenceError
         The adjustment finds no minimum.
     """

@@ -1,95 +1,39 @@
-"""The folder of a run as a transaction, with the marker that holds the hashes of its files."""
+"""The folder of a run: results are written aside, and take the places of the earlier ones all together.
+
+They are written into a hidden folder inside, which is renamed when they are complete; from then on they are moved to
+their places one by one. Whoever opens the folder next finishes that if the process was killed meanwhile.
+"""
 
 import os
 import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import filelock
-from pydantic import Field
 
-import stcal
 from stcal.errors import InputError, StcalError
-from stcal.io.files import (
-    ADDED,
-    CACHE,
-    READY,
-    REPORT_PDF,
-    RUN_ENTRIES,
-    RUN_MARKER,
-    UNFINISHED,
-    digest_of,
-    json_text,
-    own_digest,
-    real_place,
-    save,
-)
-from stcal.io.json import ResultFile, read_result
-from stcal.sfm.runs.options import RunOptions
+from stcal.io.files import CACHE, INTERNAL, REPORT_PDF, RUN_ENTRIES, RUN_MARKER, digest_of, json_text, real_place, save
+from stcal.io.json import read_result
+from stcal.sfm.runs.marker import MarkerFile
 
-ByFile = Annotated[str, "file"]
-
-
-class MarkerFile(ResultFile):
-    """Marker of a run's folder: the input of the run, and the hashes of its files."""
-
-    program: Literal["stcal-sfm"] = Field(description="that made the folder")
-    version: str = Field(description="of stcal")
-    images: str = Field(description="the folder of photographs")
-    options: dict[str, Any] | None = Field(description="of the run; null for `detect`")
-    sha256: dict[ByFile, str] | None = Field(
-        default=None,
-        description="path below the folder → SHA-256 (hex) of every file of the results, and of this one without its "
-        "own entry; absent until the run has ended well",
-    )
-
-    @classmethod
-    def of(cls, images: str | Path, options: RunOptions | None) -> "MarkerFile":
-        """Returns the marker of a run, or of a detection alone, that begins."""
-        return cls(
-            program="stcal-sfm",
-            version=stcal.__version__,
-            images=str(Path(images).absolute()),
-            options=None if options is None else asdict(options),
-        )
-
-    def sealed(self, digests: dict[str, str]) -> "MarkerFile":
-        """Returns the marker of results with these hashes, which include its own."""
-        others = {name: value for name, value in digests.items() if name != RUN_MARKER}
-        content = self.model_copy(update={"sha256": others}).content()
-        return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
-
-
-def files_below(folder: Path) -> Iterator[str]:
-    """Yields the paths of all files and links below a folder, with forward slashes; links are not followed."""
-    for place, folders, files in os.walk(folder):
-        for name in (*files, *(subfolder for subfolder in folders if os.path.islink(os.path.join(place, subfolder)))):
-            yield (Path(place) / name).relative_to(folder).as_posix()
-
-
-COMPARISON = "compare.json"
-RESULTS = (*RUN_ENTRIES, COMPARISON)
+STAGE, READY, HOLDER = f"{INTERNAL}/unfinished", f"{INTERNAL}/ready", f"{INTERNAL}/holder.txt"
+"""Results that are being written, results that are complete, and who writes."""
+GONE = "gone.txt"
+"""Names of the earlier results that complete ones lack."""
+RESULTS = tuple(name for name in RUN_ENTRIES if name != INTERNAL)
 """Entries that new results replace, or remove if the new results lack them."""
-HOLDER, ENTRIES, LOCK = "holder.txt", "entries.txt", "lock"
-LONGEST_DATABASE, MOST_DATABASE_BYTES = "scratch/mapping.db.partial-journal", 500
-"""Longest path of a database below the folder of an unfinished run, and the longest that SQLite takes (512, of which it
-keeps a few)."""
 LOOKED_AT = ("detections.csv", "overlays")
 """Results of a run that fails which help to see why, and claim nothing."""
-DATABASE_SIDES = ("-wal", "-shm", "-journal")
+LONGEST_DATABASE, MOST_DATABASE_BYTES = f"{STAGE}/scratch/mapping.db.partial-journal", 500
+"""Longest path of a database below a run's folder, and the longest that SQLite takes (512, of which it keeps a few)."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """Folder of a run in progress.
-
-    ``out`` : the folder as requested; ``stage`` : folder to which results are written; ``cache`` : folder of results
-    that later runs use again.
-    """
+    """Folder ``out`` of a run in progress: results are written to ``stage``, and ``cache`` is for later runs."""
 
     out: Path
     stage: Path
@@ -100,126 +44,143 @@ class RunFolder:
 def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object]) -> Iterator[RunFolder]:
     """Claims a run's folder; at the end of the block its results take the place of the earlier ones.
 
-    If the block raises, earlier results stay, and the files that it made are left in ``unfinished/``. If there are no
-    earlier results, the detections and their overlays take their places all the same, to be looked at.
+    If the block raises, earlier results stay. Without earlier ones, detections and overlays are left to be looked at.
+    ``content`` : the marker; ``inputs`` : what the run reads, by the word for it; what is no path is ignored.
 
-    Parameters
-    ----------
-    out : folder that is new, empty, or of an earlier run
-    content : the marker
-    inputs : what the run reads, by the word for it; values that are no paths are ignored
-
-    Raises
-    ------
-    InputError
-        The folder holds something else, an input, or a run in progress.
+    Raises InputError: the folder holds something else, an input, or a run in progress.
     """
     out = Path(out)
-    _require_short(out)
-    folder = RunFolder(out, out / UNFINISHED, out / CACHE)
+    length = len(os.fsencode(Path(real_place(out)) / LONGEST_DATABASE))
+    if length > MOST_DATABASE_BYTES:
+        raise InputError(
+            "E-OUTPUT-LENGTH",
+            f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most; give a "
+            "shorter --out",
+        )
     require_ours(out)
-    _require_no_inputs(out, inputs)
-    with _locked(out):
-        with _writable(out):
-            complete(out)
-            if not (out / RUN_MARKER).exists():
-                save(out / RUN_MARKER, json_text(content.content()))
-            _make_empty(folder.stage)
+    place, frames = real_place(out), real_place(frames_folder(out))  # the run itself has put frames there
+    for word, given in inputs.items():
+        read = real_place(given) if isinstance(given, str | Path) else frames
+        if read != frames and place in (read, *read.parents):
+            raise InputError(
+                "E-OUTPUT-IS-INPUT",
+                f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
+                "or give another --out",
+            )
+    with _staged(out) as stage:
+        if not (out / RUN_MARKER).exists():
+            save(out / RUN_MARKER, json_text(content.content()))
+        earlier = _finished(out)
         try:
-            yield folder
+            yield RunFolder(out, stage, out / CACHE)
         except BaseException as error:
-            _leave(folder, content, error)
+            if earlier and isinstance(error, StcalError) and any(stage.iterdir()):
+                error.append("; the earlier results stay")
+            for name in () if earlier else RESULTS:
+                remove(out / name)
+                if name in LOOKED_AT and (stage / name).exists():
+                    os.replace(stage / name, out / name)
             raise
-        with _writable(out):
-            _exchange(folder.stage, out, content.sealed(_digests(folder.stage)), [])
+        _exchange(out, content.sealed(_digests(stage)), [name for name in RESULTS if not (stage / name).exists()])
 
 
 @contextmanager
 def added_results(out: Path) -> Iterator[Path]:
-    """Provides a folder for files that are added to a finished run, or that replace some of its own.
+    """Provides a folder for files that are added to a finished run at the end of the block, or replace some of its own.
 
-    At the end of the block the files take their places, and the marker gets their hashes. No other command writes
-    meanwhile. The PDF of a report that is replaced is removed.
+    No other command writes meanwhile. The PDF of a report that is replaced is removed.
 
-    Raises
-    ------
-    InputError
-        Another process is writing there, or the folder is read-only.
+    Raises InputError: another process is writing there, or the folder is read-only.
     """
-    stage = out / ADDED
-    with _locked(out):
-        with _writable(out):
-            complete(out)
-            _make_empty(stage)
-        try:
-            yield stage
-            marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
-            gone = {REPORT_PDF} if (stage / "report.html").exists() else set()
-            if marker.sha256 is not None:  # None in a version that kept no hashes
-                others = {name: digest for name, digest in marker.sha256.items() if name not in gone}
-                marker = marker.sealed(others | _digests(stage))
-            with _writable(out):
-                kept_names = [name for name in RESULTS if name not in gone and os.path.lexists(out / name)]
-                _exchange(stage, out, marker, kept_names)
-        finally:
-            remove(stage)
+    with _staged(out) as stage:
+        yield stage
+        marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+        gone = [REPORT_PDF] if (stage / "report.html").exists() and not (stage / REPORT_PDF).exists() else []
+        if marker.sha256 is not None:
+            kept = {name: digest for name, digest in marker.sha256.items() if name not in gone}
+            marker = marker.sealed(kept | _digests(stage))
+        _exchange(out, marker, gone)
 
 
-def _exchange(stage: Path, out: Path, marker: MarkerFile, kept: Sequence[str]) -> None:
-    """Moves the files of a complete folder to their places; ``kept`` : earlier results that stay if not replaced."""
-    save(stage / RUN_MARKER, json_text(marker))
-    save(stage / ENTRIES, "\n".join([*kept, *(path.name for path in stage.iterdir())]))
-    os.replace(stage, out / READY)
-    complete(out)
+@contextmanager
+def _staged(out: Path) -> Iterator[Path]:
+    """Locks the folder against other commands until the block ends, and provides an empty folder for new results."""
+    _require_no_link(out)
+    lock = filelock.FileLock(out / INTERNAL / "lock")  # the system releases it when the process ends
+    try:
+        (out / CACHE).mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+        complete(out)
+        remove(out / STAGE)
+        (out / STAGE).mkdir()
+    except filelock.Timeout as error:
+        holder = "another process"
+        with suppress(OSError, ValueError):
+            holder = (out / HOLDER).read_text(encoding="utf-8").strip() or holder
+        raise InputError(
+            "E-OUTPUT-IN-USE",
+            f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out",
+        ) from error
+    except OSError as error:
+        lock.release()
+        raise _unwritable(out, error) from error
+    try:
+        with suppress(StcalError):  # it only says to others who writes here
+            save(out / HOLDER, f"process {os.getpid()} on {socket.gethostname()}\n")
+        yield out / STAGE
+    finally:
+        remove(out / STAGE)
+        lock.release()
+
+
+def _finished(out: Path) -> bool:
+    """True if the folder holds the results of a run, or of a detection alone, that came to its end."""
+    with suppress(InputError):
+        if read_result(out / RUN_MARKER, MarkerFile, "run", "run it again").sha256 is not None:
+            return True
+    return (out / "faces.json").exists()
 
 
 def _digests(stage: Path) -> dict[str, str]:
-    """Returns the hashes of all results in a folder."""
     names = sorted(name for name in files_below(stage) if name.split("/")[0] in RESULTS)
     return {name: digest_of(stage / name) for name in names}
 
 
-@contextmanager
-def _writable(out: Path) -> Iterator[None]:
+def _exchange(out: Path, marker: MarkerFile, gone: Sequence[str]) -> None:
+    """Puts new results in place of earlier ones; ``gone`` : earlier results that the new ones lack."""
+    save(out / STAGE / Path(RUN_MARKER).name, json_text(marker))
+    save(out / STAGE / GONE, "\n".join(gone))
     try:
-        yield
+        os.replace(out / STAGE, out / READY)
+        complete(out)
     except OSError as error:
         raise _unwritable(out, error) from error
 
 
-def _unwritable(out: Path, error: OSError) -> InputError:
-    return InputError("E-OUTPUT-UNWRITABLE", f"output folder {out}: {error.strerror or error}; give a writable folder")
+def complete(out: Path) -> None:
+    """Moves results that are ready to their places, and at last their marker; the folder must be locked."""
+    ready = out / READY
+    if (ready / GONE).is_file():
+        gone = (ready / GONE).read_text(encoding="utf-8").split()
+        for name in RESULTS:
+            if os.path.lexists(ready / name) or name in gone:
+                remove(out / name)
+            if os.path.lexists(ready / name):
+                os.replace(ready / name, out / name)
+        with suppress(FileNotFoundError):  # moved already
+            os.replace(ready / Path(RUN_MARKER).name, out / RUN_MARKER)
+    remove(ready)
 
 
 def complete_interrupted(out: Path) -> None:
-    """Completes a finished run that was killed while its results took their places; call it before the run is read.
-
-    Raises
-    ------
-    InputError
-        Another process is writing there.
-    """
+    """Completes a finished run that was killed while its results took their places; call it before the run is read."""
     if (out / READY).exists():
-        with _locked(out), _writable(out):
-            complete(out)
+        with _staged(out):
+            pass
 
 
-def complete(out: Path) -> None:
-    """Moves results that are ready to their places; the folder must be locked."""
-    ready = out / READY
-    if ready.is_symlink() or not (ready / ENTRIES).is_file():
-        return
-    new = (ready / ENTRIES).read_text(encoding="utf-8").split()
-    for name in RESULTS:
-        if (ready / name).exists():
-            if (ready / name).is_dir() or not (out / name).is_file():
-                remove(out / name)
-            os.replace(ready / name, out / name)
-        elif name not in new:
-            remove(out / name)
-    for side in DATABASE_SIDES:
-        remove(out / f"database.db{side}")
-    remove(ready)
+def _unwritable(out: Path, error: OSError) -> InputError:
+    return InputError("E-OUTPUT-UNWRITABLE", f"output folder {out}: {error.strerror or error}; give a writable folder")
 
 
 def remove(path: Path) -> None:
@@ -228,6 +189,13 @@ def remove(path: Path) -> None:
         path.unlink()
     elif path.is_dir():
         shutil.rmtree(path)
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """Yields the paths of all files and links below a folder, with forward slashes; links are not followed."""
+    for place, folders, files in os.walk(folder):
+        for name in (*files, *(below for below in folders if os.path.islink(os.path.join(place, below)))):
+            yield (Path(place) / name).relative_to(folder).as_posix()
 
 
 def frames_folder(out: str | Path) -> Path:
@@ -239,110 +207,16 @@ def require_ours(out: Path) -> None:
     """Raises an error if a folder is neither new, nor empty, nor of an earlier run."""
     if out.exists() and not out.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
-    ours = (CACHE, UNFINISHED)  # left by a run that was killed while it claimed the folder
-    if (
-        out.is_dir()
-        and not (out / RUN_MARKER).exists()
-        and any(path.name not in ours and not path.name.startswith(RUN_MARKER) for path in out.iterdir())
-    ):
+    _require_no_link(out)
+    if out.is_dir() and not (out / RUN_MARKER).exists() and any(path.name != INTERNAL for path in out.iterdir()):
         raise InputError(
             "E-OUTPUT-EXISTS", f"output folder {out}: not empty and not of an earlier run; give a new folder with --out"
         )
-    _require_no_links(out)
 
 
-def _require_short(out: Path) -> None:
-    """Refuses a path that SQLite cannot open a database below."""
-    length = len(os.fsencode(Path(real_place(out)) / UNFINISHED / LONGEST_DATABASE))
-    if length > MOST_DATABASE_BYTES:
-        raise InputError(
-            "E-OUTPUT-LENGTH",
-            f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most; give a "
-            "shorter --out",
-        )
-
-
-def _require_no_links(out: Path) -> None:
-    for name in (UNFINISHED, ADDED, READY, CACHE):
+def _require_no_link(out: Path) -> None:
+    for name in (INTERNAL, CACHE, STAGE, READY):
         if (out / name).is_symlink():
             raise InputError(
                 "E-OUTPUT-LINK", f"output folder {out}: {name} in it is a link; remove it, a run writes through none"
             )
-
-
-def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
-    """Refuses inputs that lie where the run writes."""
-    place, frames = real_place(out), real_place(frames_folder(out))
-    for word, given in inputs.items():
-        if isinstance(given, str | Path) and real_place(given) == frames:
-            continue  # the run itself has put them there
-        if isinstance(given, str | Path) and place in (own := real_place(given), *own.parents):
-            raise InputError(
-                "E-OUTPUT-IS-INPUT",
-                f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
-                "or give another --out",
-            )
-
-
-@contextmanager
-def _locked(out: Path) -> Iterator[None]:
-    """Locks the folder against other commands; the system releases the lock when the process ends."""
-    _require_no_links(out)
-    cache = out / CACHE
-    lock = filelock.FileLock(cache / LOCK)
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0)
-    except filelock.Timeout as error:
-        try:
-            holder = (cache / HOLDER).read_text(encoding="utf-8").strip()
-        except (OSError, ValueError):
-            holder = "another process"
-        raise InputError(
-            "E-OUTPUT-IN-USE",
-            f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out",
-        ) from error
-    except OSError as error:
-        raise _unwritable(out, error) from error
-    try:
-        with suppress(StcalError):  # it only says to others who writes here
-            save(cache / HOLDER, _me())
-        yield
-    finally:
-        lock.release()
-
-
-def _make_empty(folder: Path) -> None:
-    remove(folder)
-    folder.mkdir()
-
-
-def _me() -> str:
-    return f"process {os.getpid()} on {socket.gethostname()}\n"
-
-
-def _finished(out: Path) -> bool:
-    """True if the folder holds the results of a run, or of a detection alone, that came to its end."""
-    try:
-        marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
-    except InputError:
-        marker = None
-    return (out / "faces.json").exists() or (marker is not None and marker.sha256 is not None)
-
-
-def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None:
-    """Moves the files of a failed run to their places if there are no earlier results; else leaves them aside."""
-    remove(folder.stage / "scratch")
-    if not _finished(folder.out):
-        with suppress(StcalError):  # where there is no space, that of the beginning stays
-            save(folder.out / RUN_MARKER, json_text(content.content()))
-        for name in RESULTS:
-            if name != RUN_MARKER:
-                remove(folder.out / name)
-            if name in LOOKED_AT and (folder.stage / name).exists():
-                os.replace(folder.stage / name, folder.out / name)
-        remove(folder.stage)
-    elif not any(folder.stage.iterdir()):
-        remove(folder.stage)
-    elif isinstance(error, StcalError):
-        error.append(f"; the earlier results stay, {folder.stage} holds what this run made")

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, digest_of, own_digest
 from stcal.io.json import checked, read_json
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.saved import AnyRun, folder_of
-from stcal.sfm.runs.transaction import DATABASE_SIDES, RESULTS, MarkerFile, complete_interrupted, files_below
-
-OWN = (*RESULTS, *(f"database.db{side}" for side in DATABASE_SIDES))
-"""Entries of the folder in which a foreign file would be taken for a result, or would change one."""
+from stcal.sfm.runs.transaction import RESULTS, complete_interrupted, files_below
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +56,7 @@ def verify(run: AnyRun) -> Verified:
             f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of another version (stcal {marker.version}); "
             "run it again",
         )
-    present = {name for name in files_below(run) if name.split("/")[0] in OWN}
+    present = {name for name in files_below(run) if name == RUN_MARKER or name.split("/")[0] in RESULTS}
     changed = [
         name
         for name, known in marker.sha256.items()

@@ -18,8 +18,8 @@ from stcal.sfm.budget.lengths import against_stated
 from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.transaction import MarkerFile
 from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
@@ -240,8 +240,8 @@ def test_command(stcal_sfm, small_run, tmp_path):
     assert code == 0
     assert all(shown in text for shown in ("operator: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
     file = json.loads(out.read_text())
-    marker = json.loads((small_run / "stcal-run.json").read_text())["sha256"]
-    assert (file["run"]["sha256"], file["run"]["faces_sha256"]) == (marker["stcal-run.json"], marker["faces.json"])
+    marker = json.loads((small_run / ".stcal/run.json").read_text())["sha256"]
+    assert (file["run"]["sha256"], file["run"]["faces_sha256"]) == (marker[".stcal/run.json"], marker["faces.json"])
     assert file["run"]["changed"] == []
     origin = {each["key"]: each["origin"] for each in file["sources"]}
     assert origin["intrinsics"] == "not stated"

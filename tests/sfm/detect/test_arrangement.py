@@ -116,6 +116,9 @@ def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group)
         assert max(own) < 0.6
 
 
+PHANTOM = "a pattern like face 5: not where"
+
+
 @pytest.mark.parametrize("count", [1, 4])
 def test_a_phantom_that_does_not_stand_still_goes_out(scene, group, count):
     """Something that reads as face 5, at another place against the target in every image."""
@@ -128,32 +131,31 @@ def test_a_phantom_that_does_not_stand_still_goes_out(scene, group, count):
         assert {x for x in r.observations.labels if x.plane != "5"} == set(o.labels)
     kept = sum("5" in r.observations.face_ids() for r in results)
     assert kept <= 1  # one alone contradicts nothing that the group knows
-    assert sum("not where the group's other images see it" in n for r in results for n in r.notes) == count - kept
+    assert sum(PHANTOM in n for r in results for n in r.notes) == count - kept
 
 
-def test_a_second_target_that_is_smaller_changes_nothing(scene, group):
-    """Another face 1 behind, still in the room, in all images."""
+def test_a_face_in_view_twice_is_neither(scene, group):
+    """Another face 1 behind, in all images but the first: there alone it is read, and the second look predicts it."""
     seen = [Seen(o) for o in group]
-    for own, pose in zip(seen, poses(scene), strict=True):
+    for own, pose in list(zip(seen, poses(scene), strict=True))[1:]:
         behind = pose @ Rigid.exp([0.2, 0.1, 0.3, 400, 100, -700])
         own.face("1", plane_centres(behind, TARGET.face("1").xy_mm))
-    results, _ = labelled(scene, [s.detection() for s in seen])
-    for r, o in zip(results, group, strict=True):
-        assert dict(zip(r.observations.labels, map(tuple, r.observations.centre_px), strict=True)).keys() == set(
-            o.labels
-        )
-        own = dict(zip(r.observations.labels, r.observations.centre, strict=True))
-        truth = dict(zip(o.labels, o.centre, strict=True))
-        assert max(np.abs(own[x] - truth[x]).max() for x in truth) < 1e-12
+    results, arrangement = labelled(scene, [s.detection() for s in seen])
+    assert set(results[0].observations.labels) == set(group[0].labels)
+    assert "1" in arrangement.group_from_plane
+    for r, o in list(zip(results, group, strict=True))[1:]:
+        assert set(r.observations.labels) == {x for x in o.labels if x.plane != "1"}
+        assert any(note.startswith("face 1 found more than once") for note in r.notes)
 
 
-def test_a_second_board_in_one_image_goes_out(scene, group):
+def test_a_board_in_view_twice_is_neither(scene, group):
     seen = [Seen(o) for o in group]
     cells = np.stack(np.meshgrid(np.arange(7), np.arange(9), indexing="ij"), -1).reshape(-1, 2)
     seen[2].board(plane_centres(Rigid.exp([0.1, 0.2, 0, -100, 150, 1500]), 30.0 * cells[:, ::-1]), cells)
     results, _ = labelled(scene, [s.detection() for s in seen])
-    assert all(set(r.observations.labels) == set(o.labels) for r, o in zip(results, group, strict=True))
-    assert any("a board of 63 dots: not where" in note for note in results[2].notes)
+    for i, (r, o) in enumerate(zip(results, group, strict=True)):
+        assert set(r.observations.labels) == {x for x in o.labels if i != 2 or x.plane != "board"}
+    assert any(note.startswith("board found more than once") for note in results[2].notes)
 
 
 def test_a_reflection_as_bright_as_the_face_goes_out(scene, group):
@@ -172,7 +174,7 @@ def test_a_reflection_as_bright_as_the_face_goes_out(scene, group):
     results, _ = labelled(scene, [s.detection() for s in seen])
     for r, o in zip(results, group, strict=True):
         assert set(r.observations.labels) == set(o.labels)
-        assert any("face 4: the image of another face in a mirror" in note for note in r.notes)
+        assert any("a pattern like face 4: not where" in note for note in r.notes)
 
 
 def test_one_bad_first_image_does_not_speak_for_the_group(scene, group):

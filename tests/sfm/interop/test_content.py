@@ -25,7 +25,7 @@ def spoilt(small_run, tmp_path):
     """A copy of the small run's database after a statement."""
 
     def copy(statement: str) -> Path:
-        database = own_copy(small_run / "database.db", tmp_path)
+        database = own_copy(small_run / "colmap/database.db", tmp_path)
         with closing(sqlite3.connect(database)) as opened, opened:
             opened.execute("PRAGMA journal_mode = DELETE")
             opened.execute(statement)
@@ -135,7 +135,7 @@ def test_the_command_compares_with_the_run(small_run, stcal_sfm, tmp_path):
     own = tmp_path / "run"
     own_copy(small_run, own, ignore=shutil.ignore_patterns("cache", "overlays"))
     assert stcal_sfm("export-database", own, tmp_path / "out.db", "--schema", "3.8")[0] == 0
-    with closing(sqlite3.connect(own / "database.db")) as opened, opened:
+    with closing(sqlite3.connect(own / "colmap/database.db")) as opened, opened:
         opened.execute("PRAGMA journal_mode = DELETE")
         opened.execute("UPDATE keypoints SET data = zeroblob(8 * rows) WHERE image_id = 2")
     code, out, error = stcal_sfm("export-database", own, tmp_path / "other.db", "--schema", "3.8")

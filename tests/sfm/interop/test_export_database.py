@@ -81,7 +81,7 @@ def state_of(folder) -> dict[str, str]:
 def database(small_run, tmp_path):
     """A copy of the small run's database in a folder of its own."""
     (tmp_path / "run").mkdir()
-    return own_copy(small_run / "database.db", tmp_path / "run")
+    return own_copy(small_run / "colmap/database.db", tmp_path / "run")
 
 
 def change(database, *statements) -> None:
@@ -135,14 +135,14 @@ def no_screen(monkeypatch):
 def test_the_schema_is_what_the_program_itself_makes(schema, small_run, tmp_path):
     """Against an empty database of native COLMAP 3.8 and of pycolmap 4.2, made here and now."""
     empty_database(schema, tmp_path / "empty.db")
-    copy_database(small_run / "database.db", tmp_path / "out.db", schema)
+    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", schema)
     assert described(tmp_path / "out.db") == described(tmp_path / "empty.db")
 
 
 @pytest.mark.parametrize("schema", PUBLISHED, ids=[f"{schema} as published, not run here" for schema in PUBLISHED])
 def test_the_schema_is_the_published_one(schema, small_run, tmp_path):
     """Against what was recorded when each version was run; the versions themselves are not here."""
-    copy_database(small_run / "database.db", tmp_path / "out.db", schema)
+    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", schema)
     lines = described(tmp_path / "out.db")
     assert hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16] == PUBLISHED[schema], "\n".join(lines)
 
@@ -207,7 +207,7 @@ def test_a_database_in_rollback_mode_is_read_with_its_locks(database, tmp_path):
 def first_group(run) -> tuple[list[str], tuple[int, int]]:
     """Names of the first group's images, and the ids of its initial pair."""
     pair = json.loads((run / "report.json").read_text())["groups"][0]["pairs"][0]
-    with read_only(run / "database.db") as opened:
+    with read_only(run / "colmap/database.db") as opened:
         ids = {name: i for i, name in opened.execute("SELECT image_id, name FROM images")}
     group = pair["first"].split("/")[0]
     return [name for name in ids if name.startswith(f"{group}/")], (ids[pair["first"]], ids[pair["second"]])
@@ -232,8 +232,8 @@ def points_by_track(model) -> dict[tuple, np.ndarray]:
 def test_pycolmap_makes_the_same_model_of_the_export(schema, small_run, tmp_path):
     """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
     names, pair = first_group(small_run)
-    copy_database(small_run / "database.db", tmp_path / "out.db", schema)
-    ours = mapped(small_run / "database.db", tmp_path / "ours", names, pair)
+    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", schema)
+    ours = mapped(small_run / "colmap/database.db", tmp_path / "ours", names, pair)
     theirs = mapped(tmp_path / "out.db", tmp_path / "theirs", names, pair)
     assert theirs.num_reg_images() == ours.num_reg_images() == len(names)
     a, b = points_by_track(ours), points_by_track(theirs)
@@ -246,7 +246,7 @@ def test_native_colmap_maps_the_export(small_run, tmp_path):
     """Debian's 3.8 with thresholds for few points: every image of the group, every circle."""
     colmap = native_colmap()
     names, pair = first_group(small_run)
-    copy_database(small_run / "database.db", tmp_path / "out.db", "3.8")
+    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", "3.8")
     (tmp_path / "names.txt").write_text("\n".join(names) + "\n")
     (tmp_path / "model").mkdir()
     options = pipeline_options(names, pair)
@@ -576,7 +576,7 @@ def test_the_command_says_what_it_wrote(stcal_sfm, small_run, tmp_path):
 def test_the_command_wants_a_run(stcal_sfm, database, tmp_path):
     code, _, err = stcal_sfm("export-database", database.parent, tmp_path / "out.db", "--schema", "3.8")
     assert (code, err.count("\n")) == (2, 1)
-    assert "not a run's folder (no stcal-run.json); give the --out of a finished run" in err
+    assert "not a run's folder (no .stcal/run.json); give the --out of a finished run" in err
 
 
 def test_differences_are_told_column_by_column():

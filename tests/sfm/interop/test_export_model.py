@@ -212,7 +212,7 @@ def test_faces_and_board_differ_in_colour(exported):
     [("nvm", read_nvm, project_nvm, 1), ("bundler", read_bundler, project_bundler, -1)],
 )
 def test_one_ideal_camera_sees_what_the_run_saw(small_run, exported, known, keypoints, kind, read, project, up):
-    camera = read_camera(small_run / "cameras.txt").sized(0, 0)
+    camera = read_camera(small_run / "inputs/cameras.txt").sized(0, 0)
     cameras, points = read(exported[kind])
     rows = labels_of(exported[kind])
     assert [int(row["point"]) for row in rows] == list(range(len(points)))
@@ -256,13 +256,13 @@ def refusal(run, out) -> str:
 def test_two_focal_lengths_become_one(small_run, tmp_path, keypoints):
     own = tmp_path / "run"
     unsealed_copy(small_run, own)
-    model = read_camera(own / "cameras.txt")
+    model = read_camera(own / "inputs/cameras.txt")
     camera = replace(model.calibrated(0, 0), focal=model.focal * [1.02, 1.0])
-    write_cameras_txt(own / "cameras.txt", camera)
+    write_cameras_txt(own / "inputs/cameras.txt", camera)
     assert "its camera is not that of the run" in refusal(own, tmp_path / "refused")
-    native = pycolmap.Reconstruction(str(own / "target_model"))
+    native = pycolmap.Reconstruction(str(own / "colmap/target_model"))
     native.camera(1).params = camera.colmap_params()
-    native.write_binary(str(own / "target_model"))
+    native.write_binary(str(own / "colmap/target_model"))
     allow(own, 100.0)  # the lens is another one than that of the photographs
     written = export_model(own, tmp_path / "model.nvm", "nvm")
     assert written.focal_px == pytest.approx(1.01 * model.focal[1], abs=1e-9)
@@ -306,10 +306,10 @@ def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(small_run, tmp_path):
     for name in ("labels.csv", "report.json"):
         text = (own / name).read_text(encoding="utf-8")
         (own / name).write_text(text.replace("IMG_1000", "IMG 1000"), encoding="utf-8")
-    model = pycolmap.Reconstruction(str(own / "target_model"))
+    model = pycolmap.Reconstruction(str(own / "colmap/target_model"))
     for image_id in model.reg_image_ids():
         model.image(image_id).name = model.image(image_id).name.replace("IMG_1000", "IMG 1000")
-    model.write_binary(str(own / "target_model"))
+    model.write_binary(str(own / "colmap/target_model"))
     export_model(own, tmp_path / "model.nvm", "nvm")
     assert '\n12/IMG"1000.jpg ' in (tmp_path / "model.nvm").read_text(encoding="utf-8")
     assert "12/IMG 1000.jpg" in {name for name, *_ in read_nvm(tmp_path / "model.nvm")[0]}
@@ -324,7 +324,7 @@ def test_the_command(small_run, stcal_sfm, tmp_path):
     assert code == 0
     assert sorted(path.name for path in (tmp_path / "empty").iterdir()) == ["bundle.out", "labels.csv", "list.txt"]
     assert "8 images" in out
-    camera = read_camera(small_run / "cameras.txt")
+    camera = read_camera(small_run / "inputs/cameras.txt")
     assert f"f = {camera.focal.mean():.4f} px" in out
     assert "(647.5, 431.5)" in out  # 1296 × 864 px, centre of the first pixel at (0, 0)
     assert stcal_sfm("export-model", small_run, tmp_path / "model.nvm", "--format", "nvm")[0] == 0
@@ -381,7 +381,7 @@ def test_errors(small_run, stcal_sfm, tmp_path):
     assert "not a run's folder" in refused(tmp_path, out)
     own = tmp_path / "run"
     unsealed_copy(small_run, own)
-    model = own / "target_model"
+    model = own / "colmap/target_model"
     labels = (own / "labels.csv").read_text(encoding="utf-8")
     head, *rows = labels.splitlines(keepends=True)
     assert ",2:1," in rows[0]

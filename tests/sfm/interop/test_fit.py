@@ -25,9 +25,9 @@ def changed(small_run, own_run):
     """The copy with the small run's model after a change."""
 
     def change(spoil):
-        model = pycolmap.Reconstruction(str(small_run / "target_model"))
+        model = pycolmap.Reconstruction(str(small_run / "colmap/target_model"))
         spoil(model)
-        model.write_binary(str(own_run / "target_model"))
+        model.write_binary(str(own_run / "colmap/target_model"))
         return own_run
 
     return change
@@ -152,7 +152,7 @@ def test_a_refined_camera_is_that_of_the_report(changed, tmp_path):
     change("report.json", longer)
     with fails_with("E-MODEL-NOT-OF-RUN"):
         export_model(own, tmp_path / "model.nvm", "nvm")
-    change("stcal-run.json", refined)
+    change(".stcal/run.json", refined)
     written = export_model(own, tmp_path / "model.nvm", "nvm")
     assert written.focal_px == pytest.approx(json.loads((own / "report.json").read_text())["camera"]["focal_px"][0])
 

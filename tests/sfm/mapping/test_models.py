@@ -42,14 +42,14 @@ def read(path, saved):
 @pytest.fixture(scope="module")
 def plain(saved):
     """What the model of group 12 as the run wrote it says."""
-    return calibrate_models(saved.folder / "models" / "12", saved)
+    return calibrate_models(saved.folder / "colmap/models" / "12", saved)
 
 
 class Model(pycolmap.Reconstruction):
     """The run's model of group 12, to be edited and written."""
 
     def __init__(self, saved, folder):
-        super().__init__(str(saved.folder / "models" / "12"))
+        super().__init__(str(saved.folder / "colmap/models" / "12"))
         self.folder = folder
         self.labels = {image.name: image.labels for image in saved.observations}
 
@@ -176,12 +176,12 @@ def test_points_have_the_label_of_their_keypoints(saved):
     """Against labels.csv, read by itself."""
     with (saved.folder / "labels.csv").open(encoding="utf-8", newline="") as stream:
         labels = {(row["image"], int(row["keypoint"])): row["label"] for row in csv.DictReader(stream)}
-    raw = pycolmap.Reconstruction(str(saved.folder / "models" / "14"))
+    raw = pycolmap.Reconstruction(str(saved.folder / "colmap/models" / "14"))
     expected = {}
     for point in raw.points3D.values():
         (label,) = {labels[raw.image(e.image_id).name, e.point2D_idx] for e in point.track.elements}
         expected[label] = point.xyz
-    (group,) = read(saved.folder / "models" / "14", saved).groups
+    (group,) = read(saved.folder / "colmap/models" / "14", saved).groups
     assert group.group == "14"
     assert list(group.labels) == sorted(expected)
     assert len(expected) >= 80
@@ -207,7 +207,7 @@ def test_a_text_with_fewer_digits(saved, model, plain):
 
 
 def plain_rotation(saved) -> np.ndarray:
-    (group,) = read(saved.folder / "models" / "12", saved).groups
+    (group,) = read(saved.folder / "colmap/models" / "12", saved).groups
     return group.camera_from_model[0].rotation
 
 
@@ -336,7 +336,7 @@ def test_a_world_of_another_size_place_and_attitude(saved, model, plain):
 
 
 def test_the_models_of_all_groups(saved):
-    found = calibrate_models(saved.folder / "models", saved)
+    found = calibrate_models(saved.folder / "colmap/models", saved)
     assert [m.group for m in found.models] == ["12", "14"]
     assert found.notes == ()
     assert found.target.target_from_face.keys() == saved.faces.target_from_face.keys()
@@ -344,7 +344,7 @@ def test_the_models_of_all_groups(saved):
 
 def test_all_groups_in_one_world(saved, tmp_path):
     """As two models, and brought together as one: each group keeps its own points, scale and faces."""
-    apart = calibrate_models(saved.folder / "models", saved)
+    apart = calibrate_models(saved.folder / "colmap/models", saved)
     ids = image_ids(saved.observations)
     write_model(tmp_path / "one", apart.models, saved.observations, ids, saved.camera)
     assert len(pycolmap.Reconstruction(str(tmp_path / "one")).images) == 8
@@ -358,7 +358,7 @@ def test_all_groups_in_one_world(saved, tmp_path):
 
 def test_circles_that_are_one_point_in_all_groups(saved):
     """The run's final model: the circles of face 1 are seen by both groups, the board of each is its own."""
-    path = saved.folder / "target_model"
+    path = saved.folder / "colmap/target_model"
     groups = {group.group: group for group in read(path, saved).groups}
     place = {g: dict(zip(m.labels, m.xyz_model.tolist(), strict=True)) for g, m in groups.items()}
     shared = [label for label in place["12"] if label in place["14"]]
@@ -373,7 +373,7 @@ def test_circles_that_are_one_point_in_all_groups(saved):
 
 def test_boards_of_two_groups_merged(saved, tmp_path):
     """The same dot, but the board was moved between the groups: the point is neither's."""
-    target = pycolmap.Reconstruction(str(saved.folder / "target_model"))
+    target = pycolmap.Reconstruction(str(saved.folder / "colmap/target_model"))
     labels = {image.name: image.labels for image in saved.observations}
     dot = {}
     for point_id, point in target.points3D.items():
@@ -396,7 +396,7 @@ def test_a_group_in_two_models(saved, model, plain, tmp_path):
     model.folder = tmp_path / "sparse" / "0"
     model.folder.parent.mkdir()
     model.as_binary()
-    own_copy(saved.folder / "models" / "12", tmp_path / "sparse" / "1")
+    own_copy(saved.folder / "colmap/models" / "12", tmp_path / "sparse" / "1")
     found = calibrate_models(tmp_path / "sparse", saved)
     assert_same_faces(found, plain)
     assert len(found.models[0].images) == 4
@@ -404,7 +404,7 @@ def test_a_group_in_two_models(saved, model, plain, tmp_path):
 
 
 def test_models_with_different_cameras(saved, model, tmp_path):
-    own_copy(saved.folder / "models" / "14", tmp_path / "both" / "1")
+    own_copy(saved.folder / "colmap/models" / "14", tmp_path / "both" / "1")
     model.cameras[1].params = model.cameras[1].params * (1 + 1e-9)
     model.folder = tmp_path / "both" / "0"
     model.as_binary()
@@ -414,7 +414,7 @@ def test_models_with_different_cameras(saved, model, tmp_path):
 
 def test_models_are_found_two_folders_deep(saved, tmp_path):
     for place in ("a", "a/0", "a/0/deeper", "b/0"):
-        own_copy(saved.folder / "models" / "12", tmp_path / "all" / place)
+        own_copy(saved.folder / "colmap/models" / "12", tmp_path / "all" / place)
     (tmp_path / "all" / "notes.txt").write_text("")
     assert find_models(tmp_path / "all") == [tmp_path / "all" / p for p in ("a", "a/0", "b/0")]
     assert find_models(str(tmp_path / "all" / "a" / "0" / "deeper")) == [tmp_path / "all/a/0/deeper"]
@@ -521,7 +521,7 @@ def test_a_model_of_a_like_run(saved, small_set, stcal_sfm):
     """Another run of the same images without the correction: the same names and counts, other pixels."""
     small = small_set("12")
     stcal_sfm(*small.arguments("--no-eccentricity"))
-    outcome = stcal_sfm("faces", small.out / "models", "--run", saved.folder)
+    outcome = stcal_sfm("faces", small.out / "colmap/models", "--run", saved.folder)
     assert_error(outcome, INPUT, "E-MODEL-NOT-OF-RUN")
 
 
@@ -584,7 +584,7 @@ for folder in json.load(sys.stdin):
 def test_damaged_files_neither_crash_nor_hang_nor_eat_memory(saved, tmp_path):
     """Each file cut at its start, its end and at random places, and with counts of up to 2⁶⁴: pycolmap alone reads on
     behind the end, for hours or into all memory. In a process of its own, with a limit on both."""
-    source, rng, cases = saved.folder / "models" / "12", random.Random(1), []
+    source, rng, cases = saved.folder / "colmap/models" / "12", random.Random(1), []
     for name in FILES:
         data = (source / f"{name}.bin").read_bytes()
         cuts = [0, 1, 8, len(data) - 1, *(rng.randrange(8, len(data)) for _ in range(8))]
@@ -616,7 +616,7 @@ def test_damaged_files_neither_crash_nor_hang_nor_eat_memory(saved, tmp_path):
 def test_counts_inside_the_records(saved, tmp_path):
     """The track of the first point and the keypoints of the first image are said to be 2⁴⁰ long."""
     for name, at in (("points3D", 8 + 43), ("images", 8 + 64 + len("12/IMG_1000.jpg\0"))):
-        folder = own_copy(saved.folder / "models" / "12", tmp_path / name)
+        folder = own_copy(saved.folder / "colmap/models" / "12", tmp_path / name)
         data = bytearray((folder / f"{name}.bin").read_bytes())
         data[at + 5] = 1
         (folder / f"{name}.bin").write_bytes(data)
@@ -628,7 +628,7 @@ def test_counts_inside_the_records(saved, tmp_path):
 def test_a_file_that_is_another_one(saved, tmp_path, name):
     for other in FILES:
         if other != name:
-            folder = own_copy(saved.folder / "models" / "12", tmp_path / other)
+            folder = own_copy(saved.folder / "colmap/models" / "12", tmp_path / other)
             shutil.copy(folder / f"{other}.bin", folder / f"{name}.bin")
             with pytest.raises(InputError, match=rf"damaged or incomplete \({name}.bin"):
                 open_model(folder)
@@ -636,14 +636,14 @@ def test_a_file_that_is_another_one(saved, tmp_path, name):
 
 @pytest.mark.parametrize("name", ["cameras", "points3D", "images"])
 def test_a_file_is_missing(saved, tmp_path, name):
-    folder = own_copy(saved.folder / "models" / "12", tmp_path / "model")
+    folder = own_copy(saved.folder / "colmap/models" / "12", tmp_path / "model")
     (folder / f"{name}.bin").unlink()
     with pytest.raises(InputError, match="damaged or incomplete" if name != "images" else "no COLMAP model"):
         calibrate_models(folder, saved)
 
 
 def test_a_folder_in_place_of_a_file(saved, tmp_path):
-    folder = own_copy(saved.folder / "models" / "12", tmp_path / "model")
+    folder = own_copy(saved.folder / "colmap/models" / "12", tmp_path / "model")
     (folder / "points3D.bin").unlink()
     (folder / "points3D.bin").mkdir()
     with fails_with("E-MODEL-UNREADABLE"):
@@ -675,7 +675,7 @@ def test_every_whole_model_passes(tmp_path):
 
 def test_a_model_of_an_older_version_has_no_rigs(saved, tmp_path, plain):
     """As native 3.8 writes them: three files."""
-    folder = own_copy(saved.folder / "models" / "12", tmp_path / "model")
+    folder = own_copy(saved.folder / "colmap/models" / "12", tmp_path / "model")
     for name in ("rigs", "frames"):
         (folder / f"{name}.bin").unlink()
     assert_same_faces(calibrate_models(folder, saved), plain)
@@ -708,9 +708,11 @@ def test_no_model(saved, stcal_sfm, tmp_path):
 
 
 def test_the_command_says_what_the_models_say(saved, stcal_sfm, tmp_path):
-    code, out, err = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", tmp_path / "f.json")
+    code, out, err = stcal_sfm(
+        "faces", saved.folder / "colmap/models", "--run", saved.folder, "--out", tmp_path / "f.json"
+    )
     assert (code, err) == (0, "")
-    found = calibrate_models(saved.folder / "models", saved)
+    found = calibrate_models(saved.folder / "colmap/models", saved)
     written = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
     assert (written["format"], written["unit"], written["solve"]) == ("stcal faces 1", "mm", "chain")
     for face, pose in found.target.target_from_face.items():
@@ -725,7 +727,7 @@ def test_the_command_says_what_the_models_say(saved, stcal_sfm, tmp_path):
 
 def test_the_folder_of_the_answer_is_needed(saved, stcal_sfm, tmp_path):
     out = tmp_path / "no" / "f.json"
-    outcome = stcal_sfm("faces", saved.folder / "models", "--run", saved.folder, "--out", out)
+    outcome = stcal_sfm("faces", saved.folder / "colmap/models", "--run", saved.folder, "--out", out)
     assert_error(outcome, INPUT, "E-OUTPUT-FOLDER", f"{out}", f"{out.parent}", "--out")
 
 
@@ -740,7 +742,7 @@ def test_no_file_of_half_an_answer(saved, model, stcal_sfm, tmp_path):
 def test_a_lost_group_is_said_where_a_face_hangs_on_it(saved):
     """Group 14 alone has no face 2; group 12 is missing and named."""
     options = replace(saved.options, reference_face="2")
-    only = read(saved.folder / "models" / "14", saved)
+    only = read(saved.folder / "colmap/models" / "14", saved)
     with fails_with("E-FACE-REFERENCE … 2"):
         faces_from_models([only], replace(saved, options=options))
 
@@ -769,7 +771,7 @@ def test_a_model_that_the_disk_does_not_take_is_said(small_run, tmp_path):
     places = [tmp_path / f"{kind}-{limit}" for kind in ("binary", "text") for limit in (1000, 10_000_000)]
     for place in places:
         place.mkdir()
-    command = [sys.executable, "-c", FULL_DISK, small_run / "target_model", *places]
+    command = [sys.executable, "-c", FULL_DISK, small_run / "colmap/target_model", *places]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     for place, line in zip(places, done.stdout.splitlines(), strict=True):
         expected = (

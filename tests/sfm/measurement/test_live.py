@@ -33,7 +33,7 @@ from tests.sfm.truth import true_poses
 def tracker(small_run, small_scene):
     target = read_target(small_run / "faces.json", small_scene.target)
     object.__setattr__(target, "design", small_scene.target)
-    return Tracker(target, read_camera(small_run / "cameras.txt"))
+    return Tracker(target, read_camera(small_run / "inputs/cameras.txt"))
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +184,7 @@ def test_every_picture_of_a_video_is_read(tmp_path):
 
 def live(small_run, *words):
     """What the command printed, which ends with the pictures."""
-    files = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json", "--port", "0"]
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json", "--port", "0"]
     result = CliRunner().invoke(app, ["sfm", "measure", "--live", *map(str, [*files, *words])], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result
@@ -198,7 +198,7 @@ def test_pictures_of_a_folder_or_a_video_of_odd_size(small_run, small_dataset, t
     names = [path.name for path in sorted((small_dataset / "images/12").iterdir())][:2]
     width, height = 1296 - cut[0], 864 - cut[1]
     pictures = [cv2.imread(str(small_dataset / "images/12" / name))[:height, :width] for name in names]
-    line = (small_run / "cameras.txt").read_text().replace(" 1296 864 ", f" {width} {height} ")
+    line = (small_run / "inputs/cameras.txt").read_text().replace(" 1296 864 ", f" {width} {height} ")
     (tmp_path / "odd.txt").write_text(line)
     place = tmp_path / ("images" if kind == "folder" else "clip.avi")
     if kind == "folder":
@@ -233,7 +233,7 @@ def test_pictures_of_a_folder_or_a_video_of_odd_size(small_run, small_dataset, t
     ],
 )
 def test_what_cannot_be_shown_ends_in_one_line(small_run, words, code):
-    faces = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json"]
+    faces = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
     with fails_with(code):
         CliRunner().invoke(
             app, ["sfm", "measure", "--live", *map(str, faces), "--port", "0", *words], catch_exceptions=False
@@ -242,7 +242,7 @@ def test_what_cannot_be_shown_ends_in_one_line(small_run, words, code):
 
 def test_a_video_without_live_is_told_how_it_is_measured(small_run, tmp_path):
     (clip := tmp_path / "clip.avi").write_bytes(b"RIFF")
-    faces = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json"]
+    faces = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
     with fails_with("E-IMAGES-FOLDER … clip.avi: a file, and no image … --live --json -"):
         CliRunner().invoke(app, ["sfm", "measure", str(clip), *map(str, faces)], catch_exceptions=False)
 

@@ -30,8 +30,8 @@ def asked(port, method, place, body=None, **headers) -> tuple[int, dict]:
 @pytest.mark.slow
 def test_the_command_answers_this_machine_until_interrupted(small_run, small_dataset, tmp_path):
     photograph = min((small_dataset / "images" / "12").iterdir())
-    files = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json"]
-    files += ["--target", small_run / "target.toml"]
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
+    files += ["--target", small_run / "inputs/target.toml"]
     words = ["measure", "--serve", "--port", 0, "--max-megabytes", 4, *files]
     program = [sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()", *map(str, words)]
     with subprocess.Popen(program, stdout=-1, stderr=-1, text=True) as running:
@@ -46,7 +46,7 @@ def test_the_command_answers_this_machine_until_interrupted(small_run, small_dat
         out, err = running.communicate(timeout=PATIENCE_S)
     assert (running.returncode, out, err.splitlines()[-1]) == (130, "", "interrupted")
     (tmp_path / photograph.name).symlink_to(photograph)
-    files = small_run / "cameras.txt", small_run / "faces.json", small_run / "target.toml"
+    files = small_run / "inputs/cameras.txt", small_run / "faces.json", small_run / "target.toml"
     own = poses_file(measure(tmp_path, read_camera(files[0]), *files[1:], options=MeasureOptions(workers=1))).content()
     assert (code, content) == (200, own)
 
@@ -96,7 +96,7 @@ def test_a_port_that_is_taken_and_other_machines_with_a_token():
     ],
 )
 def test_what_belongs_to_a_folder_is_refused(small_run, stcal_sfm, words, other):
-    files = ["--camera", small_run / "cameras.txt", "--faces", small_run / "faces.json"]
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
     ended = stcal_sfm("measure", *words, *files, "--serve")
     assert (ended[0], ended.error) == (2, "E-OPTION-CONFLICT")
     assert f"{other}: images come" in ended[2]

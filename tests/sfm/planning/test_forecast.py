@@ -391,7 +391,7 @@ def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
     ("file", "change", "warning"),
     [
         (
-            "stcal-run.json",
+            ".stcal/run.json",
             lambda c: c["options"].update(eccentricity=False),
             "is an uncorrected control, whose faces are",
         ),

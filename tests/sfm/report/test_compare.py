@@ -94,23 +94,23 @@ def test_a_run_of_another_size_is_compared(small_run, small_dataset, tmp_path, f
 
 
 def test_labels_that_cannot_be_compared_are_said(small_run, small_dataset, tmp_path):
-    """A run without its table of detections, or with a damaged one."""
+    """A run without its table of labels, or with a damaged one."""
     run = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     assert compare(run, small_dataset / "truth.json").labels is not None
-    (run / "detections.csv").write_text("image,label\n12/IMG_1000.jpg,1:a\n")
-    with pytest.warns(InputNote, match="detections.csv: damaged: the labels are not compared"):
+    (run / "labels.csv").write_text("image,label\n12/IMG_1000.jpg,1:a\n")
+    with pytest.warns(InputNote, match="labels.csv: damaged: the labels are not compared"):
         assert compare(run, small_dataset / "truth.json").labels is None
-    (run / "detections.csv").unlink()
-    with pytest.warns(InputNote, match="detections.csv: No such file or directory: the labels are not compared"):
+    (run / "labels.csv").unlink()
+    with pytest.warns(InputNote, match="labels.csv: No such file or directory: the labels are not compared"):
         compare(run, small_dataset / "truth.json")
 
 
 def test_images_without_labels_are_counted(small_run, small_dataset, tmp_path):
     run = unsealed_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     known = compare(run, small_dataset / "truth.json")
-    head, *rows = (run / "detections.csv").read_text().splitlines(keepends=True)
-    lost = rows[0].split(",")[0]
-    (run / "detections.csv").write_text("".join([head, *(row for row in rows if not row.startswith(f"{lost},"))]))
+    head, *rows = (run / "labels.csv").read_text().splitlines(keepends=True)
+    lost = rows[0].split(",")[2]
+    (run / "labels.csv").write_text("".join([head, *(row for row in rows if row.split(",")[2] != lost)]))
     found = compare(run, small_dataset / "truth.json")
     assert (found.labels.images, found.labels.images_of_truth) == (known.labels.images - 1, known.labels.images)
     assert f"in the {found.labels.images} of {known.labels.images} images that have labels" in comparison_table(found)

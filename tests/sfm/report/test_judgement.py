@@ -237,7 +237,7 @@ def test_a_missing_face_that_was_expected_is_a_no():
 def test_a_face_that_was_read_and_left_out_calls_for_care():
     own = report()
     own["summary"]["faces_not_seen"] = ["5"]
-    note = "a pattern like face 5: the image of another face in a mirror; left out"
+    note = "a pattern like face 5: not where other groups see that face against the others; left out"
     own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "note": note} for i in range(3)]
     told = judgement_of(own)
     assert (told.verdict, "face 5 was read in 3 images" in told.use) == ("with care", True)

@@ -29,7 +29,7 @@ from tests.shared import own_copy
 
 CHAIN = ("--solve", "chain")
 """For what is seen before faces are adjusted together, which takes half of a small run's time."""
-RESULTS = ("faces.json", "report.json", "report.html", "database.db")
+RESULTS = ("faces.json", "report.json", "report.html", "colmap")
 
 
 def assert_success(outcome) -> str:
@@ -45,7 +45,7 @@ def results_in(out: Path) -> list[str]:
 
 def detections(out: Path) -> dict[tuple[str, str], tuple[float, float]]:
     """(image, label) → centre, px."""
-    with (out / "detections.csv").open(encoding="utf-8", newline="") as file:
+    with (out / "labels.csv").open(encoding="utf-8", newline="") as file:
         return {(row["image"], row["label"]): (float(row["x_px"]), float(row["y_px"])) for row in csv.DictReader(file)}
 
 
@@ -88,7 +88,7 @@ def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
     small = small_set()
     outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
     assert_error(outcome, INPUT, "E-VIDEO-UNREADABLE", str(small.camera), "a folder of images")
-    assert not (small.out / "cache" / "frames").exists()
+    assert not (small.out / ".stcal/cache" / "frames").exists()
 
 
 def test_empty_folder(small_set, stcal_sfm):
@@ -624,7 +624,7 @@ def test_an_interrupted_run_keeps_what_it_has_detected(small_set, stcal_sfm, mon
     assert code == INTERRUPTED
     (line,) = lines_of(err)
     assert line.startswith("interrupted; finished detections are kept, run the same command again")
-    assert {p.name for p in small.out.iterdir()} == {"cache", "stcal-run.json"}
+    assert {p.name for p in small.out.iterdir()} == {".stcal"}
     assert "group 12: 2 images" in assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert results_in(small.out) == list(RESULTS)
     assert len(detected) == 3  # the first one was kept
@@ -642,7 +642,7 @@ def test_an_interrupted_run_leaves_nothing_that_looks_complete(small_set, stcal_
         text=True,
         start_new_session=True,
     )
-    cache = small.out / "cache"
+    cache = small.out / ".stcal/cache"
     until = time.monotonic() + 60
     while not (cache.is_dir() and any(cache.glob("*.npz"))) and time.monotonic() < until:
         time.sleep(0.005)
@@ -654,13 +654,12 @@ def test_an_interrupted_run_leaves_nothing_that_looks_complete(small_set, stcal_
     if how == signal.SIGINT:
         assert len(lines_of(err)) == 1
         assert lines_of(err)[0].startswith("interrupted; finished detections are kept, run the same command again")
-    left = {"cache", "stcal-run.json"} | ({"unfinished"} if how == signal.SIGKILL else set())  # nobody could clear it
-    assert {p.name for p in small.out.iterdir()} <= left
+    assert {p.name for p in small.out.iterdir()} == {".stcal"}
 
     out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert "group 12: 4 images" in out
     assert results_in(small.out) == list(RESULTS)
-    assert not (small.out / "unfinished").exists()
+    assert not (small.out / ".stcal/unfinished").exists()
     assert {name: (cache / name).stat().st_mtime_ns for name in kept} == kept
 
 
@@ -765,7 +764,7 @@ def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
 @pytest.mark.usefixtures("no_page")
 def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
     small = small_set("14")
-    cache = small.out / "cache"
+    cache = small.out / ".stcal/cache"
 
     def stamps() -> dict[str, int]:
         return {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")}

@@ -21,7 +21,7 @@ from stcal.workflows import cluster
 from tests.levels import sampled
 from tests.outcome import fails_with
 
-RESULTS = ("faces.json", "labels.csv", "detections.csv")
+RESULTS = ("faces.json", "labels.csv")
 CLUSTER = """
 from distributed import LocalCluster
 if __name__ == "__main__":

@@ -45,8 +45,8 @@ def crowd(labels_only):
 def solve(scene, observations, kind, out):
     options = RunOptions().settled(scene.target)
     graph = image_graph(observations, scene.board, kind)
-    (out / "cache").mkdir(parents=True)
-    folders, designs = (out / "scratch", out / "cache"), (scene.target, scene.board)
+    (out / ".stcal/cache").mkdir(parents=True)
+    folders, designs = (out / "scratch", out / ".stcal/cache"), (scene.target, scene.board)
     solutions, _ = solve_groups(observations, graph, *folders, scene.camera, *designs, options, lambda *_: None)
     return (
         graph,

@@ -58,7 +58,7 @@ def test_the_published_method_is_settled_whole(small_set, stcal_sfm):
     assert (faces["solve"], faces["eccentricity"], faces["frame"]) == ("paper", False, "three-point")
     report = json.loads((data.out / "report.json").read_text())
     assert all(group["scale"]["difference_ppm"] == 0 for group in report["groups"])  # λ is that by rows
-    code, text, _ = stcal_sfm("faces", data.out / "models", "--run", data.out, "--solve", "paper")
+    code, text, _ = stcal_sfm("faces", data.out / "colmap/models", "--run", data.out, "--solve", "paper")
     assert code == 0
     off = [line.split()[-2:] for line in text.splitlines() if line.split()[0] in ("2", "4")]
     assert off == [["0.00", "0.000"]] * 2

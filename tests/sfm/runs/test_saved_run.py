@@ -13,13 +13,15 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.errors import InputError
+from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.target import read_target
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
-from stcal.sfm.runs.transaction import MarkerFile, run_folder
+from stcal.sfm.runs.transaction import run_folder
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
 
@@ -48,8 +50,8 @@ def written(small_dataset, small_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("written")
     own_copy(small_dataset, folder / "data")
     (folder / "run").mkdir()
-    own_copy(small_run / "cache", folder / "run" / "cache")
-    own_copy(small_run / "stcal-run.json", folder / "run")
+    own_copy(small_run / ".stcal/cache", folder / "run" / ".stcal/cache")
+    own_copy(small_run / ".stcal/run.json", folder / "run" / ".stcal")
     grey(folder / "data" / "images" / UNLABELLED)
     options = RunOptions("chain", "three-point", True, "2", PairOptions(np.radians(40)), workers=1)
     data = folder / "data"
@@ -121,7 +123,7 @@ def test_options_answers_and_places_are_the_same(written):
     assert saved.options == result.options
     assert saved.options.reference_face == saved.faces.reference_face == "2"
     assert saved.images == result.out.parent / "data" / "images"
-    assert saved.database == result.out / "database.db"
+    assert saved.database == result.out / "colmap/database.db"
     found = {face: np.array(matrix) for face, matrix in saved.faces.target_from_face.items()}
     assert found.keys() == result.target.target_from_face.keys()
     assert all(np.array_equal(found[face], pose.matrix()) for face, pose in result.target.target_from_face.items())
@@ -136,7 +138,7 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     with run_folder("new", MarkerFile.of("some images", OTHER), {}):
         pass
     own = own_copy(small_run, tmp_path / "run")
-    shutil.copy(tmp_path / "new" / "stcal-run.json", own)
+    shutil.copy(tmp_path / "new" / ".stcal/run.json", own / ".stcal")
     saved = load_run(own)
     assert saved.options == OTHER
     assert saved.images == tmp_path / "some images"
@@ -181,10 +183,10 @@ def edit(path, change) -> None:
 
 
 def faces_of(own_run) -> tuple:
-    return "faces", own_run / "models", "--run", own_run
+    return "faces", own_run / "colmap/models", "--run", own_run
 
 
-NEEDED = ["cameras.txt", "target.toml", "board.toml", "labels.csv", "database.db", "report.json", "faces.json"]
+NEEDED = [CAMERA, TARGET, BOARD, "labels.csv", DATABASE, "report.json", "faces.json"]
 
 
 @pytest.mark.parametrize("name", NEEDED)
@@ -198,20 +200,20 @@ def test_a_file_is_missing(own_run, stcal_sfm, name):
 
 
 def test_not_a_run(own_run, tmp_path, stcal_sfm):
-    (own_run / "stcal-run.json").unlink()
+    (own_run / ".stcal/run.json").unlink()
     for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
-        outcome = stcal_sfm("faces", own_run / "models", "--run", path)
-        assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", "stcal-run.json", "--out")
+        outcome = stcal_sfm("faces", own_run / "colmap/models", "--run", path)
+        assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", ".stcal/run.json", "--out")
 
 
 def test_a_folder_of_detections_only(small_set, stcal_sfm):
     small = small_set("12")
     stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
     outcome = stcal_sfm("faces", small.out, "--run", small.out)
-    assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), "cameras.txt, target.toml")
+    assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), f"{CAMERA}, {TARGET}")
 
 
-@pytest.mark.parametrize("name", ["stcal-run.json", "report.json", "faces.json"])
+@pytest.mark.parametrize("name", [".stcal/run.json", "report.json", "faces.json"])
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b'"text"'])
 def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
     (own_run / name).write_bytes(content)
@@ -221,8 +223,8 @@ def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
 @pytest.mark.parametrize(
     ("name", "key"),
     [
-        ("stcal-run.json", "images"),
-        ("stcal-run.json", "options"),
+        (".stcal/run.json", "images"),
+        (".stcal/run.json", "options"),
         ("report.json", "images"),
         ("report.json", "groups"),
         ("report.json", "summary"),
@@ -237,12 +239,12 @@ def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
 
 
 WRONG = {
-    "options null, as of detect": ("stcal-run.json", lambda c: c.update(options=None), "no 'pairs'"),
-    "an option unknown here": ("stcal-run.json", lambda c: c["options"].update(magic=1), "magic"),
-    "an option missing": ("stcal-run.json", lambda c: c["options"].pop("ellipses"), "no 'ellipses'"),
-    "no such choice": ("stcal-run.json", lambda c: c["options"].update(solve="guess"), "solve 'guess'"),
-    "no such face": ("stcal-run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
-    "images a number": ("stcal-run.json", lambda c: c.update(images=3), "images: 3: "),
+    "options null, as of detect": (".stcal/run.json", lambda c: c.update(options=None), "no 'pairs'"),
+    "an option unknown here": (".stcal/run.json", lambda c: c["options"].update(magic=1), "magic"),
+    "an option missing": (".stcal/run.json", lambda c: c["options"].pop("ellipses"), "no 'ellipses'"),
+    "no such choice": (".stcal/run.json", lambda c: c["options"].update(solve="guess"), "solve 'guess'"),
+    "no such face": (".stcal/run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
+    "images a number": (".stcal/run.json", lambda c: c.update(images=3), "images: 3: "),
     "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "images.1: 'a': "),
     "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "groups.1.pairs: []: "),
     "a group missing": ("report.json", lambda c: c["groups"].pop(), "no '14'"),
@@ -267,12 +269,12 @@ WRONG = {
         "circles.2:1: [1, 2]: shape (2,)",
     ),
     "a list for an option": (
-        "stcal-run.json",
+        ".stcal/run.json",
         lambda c: c["options"]["pairs"].update(max_angle_rad=[1]),
         "max_angle_rad [1]: a single value needed",
     ),
     "names that are none": (
-        "stcal-run.json",
+        ".stcal/run.json",
         lambda c: c["options"].update(exclude=[7]),
         "options: exclude [7]: a list of names needed",
     ),
@@ -336,10 +338,10 @@ def test_labels_that_are_not_the_database_s(own_run, stcal_sfm, case):
 @pytest.mark.parametrize(
     ("name", "content", "part"),
     [
-        ("cameras.txt", "", "neither COLMAP's cameras.txt"),
-        ("cameras.txt", "1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
-        ("target.toml", "polarity = 3", "polarity"),
-        ("board.toml", "rows", "not valid TOML"),
+        (CAMERA, "", "neither COLMAP's cameras.txt"),
+        (CAMERA, "1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
+        (TARGET, "polarity = 3", "polarity"),
+        (BOARD, "rows", "not valid TOML"),
     ],
 )
 def test_a_damaged_copy_of_what_the_run_was_given(own_run, stcal_sfm, name, content, part):
@@ -363,9 +365,7 @@ def nudge(path):
     path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    "name", ["labels.csv", "faces.json", "report.json", "cameras.txt", "target.toml", "stcal-run.json"]
-)
+@pytest.mark.parametrize("name", ["labels.csv", "faces.json", "report.json", CAMERA, TARGET, ".stcal/run.json"])
 def test_a_file_with_another_digit_is_refused(own_run, stcal_sfm, name):
     nudge(own_run / name)
     assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-CHANGED", str(own_run / name), "run it again")
@@ -374,7 +374,7 @@ def test_a_file_with_another_digit_is_refused(own_run, stcal_sfm, name):
 def test_faces_of_a_run_with_another_digit_are_refused_by_what_reads_them_alone(own_run):
     nudge(own_run / "faces.json")
     with fails_with("E-RUN-CHANGED"):
-        read_target(own_run / "faces.json", own_run / "target.toml")
+        read_target(own_run / "faces.json", own_run / "inputs/target.toml")
 
 
 def test_centres_that_the_joint_adjustment_corrected_otherwise(small_run, tmp_path):

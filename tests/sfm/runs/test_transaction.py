@@ -8,16 +8,18 @@ from contextlib import suppress
 
 import pytest
 
-from stcal.errors import DetectionError, InputError
-from stcal.io.files import RUN_MARKER
+from stcal.errors import DetectionError
+from stcal.io.files import INTERNAL, RUN_MARKER
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.transaction import READY, RESULTS, MarkerFile, complete, run_folder
+from stcal.sfm.runs.transaction import READY, STAGE, added_results, complete_interrupted, run_folder
+from stcal.sfm.runs.verify import verify
 from tests.outcome import fails_with
 
 MARKER = MarkerFile.of("images", RunOptions())
 
 
-def write(stage, text, names=("faces.json", "report.json", "database.db")):
+def write(stage, text, names=("faces.json", "report.json", "colmap")):
     for name in names:
         (stage / name).write_text(text)
     (stage / "overlays" / "12").mkdir(parents=True)
@@ -36,47 +38,39 @@ def fail(out, names=("detections.csv",)):
 
 
 def content(out):
-    """What the folder holds, but for the cache."""
-    return {str(p.relative_to(out)): p.read_text() for p in out.rglob("*") if p.is_file() and p.parent.name != "cache"}
+    """What the folder holds, but for the hidden one."""
+    files = (p for p in out.rglob("*") if p.is_file())
+    return {str(p.relative_to(out)): p.read_text() for p in files if INTERNAL not in p.relative_to(out).parts}
+
+
+NEW = {"faces.json": "new", "report.json": "new", "colmap": "new", "overlays/12/a.jpg": "new"}
 
 
 def test_new_results_take_the_earlier_ones_place(tmp_path):
     make(tmp_path / "run", "old", names=("faces.json", "labels.csv", "compare.json"))
     (tmp_path / "run" / "notes.txt").write_text("mine")
     make(tmp_path / "run", "new")
-    found = content(tmp_path / "run")
-    assert json.loads(found.pop(RUN_MARKER))["program"] == "stcal-sfm"
-    assert found == {
-        "faces.json": "new",
-        "report.json": "new",
-        "database.db": "new",
-        "overlays/12/a.jpg": "new",
-        "notes.txt": "mine",
-    }
+    assert content(tmp_path / "run") == NEW | {"notes.txt": "mine"}
+    assert json.loads((tmp_path / "run" / RUN_MARKER).read_text())["program"] == "stcal-sfm"
 
 
 @pytest.mark.parametrize("names", [("faces.json", "report.json"), ("detections.csv",)])
 def test_a_run_that_fails_leaves_the_earlier_results(tmp_path, names):
     make(tmp_path / "run", "old", names=names)
     before = content(tmp_path / "run")
-    with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay, .*unfinished holds what"):
+    with pytest.raises(DetectionError, match=r"nothing found; the earlier results stay"):
         fail(tmp_path / "run")
-    after = content(tmp_path / "run")
-    assert after.pop("unfinished/detections.csv") == after.pop("unfinished/overlays/12/a.jpg") == "new"
-    assert after == before
+    assert content(tmp_path / "run") == before
+    assert verify(tmp_path / "run").notes() == []
 
 
-def test_a_first_run_that_fails_leaves_its_overlays_in_place(tmp_path):
+@pytest.mark.parametrize("names", [("detections.csv",), ("detections.csv", "faces.json", "colmap")])
+def test_a_first_run_that_fails_leaves_what_helps_to_see_why(tmp_path, names):
+    """And no half results, as on a disk that fills: a ``faces.json`` without its report would pass for a result."""
     with pytest.raises(DetectionError, match=r"^nothing found$"):
-        fail(tmp_path / "run")
-    assert set(content(tmp_path / "run")) == {RUN_MARKER, "detections.csv", "overlays/12/a.jpg"}
-
-
-def test_a_first_run_that_fails_while_it_writes_leaves_no_half_results(tmp_path):
-    """As on a disk that fills: a ``faces.json`` without its report would pass for a result."""
-    with fails_with("E-TEST"):
-        fail(tmp_path / "run", names=("detections.csv", "faces.json", "database.db"))
-    assert set(content(tmp_path / "run")) == {RUN_MARKER, "detections.csv", "overlays/12/a.jpg"}
+        fail(tmp_path / "run", names)
+    assert content(tmp_path / "run") == {"detections.csv": "new", "overlays/12/a.jpg": "new"}
+    assert not (tmp_path / "run" / STAGE).exists()
 
 
 def test_a_path_that_is_too_long_for_a_database_is_refused_at_once(tmp_path):
@@ -85,35 +79,55 @@ def test_a_path_that_is_too_long_for_a_database_is_refused_at_once(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("moment", range(len(RESULTS) + 2))
-def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
-    """Killed at each of the renames: what is opened next is whole, and the new one's."""
-    out = tmp_path / "run"
-    make(out, "old", names=("faces.json", "labels.csv", "compare.json"))
+def ended_at(moment, monkeypatch, write_results):
+    """Ends with the ``moment``-th rename by which results take their places."""
     done, replace = [], os.replace
 
     def killed(source, place):
-        if len(done) == moment:
-            raise KeyboardInterrupt
-        if READY in (source.parent.name, place.name):
+        if READY in str(source) or str(place).endswith(READY):
+            if len(done) == moment:
+                raise KeyboardInterrupt
             done.append(place)
         replace(source, place)
 
     monkeypatch.setattr(os, "replace", killed)
     with suppress(KeyboardInterrupt):
-        make(out, "new")
+        write_results()
     monkeypatch.undo()
-    complete(out)
-    found = content(out)
-    found.pop(RUN_MARKER)
-    new = {"faces.json": "new", "report.json": "new", "database.db": "new", "overlays/12/a.jpg": "new"}
-    old = {"faces.json": "old", "labels.csv": "old", "compare.json": "old", "overlays/12/a.jpg": "old"}
-    assert {name: text for name, text in found.items() if not name.startswith("unfinished")} == (new if moment else old)
+
+
+@pytest.mark.parametrize("moment", range(len(NEW) + 3))
+def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_path, moment, monkeypatch):
+    """Killed at each of the renames: what is opened next is whole, and the new one's."""
+    out = tmp_path / "run"
+    make(out, "old", names=("faces.json", "labels.csv", "compare.json"))
+    before = content(out)
+    ended_at(moment, monkeypatch, lambda: make(out, "new"))
+    complete_interrupted(out)
+    assert content(out) == (NEW if moment else before)
+    assert verify(out).notes() == []
+
+
+@pytest.mark.parametrize("moment", range(4))
+def test_an_addition_that_is_killed_is_completed_and_takes_nothing_away(tmp_path, moment, monkeypatch):
+    out = tmp_path / "run"
+    make(out, "old", names=("faces.json", "report.html", "report.pdf"))
+    before = content(out)
+
+    def add():
+        with added_results(out) as stage:
+            (stage / "report.html").write_text("added")
+
+    ended_at(moment, monkeypatch, add)
+    complete_interrupted(out)
+    added = {name: text for name, text in before.items() if name != "report.pdf"} | {"report.html": "added"}
+    assert content(out) == (added if moment else before)
+    assert verify(out).notes() == []
 
 
 HOLD = """
 import sys
-from stcal.sfm.runs.transaction import MarkerFile
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.transaction import run_folder
 with run_folder(sys.argv[1], MarkerFile.of("images", RunOptions()), {}):
@@ -134,7 +148,7 @@ def test_two_runs_into_one_folder_are_refused_and_a_dead_one_holds_nothing(tmp_p
     assert content(tmp_path / "run")["faces.json"] == "new"
 
 
-@pytest.mark.parametrize("inside", ["target.toml", "overlays", "scratch/images", "."])
+@pytest.mark.parametrize("inside", ["inputs/target.toml", "overlays", ".stcal/images", "."])
 def test_inputs_in_the_folder_are_refused_and_stay(tmp_path, inside):
     make(tmp_path / "run", "old")
     given = tmp_path / "run" / inside
@@ -145,7 +159,7 @@ def test_inputs_in_the_folder_are_refused_and_stay(tmp_path, inside):
     assert content(tmp_path / "run") == before
 
 
-@pytest.mark.parametrize("name", ["models", "overlays", "faces.json"])
+@pytest.mark.parametrize("name", ["colmap", "overlays", "faces.json"])
 def test_nothing_is_written_through_a_link(tmp_path, name):
     make(tmp_path / "run", "old")
     behind = tmp_path / "behind"
@@ -163,11 +177,10 @@ def test_nothing_is_written_through_a_link(tmp_path, name):
     assert content(behind) == {"a.txt": "mine"}
 
 
-@pytest.mark.parametrize("name", ["cache", "unfinished", "ready"])
+@pytest.mark.parametrize("name", [".stcal", ".stcal/cache", ".stcal/unfinished", ".stcal/ready"])
 def test_a_folder_of_links_is_refused(tmp_path, name):
     (tmp_path / "behind").mkdir()
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / RUN_MARKER).write_text("{}")
+    (tmp_path / "run" / name).parent.mkdir(parents=True)
     (tmp_path / "run" / name).symlink_to(tmp_path / "behind")
-    with pytest.raises(InputError, match=f"{name} in it is a link; remove it"):
+    with fails_with(f"E-OUTPUT-LINK … {name}"):
         make(tmp_path / "run", "new")

@@ -8,8 +8,9 @@ import pytest
 
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop import crosscheck as interop
+from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
+from stcal.sfm.runs.transaction import added_results, run_folder
 from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy
@@ -21,7 +22,7 @@ MARKER = MarkerFile.of("images", RunOptions())
 def made(tmp_path):
     """A run's folder of a few files."""
     with run_folder(tmp_path / "run", MARKER, {}) as folder:
-        for name in ("faces.json", "report.json", "models/12/images.bin", "overlays/12/a.jpg"):
+        for name in ("faces.json", "report.json", "colmap/models/12/images.bin", "overlays/12/a.jpg"):
             (folder.stage / name).parent.mkdir(parents=True, exist_ok=True)
             (folder.stage / name).write_text(name)
     return tmp_path / "run"
@@ -35,7 +36,7 @@ def edit_marker(run, change):
 
 def test_a_run_is_whole_with_files_beside_it(made):
     (made / "notes.txt").write_text("mine")
-    (made / "cache" / "x.npz").write_text("later")
+    (made / ".stcal/cache" / "x.npz").write_text("later")
     assert verify(made).notes() == []
 
 
@@ -47,7 +48,7 @@ def link(path):
 
 SPOILT = {
     "missing": (lambda run: (run / "overlays/12/a.jpg").unlink(), "missing", "overlays/12/a.jpg"),
-    "a folder gone": (lambda run: shutil.rmtree(run / "models"), "missing", "models/12/images.bin"),
+    "a folder gone": (lambda run: shutil.rmtree(run / "colmap/models"), "missing", "colmap/models/12/images.bin"),
     "one letter": (lambda run: (run / "faces.json").write_text("faces.jsoN"), "changed", "faces.json"),
     "a link": (lambda run: link(run / "faces.json"), "changed", "faces.json"),
     "a pipe": (
@@ -57,10 +58,10 @@ SPOILT = {
     ),
     "the marker": (lambda run: edit_marker(run, lambda c: c.update(images="/elsewhere")), "changed", RUN_MARKER),
     "its hashes": (lambda run: edit_marker(run, lambda c: c["sha256"].popitem()), "changed", RUN_MARKER),
-    "a file among the results": (lambda run: (run / "models/new.bin").touch(), "added", "models/new.bin"),
-    "a link among the results": (lambda run: (run / "models/new").symlink_to("/"), "added", "models/new"),
+    "a file among the results": (lambda run: (run / "colmap/models/new.bin").touch(), "added", "colmap/models/new.bin"),
+    "a link among the results": (lambda run: (run / "colmap/models/new").symlink_to("/"), "added", "colmap/models/new"),
     "a comparison by hand": (lambda run: (run / "compare.json").touch(), "added", "compare.json"),
-    "a database's journal": (lambda run: (run / "database.db-wal").touch(), "added", "database.db-wal"),
+    "a database's journal": (lambda run: (run / "colmap/database.db-wal").touch(), "added", "colmap/database.db-wal"),
 }
 
 
@@ -97,7 +98,7 @@ def test_a_command_that_fails_adds_nothing(made):
     with pytest.raises(ValueError, match=r"^$"):
         add()
     assert verify(made).notes() == []
-    assert not (made / "added").exists()
+    assert not (made / ".stcal/unfinished").exists()
 
 
 def test_a_run_and_an_addition_wait_for_each_other(made):
@@ -132,7 +133,7 @@ def test_a_run_without_hashes_gets_none(made):
     with fails_with(f"E-RUN-DAMAGED … {RUN_MARKER} … sha256: 3:"):
         verify(made)
     with fails_with("E-RUN-FOLDER"):
-        verify(made / "models")
+        verify(made / "colmap/models")
 
 
 def test_compare_adds_its_file(small_run, small_dataset, tmp_path, stcal_sfm):

@@ -88,9 +88,9 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
         small.image(i).unlink()
     target, board = again.target_design, again.board_design
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
-    own, camera = RunFolder(small.out, small.out / "unfinished", small.out / "cache"), folder / "cameras.txt"
-    files = find_images(folder / "images")
-    detection, _ = labelled_images(Task(files, own, target, board, coarse, lambda *_: None), read_camera(camera))
+    own = RunFolder(small.out, small.out / ".stcal/unfinished", small.out / ".stcal/cache")
+    task = Task(find_images(folder / "images"), own, target, board, coarse, lambda *_: None)
+    detection, _ = labelled_images(task, read_camera(folder / "cameras.txt"))
     assert not any(image.reused for image in detection.images)
 
 
@@ -99,7 +99,7 @@ def test_a_damaged_cache_is_made_anew(small_set):
     small = pair(small_set)
     first = calibrate(small.folder, small.out)
     assert all(image.reused for image in first.detection.images)
-    for path in (small.out / "cache").iterdir():
+    for path in (small.out / ".stcal/cache").iterdir():
         path.write_bytes(path.read_bytes()[:-200])
     again = calibrate(small.folder, small.out)
     assert not any(image.reused for image in again.detection.images)
@@ -174,13 +174,13 @@ def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only)
 
 
 def test_a_missing_column_and_a_label_off_the_board_are_counted_rightly(small_dataset, small_run, tmp_path):
-    for file in ("faces.json", "detections.csv"):
+    for file in ("faces.json", "labels.csv"):
         (tmp_path / file).write_bytes((small_run / file).read_bytes())
-    rows = (small_run / "detections.csv").read_text().splitlines()
+    rows = (small_run / "labels.csv").read_text().splitlines()
     before = compare(small_run, small_dataset / "truth.json").content()["labels"]
-    some = [r for r in rows if not (r.split(",")[1].startswith("board:") and r.split(",")[1].endswith(":8"))]
-    (tmp_path / "detections.csv").write_text("\n".join(some))
+    some = [r for r in rows if not (r.split(",")[4].startswith("board:") and r.split(",")[4].endswith(":8"))]
+    (tmp_path / "labels.csv").write_text("\n".join(some))
     assert compare(tmp_path, small_dataset / "truth.json").content()["labels"]["wrong"] == before["wrong"] == 0
-    image = rows[1].split(",")[0]
-    (tmp_path / "detections.csv").write_text("\n".join([*rows, f"{image},board:7:0,5,5,0.01"]))
+    image = rows[1].split(",")[2]
+    (tmp_path / "labels.csv").write_text("\n".join([*rows, f"1,99,{image},12,board:7:0,5,5"]))
     assert compare(tmp_path, small_dataset / "truth.json").content()["labels"]["wrong"] == 1
