@@ -9,7 +9,6 @@ too. ``--paired`` starts it, BLAS left as it comes, alone and beside a process t
 a process doubles the wall time at least; threads that wait for each other would show in the processor's.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.io.files import json_text
 from stcal.parallel import ONE_THREAD
 from stcal.register import register
@@ -104,12 +104,7 @@ def paired(path: Path, rounds: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=int, default=100_000)
-    parser.add_argument("--sigma", type=float, default=0.05, help="mm per axis")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--paired", action="store_true", help="alone and beside a busy process instead")
-    given = parser.parse_args()
+    given = options_of(__doc__, rows=100_000, sigma=0.05, rounds=3, paired=False)
     with tempfile.TemporaryDirectory() as name:
         folder, columns = Path(name), []
         for share in SHARES:

@@ -7,7 +7,6 @@ one process as there are cores. ``measure`` is told in images a second and core,
 in seconds. The joint adjustment alone is that of the run's own models, in one process.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -24,6 +23,7 @@ import cv2
 import numpy as np
 from bench_rows import ADVISED, GROUPS, TREE, timed_advice, timed_boards, timed_handeye, timed_tree
 
+from scripts.runner import options_of
 from stcal.design import reference_board
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_toml, load_board, load_target
@@ -434,16 +434,9 @@ def best_of(rounds: list[dict]) -> dict:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--images", type=int, default=40, help=f"in {GROUPS} groups")
-    parser.add_argument("--width", type=int, default=5184, help="px; 3:2 images")
-    parser.add_argument("--keep", type=Path, help="render into this folder, or use what it holds")
-    parser.add_argument("--rounds", type=int, default=5, help="measure so often")
-    parser.add_argument("--large", type=int, default=10_000, help="images of the large set, measured once; 0 for none")
-    parser.add_argument("--json", type=Path, help="also write the numbers here")
-    given = parser.parse_args()
+    given = options_of(__doc__, images=40, width=5184, keep=Path, rounds=5, large=10_000, json=Path)
     if given.images % GROUPS or given.images < 4 * GROUPS:
-        parser.error(f"--images {given.images}: a multiple of {GROUPS}, at least {4 * GROUPS}, needed")
+        sys.exit(f"error: --images {given.images}: a multiple of {GROUPS}, at least {4 * GROUPS}, needed")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a user's modules are compiled from the second start on
     with tempfile.TemporaryDirectory() as scratch:
         os.environ.setdefault("PYTHONPYCACHEPREFIX", str(Path(scratch) / "compiled"))

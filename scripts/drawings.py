@@ -12,16 +12,14 @@ import argparse
 import ast
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from stcal.design import reference_board, reference_target
 from stcal.geometry.plane import circle_image_offset, circle_images
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.report.svg import COLOURS, FAINT, INK, calm, new_figure
+from stcal.report.svg import COLOURS, FAINT, INK, LETTER, Axes, Drawing, arrows, limits, save
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.forecast import observe, true_models
@@ -52,40 +50,38 @@ def images_of(radius_mm: np.ndarray, distance_mm: float, tilt_deg: float) -> tup
     return FOCAL_PX * centre, FOCAL_PX * shape, FOCAL_PX * xyz[:, :2] / xyz[:, 2:]
 
 
-def eccentricity():
+def eccentricity() -> Drawing:
     """Left: a large circle near the camera, where it can be seen; right: in px for radii and tilts at 1 m."""
-    figure = new_figure(8.4, 3.2)
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.15])
+    drawing = Drawing(8.4, 3.2)
+    left, right = drawing.panels(2, left=8, right=30, top=22, gap=56)
     centre, shape, true = (a[0] for a in images_of(np.array([150.0]), 400.0, 60.0))
     turn = np.linspace(0, 2 * np.pi, 400)
-    rim = centre[:, None] + shape @ np.array([np.cos(turn), np.sin(turn)])
-    left.fill(*rim, color=FAINT)
-    left.plot(*rim, color=INK, lw=1)
-    left.plot(*centre, "+", color=RED, ms=11, mew=2, label="centre of the ellipse: what is measured")
-    left.plot(*true, "o", color=BLUE, ms=6, label="image of the circle's centre: what is wanted")
-    left.set_aspect("equal")
-    left.axis("off")
-    left.set_title("radius 150 mm at 400 mm, 60° oblique", fontsize=8.5, color=INK)
-    left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.02), fontsize=7.5, frameon=False)
+    rim = (centre[:, None] + shape @ np.array([np.cos(turn), np.sin(turn)])).T
+    axes = Axes.equal(drawing, left, rim)
+    axes.lines([rim.T], INK, fill=FAINT)
+    axes.marks(*centre, "dash", 11, RED)
+    axes.marks(*centre, "bar", 11, RED)
+    axes.marks(*true, "dot", 6, BLUE)
+    drawing.words(((left[0] + left[2]) / 2, 9), "radius 150 mm at 400 mm, 60° oblique", 8.5)
+    drawing.key((left[0], left[3] + 8), {"centre of the ellipse: what is measured": ("dot", RED)})
+    drawing.key((left[0], left[3] + 20), {"image of the circle's centre: what is wanted": ("dot", BLUE)})
     radius = np.linspace(1, 10, 60)
-    for tilt, colour, up in zip((20.0, 40.0, 60.0), (GREEN, BLUE, RED), (-6, 3, -4), strict=True):
+    axes = Axes(drawing, right, (0.5, 10.2), (5e-4, 0.6), "y")
+    axes.frame("radius of the circle, mm", "eccentricity, px", "y")
+    for tilt, colour, up in zip((20.0, 40.0, 60.0), (GREEN, BLUE, RED), (5, -4, 3), strict=True):
         offset = np.stack([np.zeros_like(radius), np.zeros_like(radius), np.full_like(radius, 1000.0)], axis=1)
         normal = np.tile([-np.sin(np.radians(tilt)), 0.0, np.cos(np.radians(tilt))], (len(radius), 1))
         moved = circle_image_offset(offset, normal, radius)
         apart = FOCAL_PX * np.abs(moved[:, 0] / moved[:, 2])
-        right.plot(radius, apart, color=colour)
-        right.annotate(
-            f"{tilt:.0f}°", (radius[-1], apart[-1]), (3, up), textcoords="offset points", fontsize=7.5, color=colour
-        )
-    right.axhline(NOISE_PX, color=INK, lw=0.8, ls=":")
-    right.annotate("noise of a good centre, 0.01 px", (1, NOISE_PX), (2, 3), textcoords="offset points", fontsize=7.5)
-    calm(right)
-    right.set(xlabel="radius of the circle, mm", ylabel="eccentricity, px", yscale="log")
-    right.set_title("24 mm lens, 18 megapixels, at 1 m", fontsize=8.5, color=INK)
-    return figure
+        axes.lines([(radius, apart)], colour, 1.5)
+        axes.words(radius[-1], apart[-1], f"{tilt:.0f}°", (5, up), anchor="start", colour=colour)
+    axes.level(NOISE_PX, dash="1 2")
+    axes.words(10, NOISE_PX, "noise of a good centre, 0.01 px", (0, 8), anchor="end")
+    drawing.words(((right[0] + right[2]) / 2, 9), "24 mm lens, 18 megapixels, at 1 m", 8.5)
+    return drawing
 
 
-def residuals():
+def residuals() -> Drawing:
     """Residuals and errors of the faces with and without the correction, for circles of several sizes."""
     sizes, rows = (0.5, 0.75, 1.0, 1.5), []
     for size in sizes:
@@ -115,58 +111,43 @@ def residuals():
             f"radii × {size:g}: residuals {left:.4f} px, faces {apart:.1f} µm; uncorrected {plain_left:.4f} px, "
             f"{plain_apart:.1f} µm"
         )
-    figure = new_figure(8.4, 2.9)
-    for axes, k, title in zip(
-        figure.subplots(1, 2), (0, 1), ("residuals, px RMS", "error of the faces, µm RMS"), strict=True
-    ):
-        axes.plot(sizes, values[:, 1, k], "s--", color=RED, label="ellipse centres as they are")
-        axes.plot(sizes, values[:, 0, k], "o-", color=BLUE, label="corrected, one adjustment")
-        calm(axes)
-        axes.set(xlabel="radius over the reference design's", ylim=(0, None))
-        axes.set_title(title, fontsize=8.5, color=INK)
-    axes.legend(fontsize=7.5, frameon=False)
-    return figure
+    drawing = Drawing(8.4, 2.9)
+    titles = "residuals, px RMS", "error of the faces, µm RMS"
+    for k, (box, title) in enumerate(zip(drawing.panels(2, top=36), titles, strict=True)):
+        axes = Axes(drawing, box, limits(sizes), limits(values[..., k].ravel(), low=0))
+        axes.frame("radius over the reference design's", "")
+        for own, kind, colour in ((values[:, 1, k], "square", RED), (values[:, 0, k], "dot", BLUE)):
+            axes.lines([(sizes, own)], colour, 1.5)
+            axes.marks(sizes, own, kind, 5, colour)
+        drawing.words(((box[0] + box[2]) / 2, 27), title, 8.5)
+    drawing.key((46, 9), {"ellipse centres as they are": ("square", RED), "corrected, one adjustment": ("dot", BLUE)})
+    return drawing
 
 
-def chain():
+def boxed(drawing: Drawing, at, text: str, fill: str = "#ffffff", edge: str = INK, ink: str = INK) -> None:
+    """Words in a box."""
+    half = np.array([9 + LETTER * 4.5 * len(text), 11.0])
+    corners = np.array(at) + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    drawing.lines([corners], edge, 1, fill)
+    drawing.words(at, text, 9, colour=ink)
+
+
+def chain() -> Drawing:
     """Faces and the groups that see two of them, each with the board."""
-    figure = new_figure(8.4, 2.5)
-    axes = figure.subplots()
+    drawing = Drawing(8.4, 2.5)
+    axes = Axes(drawing, (0, 0, drawing.width, drawing.height), (-2.4, 5.4), (-1.5, 1.5))
     place = {"1": (0, 0), "2": (1.6, 0.9), "3": (3.6, 0.9), "4": (1.6, -0.9), "5": (-1.6, 0)}
     for one, two in (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3")):
         (x, y), (u, v) = place[one], place[two]
-        axes.plot([x, u], [y, v], color=BLUE, lw=2, zorder=1)
-        axes.text(
-            (x + u) / 2,
-            (y + v) / 2 + (0.16 if y == v else 0.34 if v > y else -0.42),
-            f"group {one}{two}",
-            ha="center",
-            fontsize=8,
-            color=BLUE,
-        )
+        axes.lines([((x, u), (y, v))], BLUE, 2)
+        up = 0.2 if y == v else 0.34 if v > y else -0.34
+        axes.words((x + u) / 2, (y + v) / 2 + up, f"group {one}{two}", size=8, colour=BLUE)
     for face, (x, y) in place.items():
-        axes.text(
-            x,
-            y,
-            f"face {face}",
-            ha="center",
-            va="center",
-            fontsize=9,
-            color="white" if face == "1" else INK,
-            bbox={"boxstyle": "round,pad=0.5", "fc": BLUE if face == "1" else "white", "ec": INK},
-        )
-    axes.annotate(
-        "target_from_face 3 = (1 ← 2) · (2 ← 3)",
-        (3.6, 0.45),
-        (3.6, -0.75),
-        ha="center",
-        fontsize=8.5,
-        color=RED,
-        arrowprops={"arrowstyle": "->", "color": RED},
-    )
-    axes.set(xlim=(-2.4, 5.4), ylim=(-1.4, 1.5))
-    axes.axis("off")
-    return figure
+        own = (BLUE, INK, "#ffffff") if face == "1" else ()
+        boxed(drawing, axes.at(x, y)[0], f"face {face}", *own)
+    axes.words(3.6, -0.75, "target_from_face 3 = (1 ← 2) · (2 ← 3)", size=8.5, colour=RED)
+    axes.arrows(np.array([[3.6, -0.6]]), np.array([[0, 1.2]]), 1.2, RED)
+    return drawing
 
 
 def imports() -> set[tuple[str, str]]:
@@ -181,67 +162,31 @@ def imports() -> set[tuple[str, str]]:
     return {(one, two) for one, two in found if one != two}
 
 
-def folders():
+def folders() -> Drawing:
     """Layers from what all rest on, below, to the commands, above; a line for each import between folders."""
-    figure = new_figure(8.4, 5.2)
-    axes = figure.subplots()
-    place = {}
-    for level, names in enumerate(LAYERS):
-        for k, name in enumerate(names):
-            place[name] = (2.0 * (k - (len(names) - 1) / 2), 1.25 * level)
-    for one, two in sorted(imports()):
-        if one in place and two in place:
-            (x, y), (u, v) = place[one], place[two]
-            axes.annotate("", (u, v + 0.24), (x, y - 0.24), arrowprops={"arrowstyle": "-", "color": FAINT, "lw": 1})
-    for name, (x, y) in place.items():
-        axes.text(
-            x,
-            y,
-            name,
-            ha="center",
-            va="center",
-            fontsize=9,
-            color=INK,
-            bbox={"boxstyle": "round,pad=0.4", "fc": "#e8f1f8" if name == "sfm" else "white", "ec": "#9aa0a8"},
-        )
-    steps = ("photographs", "detect", "mapping", "adjust", "checks", "report", "faces.json")
+    drawing = Drawing(8.4, 5.2)
     top = 1.25 * len(LAYERS)
-    at = [1.55 * (k - (len(steps) - 1) / 2) for k in range(len(steps))]
-    for x, name in zip(at, steps, strict=True):
-        inside = name not in (steps[0], steps[-1])
-        axes.text(
-            x,
-            top,
-            name,
-            ha="center",
-            va="center",
-            fontsize=8.5,
-            color=BLUE if inside else INK,
-            bbox={
-                "boxstyle": "round,pad=0.35",
-                "fc": "#e8f1f8" if inside else "white",
-                "ec": BLUE if inside else "none",
-            },
-        )
-    for one, two in pairwise(at):
-        axes.annotate(
-            "",
-            (two - 0.55, top),
-            (one + (0.72 if one == at[0] else 0.55), top),
-            arrowprops={"arrowstyle": "->", "color": BLUE},
-        )
-    axes.text(0, top + 0.5, "a photograph's way through stcal/sfm", ha="center", fontsize=8.5, color=INK)
-    axes.text(
-        0,
-        -0.75,
-        "each imports only what lies below it; the five systems never import each other",
-        ha="center",
-        fontsize=8.5,
-        color=INK,
-    )
-    axes.set(xlim=(-6.2, 6.2), ylim=(-1.0, top + 0.8))
-    axes.axis("off")
-    return figure
+    axes = Axes(drawing, (0, 0, drawing.width, drawing.height), (-6.2, 6.2), (-1.0, top + 0.8))
+    place = {
+        name: axes.at(2.0 * (k - (len(names) - 1) / 2), 1.25 * level)[0]
+        for level, names in enumerate(LAYERS)
+        for k, name in enumerate(names)
+    }
+    known = [(one, two) for one, two in sorted(imports()) if one in place and two in place]
+    drawing.lines([np.array([place[one] - [0, 11], place[two] + [0, 11]]) for one, two in known], FAINT)
+    for name, at in place.items():
+        boxed(drawing, at, name, "#e8f1f8" if name == "sfm" else "#ffffff", "#9aa0a8")
+    steps = ("photographs", "detect", "mapping", "adjust", "checks", "report", "faces.json")
+    at = axes.at(1.55 * (np.arange(len(steps)) - (len(steps) - 1) / 2), top)
+    for where, name in zip(at, steps, strict=True):
+        boxed(drawing, where, name, *(() if name in (steps[0], steps[-1]) else ("#e8f1f8", BLUE, BLUE)))
+    ends = [np.array([9 + LETTER * 4.5 * len(name), 0]) for name in steps]
+    starts = at[:-1] + ends[:-1]
+    drawing.lines(arrows(starts, at[1:] - ends[1:] - starts, 1.2), fill=BLUE)
+    axes.words(0, top + 0.55, "a photograph's way through stcal/sfm", size=8.5)
+    said = "each imports only what lies below it; the five systems never import each other"
+    axes.words(0, -0.75, said, size=8.5)
+    return drawing
 
 
 DRAWINGS: dict[str, Callable] = {d.__name__: d for d in (eccentricity, residuals, chain, folders)}
@@ -253,10 +198,9 @@ def main() -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(DRAWINGS)}; all if none")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures")
     arguments = parser.parse_args()
-    mpl.rcParams["svg.hashsalt"] = "stcal"
     for name in arguments.names or DRAWINGS:
         path = arguments.out / f"{name}.svg"
-        DRAWINGS[name]().savefig(path, bbox_inches="tight", facecolor="white", metadata={"Date": None})
+        save(DRAWINGS[name](), path)
         print(path)
 
 

@@ -14,10 +14,9 @@ without and with polishing; what λ = 1 means with lengths in m, cm and mm; the 
 Â_N = X B_N X⁻¹ of the six motions (the paper's measure, eqs. 24–26), and of X itself against the truth.
 """
 
-import argparse
-
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, motion_errors
@@ -126,10 +125,7 @@ def print_tables(trials: list[dict]) -> None:
 @one_thread()
 def main() -> None:
     """Run the seeds; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, seeds=100, scheduler=str)
     with executor_of(arguments.scheduler) as pool:
         trials = list(pool.map(trial, range(arguments.seeds)))
     print(f"{arguments.seeds} seeds, simulated; {FITTED} motions to solve with, {POSES - 1 - FITTED} held out")

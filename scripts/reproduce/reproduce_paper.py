@@ -11,13 +11,13 @@ against the dots as they really are too), the errors of the faces against the tr
 over the trials beside the predicted σ and the goals. With --keep, photographs and detections are used again.
 """
 
-import argparse
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.labels import dot_cells
@@ -134,11 +134,7 @@ def print_tables(trials: list[dict[str, Errors]]) -> None:
 @one_thread()
 def main() -> None:
     """Run the trials; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=5)
-    parser.add_argument("--width", type=int, default=5184, help="of the images, px")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep photographs and runs here, or use those")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, trials=5, width=5184, keep=Path)
     trials = []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(1, arguments.trials + 1):

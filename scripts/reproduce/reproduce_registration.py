@@ -14,13 +14,13 @@ Errors are those of 50 new places, against where the tool truly is, in the cube 
 them over several robots (median, and how many fits each method delivered).
 """
 
-import argparse
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import comb
 
+from scripts.runner import options_of
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
@@ -189,9 +189,7 @@ def print_table(trials: dict[tuple[float, float], list[dict]]) -> None:
 @one_thread()
 def main() -> None:
     """Run the trials; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=6, help="robots")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, trials=6)
     robots = f"{arguments.trials} robots as made, wrong points off by {OFF_MM[0]:g} to {OFF_MM[1]:g} mm"
     print(f"Simulated: {POINTS} points in a cube of {SMALL:.0f} mm, {SIGMA_MM} mm noise, {robots}")
     trials = {case: [trial(seed, case) for seed in range(arguments.trials)] for case in CASES}

@@ -10,13 +10,13 @@ compared with the commanded ones. Labels are simulated, no pixels; the distances
 camera measures, and the true ones of 51 other positions all over the arm's reach.
 """
 
-import argparse
 import time
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import parse_label
 from stcal.parallel import one_thread
@@ -332,14 +332,7 @@ def print_table(draws: list[Draw]) -> None:
 @one_thread()
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=100, help="arms")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--gears", type=float, default=0.0, metavar="MRAD", help="σ of the joints' periodic errors, which no model has"
-    )
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    given = parser.parse_args()
+    given = options_of(__doc__, draws=100, seed=0, gears=0.0, scheduler=str)
     start = time.perf_counter()
     sweeps()  # once, before the processes part
     for kind in (FAR, NEAR):

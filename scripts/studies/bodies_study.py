@@ -7,7 +7,6 @@ Each draw has its own faces (0.3 mm and 0.5° about the nominal ones), poses and
 face's pose against the reference face over its covariance, of 6, mean over faces and draws; 1 where σ are true.
 """
 
-import argparse
 import multiprocessing
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.boards.design import CharucoDesign
 from stcal.boards.target import printed_face
 from stcal.design import TargetDesign
@@ -77,12 +77,7 @@ def draw(name: str, seed: int) -> list[FaceErrors] | str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=10)
-    parser.add_argument(
-        "--body", default="", help="only bodies whose name has this word, such as mixed or dodecahedron"
-    )
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, draws=10, body="")
     print("| body | draws | faces found | error of a position, µm RMS | of a rotation, mdeg RMS | NEES |")
     print("|---|---|---|---|---|---|", flush=True)
     names = [name for name in BODIES if arguments.body in f"{name}, {BODIES[name][0].name}"]

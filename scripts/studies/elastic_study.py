@@ -25,6 +25,7 @@ from functools import partial
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, jacobian, observed, parameter_units, tip_jacobian, tips
@@ -199,14 +200,7 @@ def possible(true: Robot, data: Measurements, case: Case, q: np.ndarray, carried
 @one_thread()
 def main() -> None:
     """Run all cases; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines begin so")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
-    parser.add_argument("--payload", action="store_true", help="the cases with payloads")
-    parser.add_argument("--trees", action="store_true", help="the cases of two arms on a torso")
-    parser.add_argument("--approach", action="store_true", help="the cases with hysteresis")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, draws=200, only="", scheduler=str, payload=False, trees=False, approach=False)
     print(f"{arguments.draws} draws each, simulated\n")
     if arguments.payload:
         payloads(arguments)

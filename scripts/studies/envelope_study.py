@@ -17,7 +17,6 @@ leave the rims where they are, so that a shift is the program's own. µm, σ: th
 check failed.
 """
 
-import argparse
 import csv
 import json
 import os
@@ -35,6 +34,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
@@ -715,16 +715,17 @@ def rows_of(path: Path | None) -> dict[tuple, dict]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", type=Path, nargs="+", default=[SAMPLE], help="folders of rendered sets")
-    parser.add_argument("--only", default="", help="regular expression of kinds")
-    parser.add_argument("--strengths", default="1,2,3,4,5")
-    parser.add_argument("--bin", type=Path, default=Path(sys.executable).parent, help="folder of stcal-sfm")
-    parser.add_argument("--workers", type=int, default=2, help="processes of each run")
-    parser.add_argument("--json", type=Path, help="keep rows here, and take those that it has")
-    parser.add_argument("--compare", type=Path, help="an earlier file of --json")
-    parser.add_argument("--look", type=Path, help="write the first photograph of each case here, and run nothing")
-    given = parser.parse_args()
+    given = options_of(
+        __doc__,
+        sets=[SAMPLE],
+        only="",
+        strengths="1,2,3,4,5",
+        bin=Path(sys.executable).parent,
+        workers=2,
+        json=Path,
+        compare=Path,
+        look=Path,
+    )
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # folders are removed then
     strengths = [int(k) for k in given.strengths.split(",")]
     done, before = rows_of(given.json), rows_of(given.compare)

@@ -28,6 +28,7 @@ from stcal.parallel import ONE_THREAD
 
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
+from scripts.runner import options_of
 from stcal.io.files import json_text
 from stcal.io.files import save as write
 from tests.commands import CALLS, COMMANDS
@@ -92,18 +93,19 @@ def summary(found: list[Judged], seed: int) -> str:
 
 def main() -> None:
     """Run; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=1000, help="of spoiled inputs")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--kept", type=int, default=60, help="of files that runs keep")
-    parser.add_argument("--closed", type=int, default=20, help="of standard streams")
-    parser.add_argument("--drawn-only", action="store_true", help="no valid calls, mistakes and options")
-    parser.add_argument("--json", type=Path, help="keep every case here, and run none that it has")
-    parser.add_argument("--only", default="", metavar="CASE")
-    parser.add_argument("--no-mistakes", action="store_true")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__,
+        count=1000,
+        seed=1,
+        kills=20,
+        kept=60,
+        closed=20,
+        drawn_only=False,
+        json=Path,
+        only="",
+        no_mistakes=False,
+        workers=os.cpu_count() or 1,
+    )
     missing = set(COMMANDS) - {call.command for call in CALLS}
     if missing:
         sys.exit(f"no call in tests/commands.py of {', '.join(sorted(missing))}; add one")

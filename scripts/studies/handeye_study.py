@@ -9,7 +9,6 @@ covariance that the result states; 1 is true, more is too sure of itself. A seco
 off: by the σ that is stated of it, and by four times as much. Prints Markdown.
 """
 
-import argparse
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -17,6 +16,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
+from scripts.runner import options_of
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
@@ -136,12 +136,7 @@ def corner_bound(exact: Truth, noise: Noise) -> np.ndarray:
 @one_thread()
 def main() -> None:
     """Run all cases; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=500)
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases of methods that begin so")
-    parser.add_argument("--cameras", action="store_true", help="only the table of camera files that are off")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, trials=500, only="", cameras=False, scheduler=str)
     trials = arguments.trials
     low, high = np.sqrt(chi2.ppf([0.025, 0.975], 6 * trials) / (6 * trials))
     print(f"{trials} trials each, simulated; a ratio that is 1 lies within {low:.3f} … {high:.3f}\n")

@@ -7,11 +7,11 @@ solving is chosen as it is where no method is named. "Taken": the ways, and how 
 truth, mm, mean and largest, and the same for all sets solved by poses as filed.
 """
 
-import argparse
 from collections import Counter
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.handeye import HandEyeOptions, splits
 from stcal.handeye.judge.remarks import GOOD
 from stcal.handeye.pipeline import validated
@@ -25,9 +25,7 @@ POSES = (16, 25)
 
 def main() -> None:
     """Both numbers of poses."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", type=int, default=60, help="sets of each number of poses")
-    sets, good = parser.parse_args().sets, 0
+    sets, good = options_of(__doc__, sets=60).sets, 0
     print("| poses | good | taken | off | off as filed |\n|---|---|---|---|---|")
     for count in POSES:
         words, taken, off = [], Counter(), []

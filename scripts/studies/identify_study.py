@@ -11,12 +11,12 @@ predicted too (``partial``; the robot file has the tool to 5 mm); rows of an ins
 robot with two arms on a torso and three markers.
 """
 
-import argparse
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import Observed, State, jacobian, observed, residuals, tips
@@ -179,11 +179,7 @@ def without_noise(case: Case, true: Robot, count: int, rng: np.random.Generator,
 
 @one_thread()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines have this")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    given = parser.parse_args()
+    given = options_of(__doc__, draws=200, only="", scheduler=str)
     draws = given.draws
     began = time.perf_counter()
     print(f"simulated arms, {draws} draws: eᵀC⁻¹e over its degrees of freedom, expected 1")

@@ -8,12 +8,12 @@ the line of sight, and of the rotation), how many images are ambiguous, how many
 many of those are called certain, and the time of one pose.
 """
 
-import argparse
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.geometry.camera import intrinsic_basis
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
@@ -100,10 +100,7 @@ def rows_of(case: Case, images: range) -> list[tuple]:
 @one_thread()
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--images", type=int, default=500)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    given = parser.parse_args()
+    given = options_of(__doc__, images=500, scheduler=str)
     count = given.images
     print(f"{count} simulated images each, 2592×1728 px, 24 mm lens; 600–1500 mm and 0–65° where nothing else is said")
     print(

@@ -6,13 +6,13 @@ Each row is held out once in each division into six parts, of which there are fi
 positions, mm: mean over the seeds, and least and most of them.
 """
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from same_results import prepare
 
+from scripts.runner import options_of
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot
@@ -21,9 +21,7 @@ from stcal.robot.kinematics.measurements import read_measurements
 
 def main() -> None:
     """Identify with every seed; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=5)
-    seeds = range(parser.parse_args().seeds)
+    seeds = range(options_of(__doc__, seeds=5).seeds)
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder))
         robot = load_robot(Path(folder) / "rokae.toml")

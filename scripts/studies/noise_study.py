@@ -9,12 +9,12 @@ of the position and rotation errors, the Cramér–Rao bound of the position (th
 was put in, σ₀ = 1), and the position error of the uncorrected control (no eccentricity, chained), in the same labels.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
@@ -117,10 +117,7 @@ def print_table(found: dict[Point, np.ndarray]) -> None:
 @one_thread()
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20, help="runs at each point")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    given = parser.parse_args()
+    given = options_of(__doc__, seeds=20, scheduler=str)
     found = study(given.seeds, given.scheduler)
     print(f"Simulated labels, 5184×3456 px, {given.seeds} runs at each point, RMS over faces 2–5\n")
     print_table(found)

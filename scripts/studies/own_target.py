@@ -6,12 +6,13 @@ The board is that of ``init``; ``design`` makes a target for a cube of 130 mm ar
 images of 9 megapixels is rendered from afar as ``design`` was told, calibrated, and compared with the truth.
 """
 
-import argparse
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from scripts.runner import options_of
 
 GROUPS = "front-right,front-left,front-top,right-back"
 DISTANCE, WIDTH, IMAGES = "900", "3672", "5"
@@ -21,9 +22,7 @@ WORKERS = ("--workers", "1")
 
 def main() -> None:
     """Every command, and what of its answer matters."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="a new folder to keep; a temporary one if not given")
-    out = parser.parse_args().out
+    out = options_of(__doc__, out=Path).out
     with tempfile.TemporaryDirectory() as temporary:
         folder = out or Path(temporary)
         folder.mkdir(parents=True, exist_ok=out is None)

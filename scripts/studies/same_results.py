@@ -138,129 +138,67 @@ def robot_table(folder: Path) -> str:
 
 
 def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
-    """(name, arguments of ``stcal``); outputs of a command go into the folder of its name."""
-    target = DATA / "stereo_target"
+    """(name, arguments of ``stcal``); outputs of a command go into the folder of its name, ``@``."""
     found = []
+    places = {"data": DATA, "inputs": inputs, "out": out, "set": DATA / "stereo_target"}
 
-    def add(name: str, *words) -> Path:
-        found.append((name, [str(word).replace("@", str(out / name)) for word in words]))
-        return out / name
+    def add(name: str, command: str) -> None:
+        found.append((name, [word.replace("@", str(out / name)).format(**places) for word in command.split()]))
 
-    def run(name: str, images: Path, camera: Path, *more) -> Path:
-        return add(name, "sfm", "run", images, "--camera", camera, "--out", "@/run", *more) / "run"
-
-    demo = add("demo", "sfm", "demo", "--out", "@/demo") / "demo"
-    sets = {name: target / name / "images" for name in ("sample", "clean", "clutter", "exact", "white_block")}
-    sets["exact_png"] = target / "exact" / "images_png"
-    for name, images in sets.items():
-        folder = images.parent
-        more = [f"--{k}={folder / f'{k}.toml'}" for k in ("target", "board") if (folder / f"{k}.toml").exists()]
-        done = run(f"run_{name}", images, folder / "cameras.txt", *more)
-        if name != "exact_png":
-            add(f"compare_{name}", "sfm", "compare", done, folder / "truth.json", "--json", "@/compare.json")
-    images, camera = sets["sample"], target / "sample" / "cameras.txt"
-    sample = out / "run_sample" / "run"
-    run("run_chain", images, camera, "--solve", "chain")
-    run("run_refined", images, camera, "--refine-camera")
-    run("run_control", images, camera, "--no-eccentricity")
-    add("detect", "sfm", "detect", images, "--camera", camera, "--out", "@/detect")
-    files = ["--out", "@/poses.csv", "--json", "@/poses.json", "--report", "@/p.html"]
-    add("measure", "sfm", "measure", images, "--camera", camera, "--faces", sample / "faces.json", *files)
-    add("calibrate_camera", "sfm", "calibrate-camera", images, "--out", "@/cameras.txt")
-    add("advise", "sfm", "advise", sample, "--count", "2", "--json", "@/advice.json")
-    add("plan", "sfm", "plan", "--images", "6", "--json", "@/plan.json")
-    for kind in ("colmap-txt", "nvm", "bundler"):
-        add(f"export_{kind}", "sfm", "export-model", sample, "@/model", "--format", kind)
-    add("faces", "sfm", "faces", demo / "run" / "colmap" / "models", "--run", demo / "run", "--out", "@/faces.json")
-    add("crosscheck", "sfm", "crosscheck", demo / "run")
-
-    add(
-        "axes",
-        "robot",
-        "axes",
-        inputs / "fanuc.csv",
-        "--robot",
-        inputs / "fanuc.toml",
-        "--out",
-        "@/axes.toml",
-        "--json",
-        "@/axes.json",
-        "--report",
-        "@/p.html",
-    )
-    rokae = inputs / "rokae.toml"
-    for kind in ("pose", "position", "distance"):
+    add("demo", "sfm demo --out @/demo")
+    for name in ("sample", "clean", "clutter", "exact", "white_block", "exact_png"):
+        folder = name.removesuffix("_png")
+        designs = [k for k in ("target", "board") if (places["set"] / folder / f"{k}.toml").exists()]
+        more = " ".join(f"--{k}={{set}}/{folder}/{k}.toml" for k in designs)
+        images = "images_png" if name == "exact_png" else "images"
         add(
-            f"identify_{kind}",
-            "robot",
-            "identify",
-            inputs / "rokae.csv",
-            "--robot",
-            rokae,
-            "--observe",
-            kind,
-            "--out",
-            "@/robot.toml",
-            "--json",
-            "@/robot.json",
-            "--report",
-            "@/p.html",
+            f"run_{name}", f"sfm run {{set}}/{folder}/{images} --camera {{set}}/{folder}/cameras.txt --out @/run {more}"
         )
-    identified = out / "identify_pose" / "robot.toml"
-    add(
-        "compensate",
-        "robot",
-        "compensate",
-        inputs / "targets.csv",
-        "--robot",
-        identified,
-        "--nominal",
-        rokae,
-        "--out",
-        "@/joints.csv",
-        "--json",
-        "@/all.json",
-        "--report",
-        "@/p.html",
-    )
-    add("verify", "robot", "verify", inputs / "measured.csv", "--json", "@/all.json", "--report", "@/p.html")
-    add(
-        "design",
-        "robot",
-        "design",
-        "--robot",
-        rokae,
-        "--count",
-        "24",
-        "--candidates",
-        "200",
-        "--out",
-        "@/poses.csv",
-        "--json",
-        "@/all.json",
-        "--report",
-        "@/p.html",
-    )
+        if name != "exact_png":
+            add(
+                f"compare_{name}", f"sfm compare {{out}}/run_{name}/run {{set}}/{name}/truth.json --json @/compare.json"
+            )
+    sample, images, camera = "{out}/run_sample/run", "{set}/sample/images", "--camera {set}/sample/cameras.txt"
+    for name, option in (
+        ("chain", "--solve chain"),
+        ("refined", "--refine-camera"),
+        ("control", "--no-eccentricity"),
+    ):
+        add(f"run_{name}", f"sfm run {images} {camera} --out @/run {option}")
+    add("detect", f"sfm detect {images} {camera} --out @/detect")
+    files = "--out @/poses.csv --json @/all.json --report @/p.html"
+    measured = files.replace("all.json", "poses.json")
+    add("measure", f"sfm measure {images} {camera} --faces {sample}/faces.json {measured}")
+    add("calibrate_camera", f"sfm calibrate-camera {images} --out @/cameras.txt")
+    add("advise", f"sfm advise {sample} --count 2 --json @/advice.json")
+    add("plan", "sfm plan --images 6 --json @/plan.json")
+    for kind in ("colmap-txt", "nvm", "bundler"):
+        add(f"export_{kind}", f"sfm export-model {sample} @/model --format {kind}")
+    add("faces", "sfm faces {out}/demo/demo/run/colmap/models --run {out}/demo/demo/run --out @/faces.json")
+    add("crosscheck", "sfm crosscheck {out}/demo/demo/run")
 
-    register = ["--out", "@/all.json", "--report", "@/p.html"]
+    page = "--json @/all.json --report @/p.html"
+    robot, rokae = "--out @/robot.toml --json @/robot.json --report @/p.html", "--robot {inputs}/rokae.toml"
+    axes = robot.replace("robot", "axes")
+    add("axes", f"robot axes {{inputs}}/fanuc.csv --robot {{inputs}}/fanuc.toml {axes}")
+    for kind in ("pose", "position", "distance"):
+        add(f"identify_{kind}", f"robot identify {{inputs}}/rokae.csv {rokae} --observe {kind} {robot}")
+    models = "--robot {out}/identify_pose/robot.toml --nominal {inputs}/rokae.toml"
+    add("compensate", f"robot compensate {{inputs}}/targets.csv {models} --out @/joints.csv {page}")
+    add("verify", f"robot verify {{inputs}}/measured.csv {page}")
+    add("design", f"robot design {rokae} --count 24 --candidates 200 {files}")
+
+    result = "--out @/all.json --report @/p.html"
     for model in ("rigid", "similarity", "affine"):
-        add(f"register_{model}", "register", inputs / "pairs.csv", "--model", model, *register)
-    add("register_least", "register", inputs / "pairs.csv", "--method", "least-squares", *register)
-    add("register_liu", "register", inputs / "pairs.csv", "--method", "liu2017", *register)
-    hilti = inputs / "hilti"
+        add(f"register_{model}", f"register {{inputs}}/pairs.csv --model {model} {result}")
+    add("register_least", f"register {{inputs}}/pairs.csv --method least-squares {result}")
+    add("register_liu", f"register {{inputs}}/pairs.csv --method liu2017 {result}")
     for name in ("flat", "outdoor"):
-        add(f"register_{name}", "register", hilti / f"{name}.csv", *register)
-    add(
-        "register_robot",
-        "register",
-        hilti / "flat.csv",
-        "--robot",
-        hilti / "robot.toml",
-        "--identified",
-        "@/robot.toml",
-        *register,
-    )
+        add(f"register_{name}", f"register {{inputs}}/hilti/{name}.csv {result}")
+    known = "--robot {inputs}/hilti/robot.toml --identified @/robot.toml"
+    add("register_robot", f"register {{inputs}}/hilti/flat.csv {known} {result}")
 
+<<<<<<< HEAD
     add(
         "handeye_poses",
         "handeye",
@@ -317,42 +255,27 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
         "@/all.json",
     ]
     add("handeye_dots", *given)
+=======
+    add("handeye_poses", f"handeye {{inputs}}/handeye.csv --method all --splits 3 --out @/hand.json {page}")
+    charuco = "{data}/charuco_handeye/test_set_charuco"
+    camera, board = f"--camera {charuco}/cal_data.yaml", "--board {inputs}/charuco.toml"
+    given = f"handeye {charuco}/images --poses {charuco}/poses {camera} {board} --setup eye-to-hand --held-out 5"
+    for name, options in (
+        ("", ""),
+        ("_all", "--method all"),
+        ("_refined", "--refine-camera --with-scale --camera-out @/cameras.txt"),
+    ):
+        add(f"handeye_charuco{name}", f"{given} --splits 3 {page} {options}")
+    dots = "{data}/dotgrid_handeye"
+    known = f"--poses {dots}/poses --camera {dots}/camera_intr_calibrated.yaml --board {{inputs}}/dots.toml"
+    add("handeye_dots", f"handeye {dots}/images {known} --with-scale --splits 2 --json @/all.json")
+>>>>>>> figures
 
-    folder = DATA / "charuco_handeye" / "test_set_charuco"
-    camera = ["--camera", folder / "cal_data.yaml"]
-    add(
-        "locate_calibrate",
-        "locate",
-        "calibrate",
-        folder / "images",
-        *camera,
-        "--board",
-        inputs / "charuco.toml",
-        "--layout",
-        inputs / "layout.toml",
-        "--out",
-        "@/layout.toml",
-        "--json",
-        "@/all.json",
-    )
+    layout = "--layout {inputs}/layout.toml --out @/layout.toml --json @/all.json"
+    add("locate_calibrate", f"locate calibrate {charuco}/images {camera} {board} {layout}")
     for method in ("joint", "patent"):
-        add(
-            f"locate_{method}",
-            "locate",
-            "run",
-            folder / "images",
-            *camera,
-            "--layout",
-            out / "locate_calibrate" / "layout.toml",
-            "--method",
-            method,
-            "--out",
-            "@/poses.csv",
-            "--json",
-            "@/all.json",
-            "--report",
-            "@/p.html",
-        )
+        layout = f"--layout {{out}}/locate_calibrate/layout.toml --method {method}"
+        add(f"locate_{method}", f"locate run {charuco}/images {camera} {layout} {files}")
     return found
 
 

@@ -7,11 +7,11 @@ intrinsics (the given ones drawn from their σ): RMS of the position errors over
 covariance with σ₀ = 1 at the noise that was put in), and the mean normalised squared error eᵀC⁻¹e/6 of the face poses.
 """
 
-import argparse
 from dataclasses import replace
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.design import reference_board
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
@@ -64,10 +64,7 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
 @one_thread()
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the trials to this Dask cluster")
-    given = parser.parse_args()
+    given = options_of(__doc__, runs=200, scheduler=str)
     count = given.runs
     print(f"{count} runs each, {NOISE_PX} px noise, 4 groups of 6 images, 2592×1728 px (simulated labels)")
     print(f"{'':28} error / bound   normalised squared error")

@@ -11,7 +11,6 @@ group is not "Yes"; an error names a cause only by what it says as the likely ca
 centres of the same sets with new noise of the σ of each centre.
 """
 
-import argparse
 import json
 import multiprocessing
 import tempfile
@@ -24,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
@@ -583,12 +583,7 @@ def sound(where: str, seed: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", help="causes with this word in their name")
-    parser.add_argument("--sets", default="sample,block,own")
-    parser.add_argument("--sound", type=int, default=40, help="draws of each sound set")
-    parser.add_argument("--json", type=Path, help="write each run here")
-    given = parser.parse_args()
+    given = options_of(__doc__, only="", sets="sample,block,own", sound=40, json=Path)
     sets = given.sets.split(",")
     causes = [name for name in CAUSES if given.only in name]
     pool = ProcessPoolExecutor(mp_context=multiprocessing.get_context("fork"))

@@ -8,12 +8,12 @@ what they do by the good rows alone, these known; ``worst`` of that ratio; ``nam
 among the outliers; ``called wrong`` : good rows that are, of all draws.
 """
 
-import argparse
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
+from scripts.runner import options_of
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import State, observed, residuals, tips
@@ -109,11 +109,7 @@ def error(found: Identified, true: Robot, seed: int) -> float:
 @one_thread()
 def main() -> None:
     """Run all cases; print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=200)
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose lines begin so")
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="hand the draws to this Dask cluster")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, draws=200, only="", scheduler=str)
     print(f"{arguments.draws} draws each, simulated\n")
     print("| observed | rows | wrong | by, mm | within 1.1 | worst | named | called wrong |\n" + "|---" * 8 + "|")
     with executor_of(arguments.scheduler) as pool:
