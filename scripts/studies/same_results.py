@@ -198,68 +198,11 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
     known = "--robot {inputs}/hilti/robot.toml --identified @/robot.toml"
     add("register_robot", f"register {{inputs}}/hilti/flat.csv {known} {result}")
 
-<<<<<<< HEAD
-    add(
-        "handeye_poses",
-        "handeye",
-        inputs / "handeye.csv",
-        "--method",
-        "all",
-        "--splits",
-        "3",
-        "--out",
-        "@/hand.json",
-        "--json",
-        "@/all.json",
-        "--report",
-        "@/p.html",
-    )
-    folder = DATA / "charuco_handeye" / "test_set_charuco"
-    given = [
-        "handeye",
-        folder / "images",
-        "--poses",
-        inputs / "charuco_poses.csv",
-        "--camera",
-        folder / "cal_data.yaml",
-        "--board",
-        inputs / "charuco.toml",
-        "--setup",
-        "eye-to-hand",
-        "--held-out",
-        "5",
-        "--splits",
-        "3",
-        "--json",
-        "@/all.json",
-        "--report",
-        "@/p.html",
-    ]
-    add("handeye_charuco", *given)
-    add("handeye_charuco_all", *given, "--method", "all")
-    add("handeye_charuco_refined", *given, "--refine-camera", "--with-scale", "--camera-out", "@/cameras.txt")
-    folder = DATA / "dotgrid_handeye"
-    given = [
-        "handeye",
-        folder / "images",
-        "--poses",
-        inputs / "dots_poses.csv",
-        "--camera",
-        folder / "camera_intr_calibrated.yaml",
-        "--board",
-        inputs / "dots.toml",
-        "--with-scale",
-        "--splits",
-        "2",
-        "--json",
-        "@/all.json",
-    ]
-    add("handeye_dots", *given)
-=======
     add("handeye_poses", f"handeye {{inputs}}/handeye.csv --method all --splits 3 --out @/hand.json {page}")
     charuco = "{data}/charuco_handeye/test_set_charuco"
     camera, board = f"--camera {charuco}/cal_data.yaml", "--board {inputs}/charuco.toml"
-    given = f"handeye {charuco}/images --poses {charuco}/poses {camera} {board} --setup eye-to-hand --held-out 5"
+    poses = "--poses {inputs}/charuco_poses.csv --setup eye-to-hand --held-out 5"
+    given = f"handeye {charuco}/images {poses} {camera} {board}"
     for name, options in (
         ("", ""),
         ("_all", "--method all"),
@@ -267,9 +210,11 @@ def tasks(inputs: Path, out: Path) -> list[tuple[str, list]]:
     ):
         add(f"handeye_charuco{name}", f"{given} --splits 3 {page} {options}")
     dots = "{data}/dotgrid_handeye"
-    known = f"--poses {dots}/poses --camera {dots}/camera_intr_calibrated.yaml --board {{inputs}}/dots.toml"
-    add("handeye_dots", f"handeye {dots}/images {known} --with-scale --splits 2 --json @/all.json")
->>>>>>> figures
+    known = f"--camera {dots}/camera_intr_calibrated.yaml --poses {{inputs}}/dots_poses.csv"
+    add(
+        "handeye_dots",
+        f"handeye {dots}/images {known} --board {{inputs}}/dots.toml --with-scale --splits 2 --json @/all.json",
+    )
 
     layout = "--layout {inputs}/layout.toml --out @/layout.toml --json @/all.json"
     add("locate_calibrate", f"locate calibrate {charuco}/images {camera} {board} {layout}")
