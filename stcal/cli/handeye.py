@@ -389,14 +389,12 @@ def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None
     from stcal.handeye import EvolutionOptions
     from stcal.workflows.handeye.calibrate import ALL
 
-    bounds = {
-        "bounds_rad": _bounds("--de-bounds-deg", bounds_deg, math.radians(1)),
-        "bounds_mm": _bounds("--de-bounds-mm", bounds_mm, 1.0),
-    }
-    given = {name: value for name, value in bounds.items() if value is not None}
-    if given and method not in (ALL, "de", "de-polished"):
+    turn = _bounds("--de-bounds-deg", bounds_deg, math.radians(1))
+    shift = _bounds("--de-bounds-mm", bounds_mm, 1.0)
+    if (turn or shift) and method not in (ALL, "de", "de-polished"):
         raise InputError("E-OPTION-NEEDS", f"--de-bounds-…: only with --method de, de-polished or {ALL}")
-    return EvolutionOptions(**given)
+    options = EvolutionOptions(bounds_mm=shift)
+    return replace(options, bounds_rad=turn) if turn else options
 
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":

@@ -451,22 +451,6 @@ def test_turned_views_are_put_right(setup, turned):
         assert found.notes[0].endswith(", ".join(f"pose {i + 1}" for i in kept))
 
 
-def test_corners_of_turned_views_are_put_right():
-    """Numbered from the other end in two views: the adjustment comes out as without, to rounding."""
-    truth = simulated_views(np.random.default_rng(13), 8, corner_px=0.1)
-    xyz = board_corners(8, 7, 25.0)
-    other = np.argsort(((HALF @ xyz)[:, None] - xyz[None]).__pow__(2).sum(2), axis=1)[:, 0]
-    views = list(truth.views.views)
-    for i in (1, 6):
-        views[i] = View(xyz, views[i].xy_px[other])
-    views = Views(truth.views.camera, tuple(views))
-    pairs = pairs_of_views(truth.pairs.base_from_flange, views)
-    found = handeye(pairs, views=views, options=HandEyeOptions(symmetries=(HALF,)))
-    assert found.notes == ("numbered from another end of the board, and corrected: pose 2, pose 7",)
-    plain = handeye(truth.pairs, views=truth.views)
-    assert found.mount_from_camera.translation == pytest.approx(plain.mount_from_camera.translation, abs=1e-5)
-
-
 def test_corners_of_a_square_board_are_put_right():
     """Numbered from another corner, a quarter turn on: the corners fit where they then belong."""
     truth = simulated_views(np.random.default_rng(15), 9)

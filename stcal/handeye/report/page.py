@@ -150,7 +150,6 @@ def outcome_report(outcome: Outcome) -> Document:
     if outcome.held_out is not None:
         held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
         held_out += [f"held out, mean {text}" for text in _agreeing_text(outcome)]
-    camera = adjusted(outcome)
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *(block for item in _transforms(result) for block in transform_blocks(*item)),
@@ -162,11 +161,20 @@ def outcome_report(outcome: Outcome) -> Document:
         Table(["<what errs, and by how much", "σ", "<"], sigma_rows(outcome)),
         "" if result.sigma_scale is None else scale_text(outcome, result.sigma_scale),
         "" if result.observability is None else turns_text(result.observability),
-        fold("Camera, as adjusted (first pixel's centre at 0, 0)", Table(["<", "value", "± σ", "<unit"], camera or [])),
+        fold(
+            "Camera, as adjusted (first pixel's centre at 0, 0)",
+            Table(["<", "value", "± σ", "<unit"], adjusted(outcome)),
+        ),
         *remark_blocks([note for note in outcome.all_notes() if isinstance(note, Aside)], outcome.understood),
         findings_fold(judged(outcome)),
     ]
     heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
+    rows, contradicting = pose_rows(result), "left out, contradicting the others"
+    poses: list[Block] = [
+        legend({"used": GOOD, contradicting: BAD} if outcome.outliers() else {}),
+        macro("pose_chart", lambda: pose_bars(result), "By how much the chain through each pose misses the board"),
+        fold(f"{len(rows)} poses", Table(heads, rows)),
+    ]
     return Document(
         f"Hand-eye calibration: {frames.camera}",
         f"{outcome.where}: {_headline(outcome)}",
@@ -176,12 +184,7 @@ def outcome_report(outcome: Outcome) -> Document:
             Section("The arm", _arm(outcome.arm), terminal=True),
             Section("Methods", _methods(outcome), terminal=True),
             Section("Motions held out", _motions(outcome.motions), terminal=True),
-            Section(
-                "Poses",
-                pose_blocks(
-                    result, heads, "By how much the chain through each pose misses the board", len(outcome.outliers())
-                ),
-            ),
+            Section("Poses", poses),
             Section("Coverage of the image", [Html(lambda: html(*coverage_blocks(outcome)))]),
             Section("What the motions tell", _turns(outcome)),
             Section("Overlays", photograph_blocks(outcome)),
@@ -317,17 +320,6 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
     ]
 
 
-def pose_blocks(result: HandEye, heads: list[str], caption: str, contradicting: int) -> list[Block]:
-    """Returns the chart of each pose's residuals, and their table, folded."""
-    colours = {"used": GOOD, "left out, contradicting the others": BAD} if contradicting else {}
-    rows = pose_rows(result)
-    return [
-        legend(colours),
-        macro("pose_chart", lambda: pose_bars(result), caption),
-        fold(f"{len(rows)} {'images' if heads[0] == '<image' else 'poses'}", Table(heads, rows)),
-    ]
-
-
 def coverage_blocks(outcome: Outcome) -> list[Block]:
     """Returns how much of the image the board covered, with the residuals over it."""
     views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
@@ -429,11 +421,11 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     return headline
 
 
-def adjusted(outcome: Outcome) -> list[list[str]] | None:
-    """Returns rows of the camera's parameters, or None if they were not adjusted."""
+def adjusted(outcome: Outcome) -> list[list[str]]:
+    """Returns rows of the camera's parameters; none if they were not adjusted."""
     adjustment = outcome.result.reprojection
     if adjustment is None or adjustment.camera_covariance is None:
-        return None
+        return []
     sigma = dict(
         zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(adjustment.camera_covariance)), strict=True)
     )
