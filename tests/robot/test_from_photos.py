@@ -245,35 +245,24 @@ def test_the_inputs_of_these_tests_are_taken(given):
         given(["photo", *JOINTS], rows_of(), key="photo")
 
 
-def test_a_folder_without_photographs(given, tmp_path):
+NAMED, OTHERS, TWICE = rows_of(), rows_of([f"b/{i}.png" for i in range(8)]), rows_of(["a/000.png"] * 2)
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "error"),
+    [
+        (NAMED, {"images": "empty"}, "E-IMAGES-NONE … jpg"),
+        (OTHERS, {}, "E-TABLES-UNMATCHED … image … a/000.png … b/0.png"),
+        (NAMED, {"key": "photo"}, "E-TABLE-COLUMN-MISSING … log.csv … photo … --key"),
+        (TWICE, {}, "E-TABLE-ROW-REPEATED … 3 … image … a/000.png … 2"),
+        (NAMED, {"robot": five_joints()}, "E-ROBOT-MISMATCH … log.csv … 6 … MH80 … 5"),
+        (NAMED, {"robot": seven_joints()}, "E-TABLE-COLUMN-MISSING … log.csv … no such column … q7_rad or q7_deg"),
+    ],
+)
+def test_what_is_refused(given, tmp_path, rows, options, error):
     (tmp_path / "empty").mkdir()
-    with fails_with("E-IMAGES-NONE … jpg"):
-        given(["image", *JOINTS], rows_of(), images="empty")
-
-
-def test_no_names_in_common(given):
-    with fails_with("E-TABLES-UNMATCHED … image … a/000.png … b/0.png"):
-        given(["image", *JOINTS], rows_of([f"b/{i}.png" for i in range(8)]))
-
-
-def test_no_such_key(given):
-    with fails_with("E-TABLE-COLUMN-MISSING … log.csv … photo … --key"):
-        given(["image", *JOINTS], rows_of(), key="photo")
-
-
-def test_a_photograph_twice(given):
-    with fails_with("E-TABLE-ROW-REPEATED … 3 … image … a/000.png … 2"):
-        given(["image", *JOINTS], rows_of(["a/000.png"] * 2))
-
-
-def test_a_robot_of_fewer_joints(given):
-    with fails_with("E-ROBOT-MISMATCH … log.csv … 6 … MH80 … 5"):
-        given(["image", *JOINTS], rows_of(), five_joints())
-
-
-def test_a_robot_of_more_joints(given):
-    with fails_with("E-TABLE-COLUMN-MISSING … log.csv … no such column … q7_rad or q7_deg"):
-        given(["image", *JOINTS], rows_of(), seven_joints())
+    with fails_with(error):
+        given(["image", *JOINTS], rows, **options)
 
 
 def test_targets_of_a_tool_that_is_not_photographed(given):

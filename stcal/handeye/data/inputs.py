@@ -72,11 +72,8 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
         The message says what is wrong with the file, or that it holds poses of one side only.
     """
     content = read_content(path, statements, key, quaternions)
-    return None if content is None else _told(content, path, statements)
-
-
-def _told(content: Content, path: Path, statements: Said) -> Told:
-    """Returns the pose pairs of a file's content; errors as :func:`read_pairs`."""
+    if content is None:
+        return None
     if not content.both:
         side = content.sides[0]
         held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, robot or camera"
@@ -121,8 +118,12 @@ def read_two(
         return None
     sides = []
     for role, path, content, own in zip(FRAMES, (first, second), contents, keys, strict=True):
-        content_of_side = content or _of_table(read_table(path, "table", quaternions), statements, own)
-        sides.append(settled(_side(content_of_side, role, path), role, content_of_side, path, statements))
+        if content is None:
+            table = read_table(path, "table", quaternions)
+            content = read_columns(table, own, statements)
+            if content is None:
+                raise _no_poses(table)
+        sides.append(settled(_side(content, role, path), role, content, path, statements))
     robot, camera = sides
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
     if (
@@ -185,14 +186,6 @@ def require_own(path: Path, quaternions: Order = "wxyz") -> None:
     table = read_table(path, "table", quaternions)
     if not todays(table):
         raise _no_poses(table)
-
-
-def _of_table(table: Table, statements: Said, key: str) -> Content:
-    """Returns the poses of one side in a table of the package's own."""
-    content = read_columns(table, key, statements)
-    if content is None:
-        raise _no_poses(table)
-    return content
 
 
 def _no_poses(table: Table) -> InputError:
