@@ -399,5 +399,5 @@ def test_errors(small_run, stcal_sfm, tmp_path):
     for kind in FORMATS:
         assert "damaged or incomplete" in refused(own, out, kind)
     shutil.rmtree(model)
-    assert "no target_model; run it again" in refused(own, out)
+    assert "no colmap/target_model; run it again" in refused(own, out)
     assert list(out.parent.iterdir()) == []
