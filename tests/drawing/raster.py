@@ -9,6 +9,8 @@ from stcal.geometry.camera import COEFFICIENTS, Camera
 
 PER_MM = 4
 """With fewer, the letters beside a plate pass for circles seen from the side."""
+FINE = 4
+"""Pixels in which a page is drawn in a pixel of its image, along each side."""
 OBLIQUE_RAD = np.radians(50)
 
 
@@ -24,8 +26,14 @@ def page_image(sheet) -> np.ndarray:
 
 def pages_of(content: bytes) -> list[np.ndarray]:
     """Pages of a PDF as another program draws them, grey."""
-    document = PdfDocument(content)
-    return [page.render(scale=PER_MM * POINT_MM, grayscale=True).to_numpy().copy() for page in document]
+    scale, pages = PER_MM * POINT_MM, []
+    for page in PdfDocument(content):
+        whole = np.ceil(np.array(page.get_size()) * scale - 1e-3)  # else the page is stretched to whole pixels
+        page.set_mediabox(0, 0, *(whole / scale).tolist())
+        # PDFium moves the sides of rectangles to whole pixels: these are made small.
+        fine = page.render(scale=FINE * scale * (1 - 1e-7), grayscale=True).to_numpy()
+        pages.append(cv2.resize(fine, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA))
+    return pages
 
 
 def pixel_from_page(image: np.ndarray, xy_mm: np.ndarray) -> np.ndarray:
