@@ -17,7 +17,7 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("alone", "errors", "parallel", "one_thread", "cross_validation", "row_order"),
+    ("alone", "errors", "parallel", "cross_validation", "row_order"),
     ("geometry",),
     ("design", "labels", "lookalikes", "lengths"),
     ("io",),

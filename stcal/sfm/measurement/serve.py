@@ -20,8 +20,8 @@ import h11
 
 import stcal
 from stcal.errors import InputError
-from stcal.parallel import LOOK_S
 from stcal.sfm.measurement.live import LiveView
+from stcal.sfm.measurement.own_process import LOOK_S
 from stcal.sfm.measurement.service import BUSY, DONE, FAILED, NO_POSE, REFUSED, Answer, MeasureService, refusal
 from stcal.sfm.measurement.service import WAITING as WAITING
 from stcal.sfm.measurement.service import Setting as Setting

@@ -14,9 +14,9 @@ from stcal.errors import ConvergenceError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import Skipped, decode, name_fault, stated_size, without_mosaic
-from stcal.parallel import LOOK_S, OwnProcess
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
+from stcal.sfm.measurement.own_process import LOOK_S, OwnProcess
 from stcal.sfm.measurement.pose import PoseOptions
 from stcal.sfm.measurement.report import poses_file
 from stcal.sfm.measurement.target import TargetCircles
