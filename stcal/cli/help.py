@@ -31,7 +31,6 @@ PANELS = {
             "columns_a",
             "undo_flips",
             "camera_name",
-            "bayer",
         ),
     ),
     "Noise": (

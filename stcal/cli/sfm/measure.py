@@ -187,7 +187,6 @@ def _setting(camera, faces, target, board, sigma_factor, ellipses) -> "Setting":
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
-    from stcal.io.images import stated_mosaic
     from stcal.sfm.measurement.pose import PoseOptions
     from stcal.sfm.measurement.service import Setting
     from stcal.sfm.measurement.target import read_target
@@ -198,7 +197,6 @@ def _setting(camera, faces, target, board, sigma_factor, ellipses) -> "Setting":
         load_board(board) if board else None,
         PoseOptions(sigma_factor=sigma_factor),
         ellipses,
-        stated_mosaic(),
     )
 
 

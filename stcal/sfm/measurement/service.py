@@ -13,7 +13,7 @@ from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
-from stcal.io.images import Skipped, decode, name_fault, stated_size, without_mosaic
+from stcal.io.images import Skipped, decode, name_fault, stated_size
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
 from stcal.sfm.measurement.own_process import LOOK_S, OwnProcess
@@ -36,17 +36,13 @@ DONE, NO_POSE, REFUSED, FAILED, BUSY = 200, 422, 400, 500, 503
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The data that every process holds; see :class:`stcal.sfm.measurement.tracker.Tracker`.
-
-    ``bayer`` : pattern of the mosaics that the images are, or empty.
-    """
+    """The data that every process holds; see :class:`stcal.sfm.measurement.tracker.Tracker`."""
 
     target: TargetCircles
     camera: CameraModel
     board: BoardDesign | None = None
     pose: PoseOptions = field(default_factory=PoseOptions)
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
-    bayer: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,13 +199,10 @@ class _Sequence:
 
 _tracker: Tracker | None = None
 """The tracker of this process, with target and camera."""
-_bayer = ""
-"""Pattern of the mosaics that this process is sent."""
 
 
 def _begin(setting: Setting) -> None:
-    global _tracker, _bayer
-    _bayer = setting.bayer
+    global _tracker
     _tracker = Tracker(setting.target, setting.camera, setting.board, setting.pose, setting.ellipses)
 
 
@@ -230,7 +223,7 @@ def _answer(data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, 
                 "E-IMAGE-SIZE",
                 f"{name}: {width}×{height} px, camera {camera.width}×{camera.height} px; send it as the camera took it",
             )
-        image = decode(without_mosaic(data, name, _bayer), name)
+        image = decode(data, name)
         try:
             labelled, pose = tracker.observe(image, name)
             measured = outcome(name, pose, labelled.notes)

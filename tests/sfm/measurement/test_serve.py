@@ -459,24 +459,6 @@ def test_an_address_that_is_none(known, host, port):
         MeasureServer(MeasureService(Setting(*known), 1), ServeOptions(host, port))
 
 
-@pytest.mark.slow
-def test_mosaics_are_sent(known, photographs):
-    """A photograph through a filter without white balance, as RGGB: its pose is that of the photograph."""
-    name, data = next(iter(photographs.items()))
-    grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    gain = np.tile([[0.55, 1.0], [1.0, 0.7]], (grey.shape[0] // 2, grey.shape[1] // 2))
-    mosaic = cv2.imencode(".png", np.round(gain * grey).astype(np.uint8))[1].tobytes()
-    found = []
-    for pattern, sent in (("", data), ("RGGB", mosaic)):
-        service = MeasureService(Setting(*known, bayer=pattern), 1)
-        answer = service.answer(sent, name)
-        service.close()
-        assert answer.code == DONE, answer.text
-        (image,) = json.loads(answer.text)["images"]
-        found.append(np.array(image["camera_from_target"])[:3, 3])
-    np.testing.assert_allclose(found[1], found[0], atol=0.5)  # 0.5 mm at half a metre: half the pixels
-
-
 def test_a_port_that_is_taken(server, known):
     with fails_with("E-SERVICE-ADDRESS … Address already in use"):
         MeasureServer(MeasureService(Setting(*known), 1), ServeOptions(port=server.server_address[1]))

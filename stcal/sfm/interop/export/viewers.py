@@ -12,7 +12,7 @@ import numpy as np
 from stcal.drawing.formats import dxf_text, new_drawing
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.images import find_images, mosaic_of
+from stcal.io.images import find_images
 from stcal.io.poses.programs import metres, xyzw
 from stcal.sfm.interop.export.content import BOARD_RGB, Circle, Content, Photograph, ellipsoid, exaggeration
 
@@ -383,8 +383,7 @@ def _photographs(content: Content, recording, rr, write: Callable[[], object]) -
     """Adds the photographs. ``write`` : called after each, writes what has been added, so that memory holds one."""
     files = {}
     if content.run.images.is_dir():
-        with mosaic_of(content.run.options.bayer):
-            files = {item.name: item for item in find_images(content.run.images)[0]}
+        files = {item.name: item for item in find_images(content.run.images)[0]}
     camera, depth = content.camera, camera_depth_mm(content)
     observations = {item.name: item for item in content.run.observations}
     missing, unreadable = [], []
@@ -412,7 +411,7 @@ def _photographs(content: Content, recording, rr, write: Callable[[], object]) -
         )
         recording.log(f"{entity}/image/circles", centres)
         file = files.get(photograph.name)
-        suffix = "" if file is None else ".png" if file.bayer else file.path.suffix.lower()  # as it is read
+        suffix = "" if file is None else file.path.suffix.lower()
         if file is None:
             missing.append(photograph.name)
         elif suffix not in MEDIA:
