@@ -98,20 +98,14 @@ def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
     assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures] == ["silent wrong"]
 
 
-QUICK = [
-    "register: a in metres",
-    "register: rows one late",
-    "verify: measured in inches",
-    "handeye, poses: both inverse",
-    "compare: truth in metres",
-    "compensate: x y z w",
-]
+BRIEF = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2]
+"""Those of calls that take together less than a minute of processor time; `scripts/full` makes all mistakes."""
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", BRIEF)
 def test_a_mistake_is_told(stock, tmp_path, name):
-    assert name in MISTAKES
-    assert mistaken(stock, tmp_path / "case", name).failures == ()
+    found = mistaken(stock, tmp_path / "case", name).failures
+    assert {kind for kind, _ in found} <= {"no program could tell"}, found
 
 
 ELSEWHERE = {"sfm demo", "sfm detect", "robot from-photos"}
