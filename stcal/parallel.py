@@ -24,7 +24,7 @@ Progress = Callable[[str, int, int], None]
 """Function that is called with (stage, done, total)."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Variables from which libraries read their number of threads when they are loaded; worker processes have it 1."""
-FOR_WORKERS = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
+FOR_WORKERS: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
 """Environment of worker processes. The working folder might hold files with the names of modules."""
 AT_ONCE = 4
 """Number of jobs that are handed over for each process, so that the next ones are there when one is done."""

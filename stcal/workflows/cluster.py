@@ -30,7 +30,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     other versions. Raises DetectionError: the scheduler was lost, or an image ended several workers.
     """
     with _connected(address) as client:
-        from distributed.comm import CommClosedError
+        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
         try:
