@@ -4,21 +4,15 @@ import contextlib
 import itertools
 import multiprocessing
 import multiprocessing.context
+import multiprocessing.util
 import os
+import shutil
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    as_completed,
-    wait,
-)
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
@@ -29,9 +23,11 @@ R = TypeVar("R")
 Progress = Callable[[str, int, int], None]
 """Function that is called with (stage, done, total)."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""Variables from which libraries read their number of threads when they are loaded; parallel processes set it to 1."""
-LOADED_ONCE = "stcal.one_thread", "stcal.sfm.pipeline"
-"""Modules that are loaded, with all their imports, before processes are forked."""
+"""Variables from which libraries read their number of threads when they are loaded; worker processes have it 1."""
+FOR_WORKERS: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
+"""Environment of worker processes. The working folder might hold files with the names of modules."""
+AT_ONCE = 4
+"""Number of jobs that are handed over for each process, so that the next ones are there when one is done."""
 _limited = threading.Lock()
 _one_starts = threading.Lock()
 
@@ -66,12 +62,21 @@ def one_thread() -> Iterator[None]:
         _limited.release()
 
 
+@cache
+def reserve_buffers() -> None:
+    """Lets both libraries of linear algebra, NumPy's and SciPy's, take their working memory, which they keep.
+
+    OpenBLAS takes it at the first call that needs it. Where it then gets none, it ends the process, or tries for ever.
+    """
+    import numpy as np
+    import scipy.linalg
+
+    np.linalg.inv(np.eye(2))
+    scipy.linalg.cholesky(np.eye(2))
+
+
 def run_parallel(
-    function: Callable[..., R],
-    jobs: Sequence[tuple],
-    workers: int | None = None,
-    executor: Executor | None = None,
-    at_once: int | None = None,
+    function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None
 ) -> Iterator[tuple[int, R]]:
     """Yields (index of the job, result of ``function(*job)``) as results arrive, in any order.
 
@@ -80,18 +85,8 @@ def run_parallel(
     needs no ``if __name__ == "__main__"``. One worker, or one job, runs in this process; so does all work within a
     process of ``multiprocessing.Pool``, which may start no others: a note says so.
 
-    Parameters
-    ----------
-    workers : int, optional
-        Number of processes; one per core if None. Within :func:`kept_processes`, its number counts.
-    executor : concurrent.futures.Executor, optional
-        Executor that runs the jobs instead of processes of this module. It is left open.
-    at_once : int, optional
-        Number of jobs that are handed to the executor at a time; all of them if None.
+    ``workers`` : number of processes; one per core if None. Within :func:`kept_processes`, its number counts.
     """
-    if executor is not None:
-        yield from _handed_over(executor, function, jobs, at_once or len(jobs))
-        return
     kept = _kept.get()
     workers = min(kept.workers if kept else _number_of_processes(workers), len(jobs))
     if workers <= 1:
@@ -102,44 +97,86 @@ def run_parallel(
         yield from processes.run(function, jobs)
 
 
-def run_briefly(
-    function: Callable[..., R], jobs: Sequence[tuple], step: Callable[[object], None] | None = None
-) -> list[R]:
-    """Returns the results of ``function(*job)`` in the order of the jobs, for jobs of about a tenth of a second each.
-
-    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process; one job alone runs
-    in this process. ``step`` : called with each result as it arrives, in any order
-    """
-    processes, results = _kept.get(), dict[int, R]()
-    if processes and processes.workers > 1 and len(jobs) > 1:
-        # If a process is ended from outside, the other jobs run in this process, more slowly.
-        with contextlib.suppress(BrokenExecutor):
-            for i, result in processes.run(function, jobs):
-                results[i] = result
-                if step:
-                    step(result)
-    for i, job in enumerate(jobs):
-        if i not in results:
-            results[i] = function(*job)
-            if step:
-                step(results[i])
-    return [results[i] for i in range(len(jobs))]
-
-
 def run_in_order(
     function: Callable[..., R],
     jobs: Sequence[tuple],
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[R]:
-    """Returns the results of :func:`run_parallel` in the order of the jobs. ``progress`` : called with the number of
-    jobs done, and the number of all jobs."""
-    results = {}
-    for i, result in run_parallel(function, jobs, workers):
-        results[i] = result
-        if progress:
-            progress(len(results), len(jobs))
+    """Returns the results of :func:`run_parallel` in the order of the jobs.
+
+    If a process is ended from outside, the other jobs run in this process, more slowly.
+
+    ``workers`` : as there; 1 for jobs of a tenth of a second, for which only processes that are there already are used.
+    ``progress`` : called with the number of jobs done, and the number of all jobs.
+    """
+    results: dict[int, R] = {}
+    here = ((i, function(*job)) for i, job in enumerate(jobs) if i not in results)
+    for found in (run_parallel(function, jobs, workers), here):
+        with contextlib.suppress(BrokenExecutor):
+            for i, result in found:
+                results[i] = result
+                if progress:
+                    progress(len(results), len(jobs))
     return [results[i] for i in range(len(jobs))]
+
+
+def hand_over(
+    executor: Executor, function: Callable[..., R], jobs: Iterable[tuple], at_once: int
+) -> Iterator[tuple[int, R]]:
+    """Yields index and result of each job, in any order; ``at_once`` : number of jobs that the executor has at a time.
+
+    The executor stays open.
+    """
+    waiting: dict[Future[R], int] = {}
+    remaining = enumerate(jobs)
+    try:
+        while True:
+            with _starting():
+                for i, job in itertools.islice(remaining, at_once - len(waiting)):
+                    waiting[executor.submit(function, *job)] = i
+            if not waiting:
+                return
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                yield waiting.pop(future), future.result()
+    except BrokenExecutor:  # a pool ends its futures itself; cancelling them would break its thread
+        raise
+    except BaseException:
+        for future in waiting:
+            future.cancel()
+        raise
+
+
+class _Processes:
+    """Pool of processes that starts with the first job and ends with the context."""
+
+    def __init__(self, workers: int):
+        self.workers = workers
+        self._pool: ProcessPoolExecutor | None = None
+        self._others = multiprocessing.active_children()
+
+    def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
+        if self._pool is None:
+            with _starting():
+                sockets = multiprocessing.util.get_temp_dir()
+                self._pool = ProcessPoolExecutor(self.workers, _context(), _follow_parent, (sockets,))
+        return hand_over(self._pool, function, jobs, AT_ONCE * self.workers)
+
+    def __enter__(self) -> "_Processes":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_) -> None:
+        if self._pool is None:
+            return
+        if kind is not None and not issubclass(kind, Exception):  # asked to end: half-done work is of no use
+            for process in multiprocessing.active_children():
+                if process not in self._others:
+                    process.terminate()
+        # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+_kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)
 
 
 @contextlib.contextmanager
@@ -168,77 +205,6 @@ def _number_of_processes(workers: int | None) -> int:
     return wanted
 
 
-class _Processes:
-    """Pool of processes that starts with the first job and ends with the context."""
-
-    def __init__(self, workers: int):
-        self.workers = workers
-        self._pool: ProcessPoolExecutor | None = None
-        self._others = multiprocessing.active_children()
-
-    def _start(self) -> ProcessPoolExecutor:
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(self.workers, _context(), initializer=_follow_parent)
-        return self._pool
-
-    def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
-        """Yields index and result of each job, in any order."""
-        with _starting():
-            pool = self._start()
-            futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except BrokenExecutor:  # the pool ends its futures itself; cancelling them would break its thread
-            raise
-        except (Exception, GeneratorExit):
-            for future in futures:
-                future.cancel()
-            raise
-
-    def __enter__(self) -> "_Processes":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_) -> None:
-        if self._pool is None:
-            return
-        asked_to_end = kind is not None and not issubclass(kind, Exception)  # half-done work is of no use
-        if asked_to_end:
-            for process in multiprocessing.active_children():
-                if process not in self._others:
-                    process.terminate()
-        # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-
-_kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)
-
-
-@contextlib.contextmanager
-def _starting() -> Iterator[None]:
-    """Prepares the start of processes, by one thread at a time, and leaves all that it changes as it was."""
-    with _one_starts, _plain_main(), _deaf_to_interrupts():
-        undecided = multiprocessing.get_start_method(allow_none=True) is None
-        try:
-            yield
-        finally:
-            if undecided:  # the start of a process asks for the default method, which then could not be set any more
-                multiprocessing.set_start_method(None, force=True)
-
-
-@cache
-def reserve_buffers() -> None:
-    """Lets both libraries of linear algebra, NumPy's and SciPy's, take their working memory, which they keep.
-
-    OpenBLAS takes it at the first call that needs it. Where it then gets none, it ends the process, or tries for ever.
-    """
-    import numpy as np
-    import scipy.linalg
-
-    np.linalg.inv(np.eye(2))
-    scipy.linalg.cholesky(np.eye(2))
-
-
 def load_ahead(workers: int | None = None) -> None:
     """Starts the server of processes, which loads their libraries while this process goes on."""
     if (workers or os.cpu_count() or 1) > 1:
@@ -255,7 +221,7 @@ def _context() -> multiprocessing.context.BaseContext:
         from multiprocessing.forkserver import ensure_running
 
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([*LOADED_ONCE])  # without effect if a server is running
+        context.set_forkserver_preload(["stcal.sfm.pipeline"])  # without effect if a server is running
         # The server may be of the process that forked this one, or TMPDIR too long a name for its socket.
         with contextlib.suppress(OSError):
             ensure_running()
@@ -263,20 +229,27 @@ def _context() -> multiprocessing.context.BaseContext:
     return multiprocessing.get_context("spawn")
 
 
-def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: int) -> Iterator[tuple[int, R]]:
-    waiting: dict[Future, int] = {}
-    remaining = iter(range(len(jobs)))
-    try:
-        while True:
-            for i in itertools.islice(remaining, at_once - len(waiting)):
-                waiting[executor.submit(function, *jobs[i])] = i
-            if not waiting:
-                return
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                yield waiting.pop(future), future.result()
-    finally:
-        for future in waiting:
-            future.cancel()
+@contextlib.contextmanager
+def _starting() -> Iterator[None]:
+    """Prepares the start of processes, by one thread at a time, and leaves all that it changes as it was.
+
+    New processes have the environment of workers and do not see the file of the main module.
+    """
+    main = vars(sys.modules["__main__"])
+    with _one_starts, _deaf_to_interrupts():
+        hidden = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+        before = {name: os.environ.get(name) for name in FOR_WORKERS}
+        undecided = multiprocessing.get_start_method(allow_none=True) is None
+        main.update(dict.fromkeys(hidden))
+        os.environ.update(FOR_WORKERS)
+        try:
+            yield
+        finally:
+            main.update(hidden)
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+            if undecided:  # the start of a process asks for the default method, which then could not be set any more
+                multiprocessing.set_start_method(None, force=True)
 
 
 @contextlib.contextmanager
@@ -300,42 +273,20 @@ def _deaf_to_interrupts():
             signal.raise_signal(number)
 
 
-def _follow_parent() -> None:
+def _follow_parent(folder: str) -> None:
     """Lets a worker leave Ctrl-C to the parent, which stops the pool in order, and end when the parent is killed.
 
-    Libraries that it loads have one thread.
+    ``folder`` : the parent's folder of sockets, which it removes at its end, except if it is killed.
     """
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    reserve_buffers()
     parent = multiprocessing.parent_process()
     if parent is None:
         return
 
     def watch() -> None:
         parent.join()
+        shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _plain_main():
-    """Hides the main module's file and the working folder from new processes.
-
-    The working folder might hold files with the names of modules.
-    """
-    main = sys.modules["__main__"]
-    hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if getattr(main, name, None) is not None}
-    before = os.environ.get("PYTHONSAFEPATH")
-    for name in hidden:
-        setattr(main, name, None)
-    os.environ["PYTHONSAFEPATH"] = "1"
-    try:
-        yield
-    finally:
-        for name, value in hidden.items():
-            setattr(main, name, value)
-        if before is None:
-            os.environ.pop("PYTHONSAFEPATH", None)
-        else:
-            os.environ["PYTHONSAFEPATH"] = before

@@ -1,20 +1,19 @@
-"""Threads of BLAS: one while heavy functions work, the caller's own number before and after; one in each worker; and
-processes that are kept from call to call."""
+"""Threads of BLAS: one while heavy functions work, and in each worker; processes, and what is left of them."""
 
 import multiprocessing
 import os
-import signal
 import subprocess
 import sys
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD, _deaf_to_interrupts, counted, kept_processes, run_briefly, run_parallel
+from stcal.parallel import ONE_THREAD, kept_processes, run_in_order, run_parallel
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -37,13 +36,16 @@ def say():
     print(*{library["num_threads"] for library in threadpool_info()}, end=" ")
 """
 
-OUTERMOST = """
+LIMIT = """
 say()
-with one_thread():
+try:
+    with one_thread():
+        say()
+        one_thread()(say)()
+        say()
+        raise ValueError
+except ValueError:
     say()
-    one_thread()(say)()
-    say()
-say()
 """
 
 SEVERAL_THREADS = """
@@ -59,19 +61,9 @@ def first():
         began.wait(10)
     first_ended.set()
 other = threading.Thread(target=second)
-starter = threading.Thread(target=first)
-starter.start()
-starter.join()
+first()
 other.join()
 say()
-"""
-
-ERROR = """
-try:
-    with one_thread():
-        raise ValueError
-except ValueError:
-    say()
 """
 
 NOTHING_LEFT = """
@@ -130,19 +122,15 @@ print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in 
 @pytest.fixture(scope="module")
 def said() -> dict[str, list[str]]:
     """What each of the programs says in a process whose number of threads nobody limits."""
-    programs = (OUTERMOST, SEVERAL_THREADS, ERROR, NOTHING_LEFT, WORKERS)
+    programs = (LIMIT, SEVERAL_THREADS, NOTHING_LEFT, WORKERS)
     code = "\nprint()\n".join([BEGIN, *programs])
     done = subprocess.run([sys.executable, "-c", code], env=UNLIMITED, capture_output=True, text=True, check=True)
     return dict(zip(programs, map(str.split, done.stdout.splitlines()[1:]), strict=True))
 
 
-def test_tests_have_one_thread():
-    assert threads() == {1}
-
-
 @pytest.mark.slow
-def test_the_limit_ends_with_the_outermost_call(said):
-    assert said[OUTERMOST] == [CORES, "1", "1", "1", CORES]
+def test_the_limit_ends_with_the_outermost_call_or_an_error(said):
+    assert said[LIMIT] == [CORES, "1", "1", "1", CORES]
 
 
 @pytest.mark.slow
@@ -152,8 +140,9 @@ def test_calls_of_several_threads_leave_no_limit_behind(said):
 
 
 @pytest.mark.slow
-def test_an_error_lifts_the_limit(said):
-    assert said[ERROR] == [CORES]
+def test_workers_have_one_thread(said):
+    assert threads() == {1}
+    assert said[WORKERS] == ["1", "1"]
 
 
 @pytest.mark.slow
@@ -186,48 +175,21 @@ def in_a_pool() -> tuple[list, list[str]]:
     return found, [str(note.message) for note in noted]
 
 
-@pytest.mark.slow
-def test_workers_have_one_thread(said):
-    assert said[WORKERS] == ["1", "1"]
-
-
-def test_what_is_done_is_counted():
-    told = []
-    step = counted(lambda *state: told.append(state), "detect", 2)
-    step("a")
-    step("b")
-    assert told == [("detect", 0, 2), ("detect", 1, 2), ("detect", 2, 2)]
-
-
 def process(_) -> int:
     time.sleep(0.05)  # so that one alone does not do all
     return os.getpid()
 
 
 @pytest.mark.slow
-def test_processes_are_kept_from_call_to_call():
+def test_processes_are_kept_from_call_to_call_also_after_an_error():
     with kept_processes(2):
-        first = {found for _, found in run_parallel(process, [(i,) for i in range(6)])}
-        again = set(run_briefly(process, [(i,) for i in range(6)]))
-    assert len(first) == 2
-    assert again == first
-    with kept_processes(1):
-        assert run_briefly(process, [(0,), (1,)]) == [os.getpid()] * 2
-    assert run_briefly(process, [(0,)]) == [os.getpid()]
-    assert not multiprocessing.active_children()
-
-
-def test_results_are_in_the_order_of_the_jobs():
-    with kept_processes(2):
-        dict(run_parallel(process, [(0,), (1,)]))
-        assert run_briefly(pow, [(i, 2) for i in range(40)]) == [i * i for i in range(40)]
-
-
-def test_what_fails_ends_the_call_and_not_the_processes():
-    with kept_processes(2):
+        first = set(run_in_order(process, [(i,) for i in range(6)]))
         with pytest.raises(ZeroDivisionError):
             dict(run_parallel(divmod, [(1, 0), (2, 0)]))
-        assert len({found for _, found in run_parallel(process, [(i,) for i in range(6)])}) == 2
+        assert set(run_in_order(process, [(i,) for i in range(6)], 1)) == first
+    assert len(first) == 2
+    assert run_in_order(process, [(0,), (1,)], 1) == [os.getpid()] * 2
+    assert not multiprocessing.active_children()
 
 
 def end_elsewhere(parent: int) -> int:
@@ -237,10 +199,13 @@ def end_elsewhere(parent: int) -> int:
     return parent
 
 
-def test_brief_work_goes_on_here_when_a_process_is_ended():
+def test_work_goes_on_here_when_a_process_is_ended():
+    done = []
     with kept_processes(2):
-        assert run_briefly(end_elsewhere, [(os.getpid(),)] * 4) == [os.getpid()] * 4
-        assert run_briefly(pow, [(2, 3)] * 2) == [8, 8]
+        assert (
+            run_in_order(end_elsewhere, [(os.getpid(),)] * 4, progress=lambda *at: done.append(at)) == [os.getpid()] * 4
+        )
+    assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 @pytest.mark.slow
@@ -273,17 +238,33 @@ def test_processes_end_when_the_work_is_broken_off():
     assert not multiprocessing.active_children()
 
 
-def test_a_request_to_end_while_processes_start_is_answered_after_it():
-    answered: list[int] = []
-    before = signal.signal(signal.SIGTERM, lambda number, _: answered.append(number))
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+def test_a_killed_program_leaves_no_process_and_no_file(tmp_path):
+    code = (
+        "import tests.test_parallel as t\n"
+        "with t.kept_processes(2):\n"
+        "    print(*set(t.run_in_order(t.process, [(i,) for i in range(6)])), flush=True)\n"
+        "    t.run_in_order(t.time.sleep, [(60,)] * 2)\n"
+    )
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True, env=environment) as started:
+        assert started.stdout is not None
+        workers = started.stdout.readline().split()
+        assert any(tmp_path.iterdir())
+        started.kill()
+    until = time.monotonic() + 20
+    while time.monotonic() < until and (any(map(is_alive, workers)) or any(tmp_path.iterdir())):
+        time.sleep(0.05)
+    assert not any(map(is_alive, workers))
+    assert not any(tmp_path.iterdir())
+
+
+def is_alive(number: str) -> bool:
     try:
-        with _deaf_to_interrupts():
-            signal.raise_signal(signal.SIGTERM)
-            signal.raise_signal(signal.SIGINT)
-            assert answered == []
-        assert answered == [signal.SIGTERM]
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        return Path(f"/proc/{number}/stat").read_text().split()[2] != "Z"
+    except OSError:
+        return False
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of memory")

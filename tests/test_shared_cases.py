@@ -8,7 +8,6 @@ import json
 import shlex
 import sys
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -131,26 +130,3 @@ def test_tags_half_a_turn_off_are_told(call):
     assert code == 0
     assert out.count("accept") >= 2
     assert "reject" not in out
-
-
-@pytest.mark.slow
-def test_mosaics_of_a_bayer_sensor(call, shared_case, tmp_path):
-    """The same photographs through a filter without white balance: rejected and said, and right with the pattern."""
-    folder = shared_case("loc_bundle/images")
-    for scene in sorted(folder.iterdir()):
-        (tmp_path / "images" / scene.name).mkdir(parents=True)
-        for file in scene.iterdir():
-            grey = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-            gain = np.where(np.add.outer(np.arange(grey.shape[0]), np.arange(grey.shape[1])) % 2, 1.0, 0.55)
-            gain[1::2, 1::2] = 0.7
-            cv2.imwrite(
-                str(tmp_path / "images" / scene.name / f"{file.stem}.png"), np.round(grey * gain).astype(np.uint8)
-            )
-    words = "locate run {tmp}/images --layout layout.toml --camera cameras.txt --json {tmp}/l.json --overwrite"
-    code, out, error = call("loc_tag36h11_name", words)
-    assert code == 3
-    assert "--bayer RGGB or BGGR" in out + error
-    assert call("loc_tag36h11_name", f"{words} --bayer RGGB")[0] == 0
-    scenes = json.loads((tmp_path / "l.json").read_text())["scenes"]
-    for scene, place in zip(scenes, [[-40, -30, 700], [-40, -30, 800]], strict=True):
-        np.testing.assert_allclose(np.array(scene["camera_from_obj"])[:3, 3], place, atol=0.5)

@@ -29,7 +29,6 @@ PANELS = {
             "quaternions",
             "undo_flips",
             "camera_name",
-            "bayer",
         ),
     ),
     "Noise": (

@@ -74,13 +74,12 @@ class Arg:
 @dataclass(frozen=True, slots=True)
 class Declared:
     """``annotation`` : of a parameter, for Typer; ``word`` : its name in messages; ``reads``, ``writes`` : whether its
-    value is a path that is read, or written; ``reads_images`` : whether images are read there."""
+    value is a path that is read, or written."""
 
     annotation: Any
     word: str
     reads: bool
     writes: bool
-    reads_images: bool
 
 
 def declared(parameter: str, annotation: Any) -> Declared:
@@ -92,8 +91,7 @@ def declared(parameter: str, annotation: Any) -> Declared:
     info.rich_help_panel = panel_of(parameter, is_path, given.writes)
     # With Annotated, Typer takes an option's first name for its default.
     word = info.default if isinstance(given, Opt) else parameter
-    of_images = is_path and (parameter in ("images", "exposures") or "IMAGES" in (given.metavar or ""))
-    return Declared(Annotated[kind, info], word, is_path and not given.writes, given.writes, of_images)
+    return Declared(Annotated[kind, info], word, is_path and not given.writes, given.writes)
 
 
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
@@ -111,10 +109,6 @@ CameraName = Annotated[
     str, "Take this camera from a --camera file of several: its name, or COLMAP's number.", Opt("--camera-name")
 ]
 """Option that every command with ``--camera`` has."""
-Bayer = Annotated[
-    str, "Treat images as raw mosaics of a sensor with this Bayer pattern: RGGB, BGGR, GRBG or GBRG.", Opt("--bayer")
-]
-"""Option that every command has that reads a folder of images."""
 TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
 BoardFile = Annotated[
     Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
@@ -400,7 +394,6 @@ def _protected(command: Callable) -> Callable:
     parameters = {name: declared(name, each.annotation) for name, each in signature.parameters.items()}
     words = {name: each.word for name, each in parameters.items()}
     outputs = {name for name, each in parameters.items() if each.writes}
-    reads_images = any(each.reads_images for each in parameters.values())
 
     @wraps(command)
     def checked(
@@ -408,7 +401,6 @@ def _protected(command: Callable) -> Callable:
         quiet: bool = False,
         verbose: bool = False,
         camera_name: str = "",
-        bayer: str = "",
         **given,
     ):
         paths = [
@@ -441,13 +433,12 @@ def _protected(command: Callable) -> Callable:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
             with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes():
-                return command(**given) if not camera_name + bayer else _with(camera_name, bayer, command, given)
+                return command(**given) if not camera_name else _with(camera_name, command, given)
         finally:
             _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
-    further: dict[str, tuple[Any, Any]] = {"bayer": (Bayer, "")} if reads_images else {}
-    further |= {"camera_name": (CameraName, "")} if CAMERA in words.values() else {}
+    further: dict[str, tuple[Any, Any]] = {"camera_name": (CameraName, "")} if CAMERA in words.values() else {}
     further |= {"overwrite": (Overwrite, False)} if outputs and command.__name__ not in ALWAYS_NEW else {}
     further |= {"quiet": (Quiet, False), "verbose": (Verbose, False)}
     every = [each.replace(annotation=parameters[name].annotation) for name, each in signature.parameters.items()]
@@ -460,13 +451,11 @@ def _protected(command: Callable) -> Callable:
     return checked
 
 
-def _with(camera_name: str, bayer: str, command: Callable, given: dict):
-    """Run a command with the camera of this name if a camera file has several, and with images read as mosaics of this
-    pattern."""
+def _with(camera_name: str, command: Callable, given: dict):
+    """Run a command with the camera of this name if a camera file has several."""
     from stcal.io.cameras.read import camera_chosen
-    from stcal.io.images import mosaic_of
 
-    with camera_chosen(camera_name), mosaic_of(bayer) if bayer else nullcontext():
+    with camera_chosen(camera_name):
         return command(**given)
 
 

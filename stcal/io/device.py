@@ -14,7 +14,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.images import decode, find_images, grey_8bit, stated_mosaic
+from stcal.io.images import decode, find_images, grey_8bit
 
 MANUAL_V4L2, MANUAL_OTHERS = 1.0, 0.25
 """Values of OpenCV's AUTO_EXPOSURE that mean manual: V4L2's menu, and the convention of the other back ends."""
@@ -228,16 +228,7 @@ def quiet_opencv() -> Iterator[None]:
 
 
 def _device(source: int | str) -> cv2.VideoCapture:
-    """Return the source, opened if it can be. The libraries' own words about it are kept back.
-
-    Raises InputError: a mosaic's pattern is in force, which pictures of a camera or a video no longer have.
-    """
-    if pattern := stated_mosaic():
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"--bayer {pattern}: pictures of a camera or a video have their colours already, and no mosaic; leave "
-            "--bayer out",
-        )
+    """Return the source, opened if it can be. The libraries' own words about it are kept back."""
     before = os.environ.get(FFMPEG_LEVEL)
     os.environ[FFMPEG_LEVEL] = "-8"
     try:

@@ -8,7 +8,6 @@ import threading
 import unicodedata
 import warnings
 from collections.abc import Iterator, Sequence
-from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import BytesIO
@@ -18,10 +17,10 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
-from stcal.errors import InputError, InputNote
+from stcal.errors import InputError
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
 from stcal.io.photographs import decoding
-from stcal.io.photographs.decoding import PATTERNS, demosaiced, ends_properly, is_png, patterns_seen, png_intact
+from stcal.io.photographs.decoding import ends_properly, is_png, patterns_seen, png_intact
 
 USUAL = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 SUFFIXES = (*USUAL, *decoding.readable())
@@ -68,18 +67,16 @@ class ImageFile:
     """An image file.
 
     ``name`` : path below the image folder, with forward slashes; ``content`` : bytes of the file if they are carried
-    along to a machine that does not see the path, else None; ``bayer`` : pattern of the mosaic of coloured pixels that
-    the file holds, or empty.
+    along to a machine that does not see the path, else None.
     """
 
     path: Path
     name: str
     group: str
     content: bytes | None = field(default=None, repr=False)
-    bayer: str = ""
 
     def read(self) -> bytes:
-        """Return the content of the file; of a mosaic that of a PNG of its grey image.
+        """Return the content of the file.
 
         Raises
         ------
@@ -91,11 +88,10 @@ class ImageFile:
         if self.content is not None:
             return self.content
         try:
-            data = read_bytes(self.path, IMAGE_BYTES)
+            return read_bytes(self.path, IMAGE_BYTES)
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
             reason = "was there when the work began, and is gone; put it back, or begin again without it"
             raise InputError("E-IMAGES-GONE", f"{self.path}: {reason}") from error
-        return without_mosaic(data, self.name, self.bayer)
 
     def carried(self) -> "ImageFile":
         """Return the file with its content. An unreadable file is unchanged: its later read reports the error."""
@@ -118,50 +114,11 @@ class Skipped:
 
 ImageFiles = tuple[list[ImageFile], list[Skipped]]
 """Files to use and files that are left out, as they were when the work began."""
-_bayer: ContextVar[str] = ContextVar("_bayer", default="")
-"""Pattern of the mosaics that :func:`find_images` finds."""
-
-
-@contextlib.contextmanager
-def mosaic_of(pattern: str) -> Iterator[None]:
-    """Read images as mosaics of this pattern, or as they are if it is empty; for all images that are found meanwhile.
-
-    Raises InputError: the pattern is unknown.
-    """
-    if pattern and pattern.upper() not in PATTERNS:
-        raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
-    token = _bayer.set(pattern.upper())
-    try:
-        yield
-    finally:
-        _bayer.reset(token)
 
 
 def image_file(path: Path) -> ImageFile:
     """Return a single image file, outside of any folder of images."""
-    return ImageFile(path, path.name, TOP_GROUP, bayer=_bayer.get())
-
-
-def stated_mosaic() -> str:
-    """Return the pattern of :func:`mosaic_of` that is in force, or an empty text."""
-    return _bayer.get()
-
-
-def without_mosaic(data: bytes, name: str, pattern: str) -> bytes:
-    """Return a PNG of the grey image of a mosaic; data that are no image stay, as their decoder says why.
-
-    ``data`` : content of an image file; ``name`` : name of the image, for messages; ``pattern`` : colours of the
-    mosaic, or empty, where the data stay.
-
-    Raises InputError: the image has colours already.
-    """
-    if not pattern:
-        return data
-    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if image is None:
-        return data
-    return cv2.imencode(".png", demosaiced(image, pattern, name), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    return ImageFile(path, path.name, TOP_GROUP)
 
 
 @lru_cache(maxsize=4)
@@ -173,9 +130,9 @@ def _mosaics(path: Path, _: int) -> tuple[str, ...]:
     return patterns_seen(decode(read_bytes(path, IMAGE_BYTES), path.name))
 
 
-def _say_mosaic(files: Sequence[ImageFile]) -> None:
-    """Say that images are mosaics, by the first one in a form without losses, where no pattern was given."""
-    first = next((file for file in files if file.path.suffix.lower() in UNPACKED and not file.bayer), None)
+def _refuse_mosaics(files: Sequence[ImageFile]) -> None:
+    """Refuse images that are mosaics, by the first one in a form without losses: read as grey, it shifts centres."""
+    first = next((file for file in files if file.path.suffix.lower() in UNPACKED), None)
     if first is None:
         return
     try:
@@ -183,12 +140,10 @@ def _say_mosaic(files: Sequence[ImageFile]) -> None:
     except Exception:  # whoever reads it says what is wrong
         return
     if seen:
-        warnings.warn(
-            f"{first.name}: its pixels look like a mosaic of colours, as a sensor with a Bayer filter delivers them; "
-            f"give --bayer {' or '.join(seen)}, as the sensor has it, or the images that the camera's program makes of "
-            "it",
-            InputNote,
-            stacklevel=3,
+        raise InputError(
+            "E-IMAGE-MOSAIC",
+            f"{first.name}: its pixels are a mosaic of colours, {' or '.join(seen)}, as a sensor with a Bayer filter "
+            "delivers them; give the grey or colour images that the camera's program makes of it",
         )
 
 
@@ -205,7 +160,7 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
     if root.is_file():
         _sort_in(root, root.name, TOP_GROUP, files, skipped)
         if files:
-            _say_mosaic(files)
+            _refuse_mosaics(files)
             return files, skipped
     if not root.is_dir():
         fault = f"not a folder, and {skipped[0].reason}" if skipped else "does not exist"
@@ -221,9 +176,9 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         # A nested folder is the most helpful hint: the images lie deeper than they should.
-        photographs = {decoding.reason_unread(suffix) for suffix in decoding.EXTRAS}
+        unread = set(decoding.UNREAD.values())
         most_telling = sorted(
-            skipped, key=lambda s: (s.reason not in photographs, s.gate != "folder", HOLDS_IMAGES not in s.reason)
+            skipped, key=lambda s: (s.reason not in unread, s.gate != "folder", HOLDS_IMAGES not in s.reason)
         )[:1]
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
         raise InputError(
@@ -231,7 +186,7 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             f"image folder {root}: no image, one of {', '.join(s[1:] for s in USUAL)}{hint}; "
             f"put them into {root}/<group>/",
         )
-    _say_mosaic(files)
+    _refuse_mosaics(files)
     return files, skipped
 
 
@@ -279,7 +234,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         skipped.append(Skipped(plain, reason, "folder"))
     elif path.suffix.lower() not in SUFFIXES:
         kinds, suffix = ", ".join(USUAL), path.suffix.lower()
-        reason = decoding.reason_unread(suffix) if suffix in decoding.EXTRAS else "not an image file"
+        reason = decoding.UNREAD.get(suffix, "not an image file")
         skipped.append(Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or name_fault(name):
         # Result files cannot store such a name.
@@ -288,7 +243,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
     elif not path.is_file():
         skipped.append(Skipped(name, "cannot be read: not a file, or a broken link"))
     else:
-        files.append(ImageFile(path, name, group, bayer=_bayer.get()))
+        files.append(ImageFile(path, name, group))
 
 
 def name_fault(name: str) -> str | None:
@@ -317,8 +272,8 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
         raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged (a checksum is wrong); copy it again")
     if decoding.is_heic(data):
         image = decoding.heic_grey(data, name)
-    elif name.lower().endswith(decoding.RAW) or decoding.is_dng(data):
-        image = decoding.raw_grey(data, name)
+    elif name.lower().endswith(decoding.RAW) or (data[:4] in TIFF_HEADS and decoding.is_dng(data)):
+        raise InputError("E-IMAGE-TYPE", f"{name}: {decoding.UNREAD['.dng']}")
     else:
         image = _decoded(data, name)
     if image.dtype not in (np.uint8, np.uint16):

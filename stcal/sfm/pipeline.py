@@ -25,7 +25,6 @@ from stcal.io.images import (
     ImageFile,
     ImageFiles,
     chosen_images,
-    mosaic_of,
     require_common_size,
 )
 from stcal.io.photographs.video import AUTO, write_frames
@@ -148,11 +147,10 @@ def run(
         images = frames_in_run(images, out, every or AUTO)
     elif every is not None:
         raise InputError("E-OPTION-VALUE", f"--every {every}: a video file in place of the images needed")
-    with mosaic_of(options.bayer) if options.bayer else nullcontext():
-        if isinstance(images, Mapping):
-            files, place = files_of_arrays(images, options.exclude), IN_MEMORY
-        else:
-            files, place = chosen_images(images, options.exclude), images
+    if isinstance(images, Mapping):
+        files, place = files_of_arrays(images, options.exclude), IN_MEMORY
+    else:
+        files, place = chosen_images(images, options.exclude), images
     return run_on_files(files, place, camera, out, target, board, options, progress, checks)
 
 
@@ -203,7 +201,7 @@ def run_on_files(
         )
     if options.compare:
         require_dots(known, f"--compare {options.compare}")
-    options = replace(options, bayer=next((file.bayer for file in files[0] if file.bayer), "")).settled(target_design)
+    options = options.settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(target_design))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
@@ -551,11 +549,10 @@ def detect_images(
     has_none = board is None and target_design.has_scale
     board_design = scale_reference(None, target_design) if has_none else board_of(board)
     require_no_calibration(out)
-    with mosaic_of(options.bayer) if options.bayer else nullcontext():
-        if isinstance(images, Mapping):
-            files, place = files_of_arrays(images, options.exclude), IN_MEMORY
-        else:
-            files, place = chosen_images(images, options.exclude), images
+    if isinstance(images, Mapping):
+        files, place = files_of_arrays(images, options.exclude), IN_MEMORY
+    else:
+        files, place = chosen_images(images, options.exclude), images
     model = None if camera is None else camera_model(camera)
     given = {"images": place, "--camera": camera, "--target": target, "--board": board}
     with run_folder(out, MarkerFile.of(place, None), given) as folder:

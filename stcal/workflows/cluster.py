@@ -1,29 +1,22 @@
-"""Detection and ``measure`` on the machines of a Dask cluster.
-
-Alternatives considered: Ray and MPI need a cluster of their own, and no worker may join, leave or die during the work.
-Jobs of a batch system are separate programs; the cache by content takes the files that they leave in a shared folder.
-"""
+"""Detection and ``measure`` on the machines of a Dask cluster."""
 
 import asyncio
 import contextlib
 import logging
 import re
-from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor
 from importlib import metadata
 from typing import Any
 
 import stcal
-from stcal.errors import InputError
+from stcal.errors import DetectionError, InputError
 from stcal.io.image_jobs import spread
+from stcal.parallel import AT_ONCE
 
 ANSWER_S = 10
 """Longest time that a scheduler, and the first worker, may take to answer, in s."""
-AT_ONCE = 4
-"""Number of images handed over for each thread of the workers, so that the next ones are there when one is done."""
 ADDRESS = re.compile(r"((tcp|tls)://)?([\w.-]+|\[[\da-fA-F:]+\]):\d{1,5}")
-SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
-"""Packages on which a result depends, bit by bit."""
 
 
 @contextlib.contextmanager
@@ -34,10 +27,20 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     Otherwise they are sent by path, on storage that all workers share.
 
     Raises InputError: the extra ``dask`` is not installed, no scheduler answers, it has no workers, or a worker has
-    other versions.
+    other versions. Raises DetectionError: the scheduler was lost, or an image ended several workers.
     """
-    with _connected(address) as workers, spread(workers, AT_ONCE * workers.threads, send_images):
-        yield
+    with _connected(address) as client:
+        from distributed.comm.core import CommClosedError
+        from distributed.scheduler import KilledWorker
+
+        try:
+            with spread(client.get_executor(pure=False), AT_ONCE * sum(client.nthreads().values()), send_images):
+                yield
+        except (CancelledError, KilledWorker, CommClosedError, ConnectionError) as error:
+            lost = "its workers were" if isinstance(error, KilledWorker) else "the connection to it was"
+            raise DetectionError(
+                "E-WORKER-DIED", f"--scheduler {address}: {lost} lost; run the same command again"
+            ) from error
 
 
 @contextlib.contextmanager
@@ -46,20 +49,27 @@ def executor_of(address: str | None = None) -> Iterator[Executor]:
 
     Raises InputError: for the reasons given in :func:`dask_cluster`.
     """
-    with ProcessPoolExecutor() if address is None else _connected(address) as executor:
-        yield executor
+    if address is None:
+        with ProcessPoolExecutor() as pool:
+            yield pool
+    else:
+        with _connected(address) as client:
+            yield client.get_executor(pure=False)
 
 
 @contextlib.contextmanager
-def _connected(address: str) -> Iterator["_Workers"]:
+def _connected(address: str) -> Iterator[Any]:
+    """Yields the client of a cluster whose workers have the versions of this machine and one thread for BLAS."""
     try:
         from distributed import Client
     except ImportError as error:
         raise InputError(
             "E-EXTRA-MISSING", "--scheduler: needs Dask; install stereo-target-calibration[dask]"
         ) from error
-    _require_address(address)
-    with _silent("distributed"), Client(address, timeout=ANSWER_S, set_as_default=False) as client:
+    for name in ("distributed", "distributed.client"):  # Dask logs each lost worker; a fault shows by its effect
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    _require_scheduler(address)
+    with Client(address, timeout=ANSWER_S, set_as_default=False) as client:
         try:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except OSError as error:
@@ -67,27 +77,12 @@ def _connected(address: str) -> Iterator["_Workers"]:
                 "E-CLUSTER-WORKERS",
                 f"--scheduler {address}: no worker within {ANSWER_S} s; start one with `dask worker {address}`",
             ) from error
-        _require_same(dict[str, dict[str, str]](client.run(versions)), address)  # type: ignore[arg-type]
-        yield _Workers(client, sum(dict[str, int](client.nthreads()).values()))  # type: ignore[arg-type]
+        _require_same(client.run(versions), address)  # type: ignore[arg-type]
+        client.register_worker_callbacks(_limit_threads)
+        yield client
 
 
-@contextlib.contextmanager
-def _silent(package: str) -> Iterator[None]:
-    """Silence the logs of a package. Dask logs each lost worker and each closed connection; a fault shows by
-    its effect."""
-    every = logging.root.manager.loggerDict.items()
-    logs = [log for name, log in every if isinstance(log, logging.Logger) and name.split(".")[0] == package]
-    levels = [log.level for log in logs]
-    for log in logs:
-        log.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for log, level in zip(logs, levels, strict=True):
-            log.setLevel(level)
-
-
-def _require_address(address: str) -> None:
+def _require_scheduler(address: str) -> None:
     """Refuse addresses without a scheduler: for some of them, and for answers of other programs, Dask's client waits
     for ever."""
     from distributed.core import rpc
@@ -111,67 +106,28 @@ def _require_address(address: str) -> None:
         ) from error
 
 
-def versions() -> dict[str, str]:
-    """Returns the versions here of the packages on which a result depends; empty for a package that is not installed by
-    its name."""
-    version_of = {"stcal": stcal.__version__}
-    for name in SAME[1:]:
+def versions() -> str:
+    """Returns the versions here of the packages on which a result depends, bit by bit."""
+    found = [f"stcal {stcal.__version__}"]
+    for name in ("numpy", "scipy", "opencv-python-headless"):
         try:
-            version_of[name] = metadata.version(name)
+            found.append(f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:
-            version_of[name] = ""
-    return version_of
+            found.append(f"{name} none")
+    return ", ".join(found)
 
 
-def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
-    local = versions()
+def _require_same(found: dict[str, str], address: str) -> None:
     for worker, theirs in found.items():
-        for name, version in local.items():
-            if theirs[name] != version:
-                raise InputError(
-                    "E-CLUSTER-VERSIONS",
-                    f"--scheduler {address}: worker {worker} has {name} {theirs[name] or 'none'}, {version or 'none'} "
-                    "here; results would differ; install the same versions",
-                )
+        if theirs != versions():
+            raise InputError(
+                "E-CLUSTER-VERSIONS",
+                f"--scheduler {address}: worker {worker} has {theirs}, here {versions()}; results would differ; "
+                "install the same versions",
+            )
 
 
-class _Workers(Executor):
-    """The workers of a cluster. Dask gives the jobs of a lost worker to another one, three times at most."""
+def _limit_threads() -> None:
+    from threadpoolctl import threadpool_limits
 
-    def __init__(self, client, threads: int):
-        self._client, self.threads = client, threads
-
-    def submit(self, function: Callable, /, *arguments, **_) -> Future:
-        answer: Future = Future()
-        answer.set_running_or_notify_cancel()  # the client drops futures that nobody waits for
-        future = self._client.submit(_alone, function, *arguments, pure=False)
-
-        def done(inner) -> None:
-            try:
-                result = inner.result()
-            except Exception as error:
-                if inner.status == "error" and not type(error).__module__.startswith("distributed"):
-                    answer.set_exception(error)
-                else:
-                    # A scheduler that ends cancels the jobs, or resets the connection while a result is on its way.
-                    lost = inner.status == "cancelled" or isinstance(error, OSError)
-                    why = "the connection to the scheduler was lost" if lost else error
-                    answer.set_exception(BrokenExecutor(f"the cluster gave a job up: {why}"))
-            else:
-                answer.set_result(result)
-
-        future.add_done_callback(done)
-        return answer
-
-
-_limit: Any = None
-
-
-def _alone(function: Callable, *arguments):
-    """Execute a job on a worker, with one thread for BLAS from the first job on, as in processes of this machine."""
-    global _limit
-    if _limit is None:
-        from threadpoolctl import threadpool_limits
-
-        _limit = threadpool_limits(1)
-    return function(*arguments)
+    threadpool_limits(1)

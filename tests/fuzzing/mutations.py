@@ -29,87 +29,50 @@ def pick(rng: np.random.Generator, values):
     return values[int(rng.integers(len(values)))]
 
 
-def _bytes(change: Callable[[bytes, np.random.Generator], bytes]) -> Mutation:
+def _bytes(said: str, change: Callable[[bytes, np.random.Generator], bytes]) -> Mutation:
     def spoil(path: Path, rng: np.random.Generator) -> str:
         path.write_bytes(change(path.read_bytes(), rng))
-        return change.__name__.strip("_")
+        return said
 
-    spoil.__name__ = change.__name__
     return spoil
 
 
-@_bytes
-def truncated(data: bytes, rng: np.random.Generator) -> bytes:
-    return data[: int(rng.integers(len(data) + 1))]
+def _inserted(said: str, piece: Callable[[np.random.Generator], bytes]) -> Mutation:
+    """Puts a piece at a random place."""
+
+    def change(data: bytes, rng: np.random.Generator) -> bytes:
+        at = int(rng.integers(len(data) + 1))
+        return data[:at] + piece(rng) + data[at:]
+
+    return _bytes(said, change)
 
 
-@_bytes
-def flipped(data: bytes, rng: np.random.Generator) -> bytes:
+def _replaced(said: str, instead: Callable[[bytes], bytes]) -> Mutation:
+    """Puts something in the place of a random piece."""
+
+    def change(data: bytes, rng: np.random.Generator) -> bytes:
+        a, b = sorted(rng.integers(len(data) + 1, size=2).tolist())
+        return data[:a] + instead(data[a:b]) + data[b:]
+
+    return _bytes(said, change)
+
+
+def _flipped(data: bytes, rng: np.random.Generator) -> bytes:
     found = bytearray(data)
     for at in rng.integers(len(found), size=int(rng.integers(1, 6))) if found else ():
         found[at] ^= 1 << int(rng.integers(8))
     return bytes(found)
 
 
-@_bytes
-def a_piece_twice(data: bytes, rng: np.random.Generator) -> bytes:
-    a, b = sorted(rng.integers(len(data) + 1, size=2).tolist())
-    return data[:b] + data[a:]
+LINE_ENDS = (b"\r\n", b"\r", b"\n\n", "\u2028".encode(), b"\x0c\n")
+CONTROL = (b"\x1b[31;1m", b"\x00", b"\x07\x08", "\u202e\u200b".encode(), b"\x7f")
+ENCODINGS = ("utf-16", "utf-16-be", "utf-32")
 
-
-@_bytes
-def a_piece_of_junk(data: bytes, rng: np.random.Generator) -> bytes:
-    at = int(rng.integers(len(data) + 1))
-    return data[:at] + rng.bytes(int(rng.integers(1, 200))) + data[at:]
-
-
-@_bytes
-def a_piece_of_zeros(data: bytes, rng: np.random.Generator) -> bytes:
-    a, b = sorted(rng.integers(len(data) + 1, size=2).tolist())
-    return data[:a] + bytes(b - a) + data[b:]
-
-
-@_bytes
-def byte_order_mark(data: bytes, _) -> bytes:
-    return b"\xef\xbb\xbf" + data
-
-
-@_bytes
-def other_line_ends(data: bytes, rng: np.random.Generator) -> bytes:
-    return data.replace(b"\n", pick(rng, [b"\r\n", b"\r", b"\n\n", "\u2028".encode(), b"\x0c\n"]))
-
-
-@_bytes
-def control_characters(data: bytes, rng: np.random.Generator) -> bytes:
-    at = int(rng.integers(len(data) + 1))
-    return data[:at] + pick(rng, [b"\x1b[31;1m", b"\x00", b"\x07\x08", "\u202e\u200b".encode(), b"\x7f"]) + data[at:]
-
-
-@_bytes
-def a_long_line(data: bytes, rng: np.random.Generator) -> bytes:
-    at = int(rng.integers(len(data) + 1))
-    return data[:at] + pick(rng, [b"9", b"x", b"[", b'"', b" ", b","]) * 300_000 + data[at:]
-
-
-@_bytes
-def latin_1(data: bytes, rng: np.random.Generator) -> bytes:
-    at = int(rng.integers(len(data) + 1))
-    return data[:at] + b"\xb0 \xe9" + data[at:]
-
-
-@_bytes
-def utf_16(data: bytes, rng: np.random.Generator) -> bytes:
-    return data.decode("utf-8", "replace").encode(pick(rng, ["utf-16", "utf-16-be", "utf-32"]))
-
-
-@_bytes
-def emptied(*_) -> bytes:
-    return b""
-
-
-@_bytes
-def junk(data: bytes, rng: np.random.Generator) -> bytes:
-    return rng.bytes(max(len(data), 64))
+truncated = _bytes("truncated", lambda data, rng: data[: int(rng.integers(len(data) + 1))])
+flipped = _bytes("flipped", _flipped)
+emptied = _bytes("emptied", lambda *_: b"")
+junk = _bytes("junk", lambda data, rng: rng.bytes(max(len(data), 64)))
+utf_16 = _bytes("utf_16", lambda data, rng: data.decode("utf-8", "replace").encode(pick(rng, ENCODINGS)))
 
 
 def a_folder(path: Path, _) -> str:
@@ -147,8 +110,20 @@ def huge(path: Path, _) -> str:
     return f"{HUGE_BYTES >> 30} GB"
 
 
-BYTES = (truncated, flipped, a_piece_twice, a_piece_of_junk, a_piece_of_zeros)
-TEXT = (byte_order_mark, other_line_ends, control_characters, a_long_line, latin_1)
+BYTES = (
+    truncated,
+    flipped,
+    _replaced("a piece twice", lambda piece: 2 * piece),
+    _inserted("a piece of junk", lambda rng: rng.bytes(int(rng.integers(1, 200)))),
+    _replaced("a piece of zeros", lambda piece: bytes(len(piece))),
+)
+TEXT = (
+    _bytes("byte order mark", lambda data, _: b"\xef\xbb\xbf" + data),
+    _bytes("other line ends", lambda data, rng: data.replace(b"\n", pick(rng, LINE_ENDS))),
+    _inserted("control characters", lambda rng: pick(rng, CONTROL)),
+    _inserted("a long line", lambda rng: pick(rng, [b"9", b"x", b"[", b'"', b" ", b","]) * 300_000),
+    _inserted("latin 1", lambda _: b"\xb0 \xe9"),
+)
 MAY_BE_READ = (utf_16,)
 """Those of :data:`REFUSED` that some readers understand: UTF-16 and UTF-32 begin with a mark."""
 REFUSED = (utf_16, emptied, junk, a_folder, missing, a_broken_link, not_permitted, huge)

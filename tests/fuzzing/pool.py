@@ -3,13 +3,12 @@
 import multiprocessing
 import os
 import resource
-import shutil
 import tempfile
-import time
+import threading
+import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import cache
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 from stcal.parallel import ONE_THREAD
@@ -29,18 +28,11 @@ def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:
     from tests.fuzzing.kept import closed, of_kept
     from tests.fuzzing.kills import killed
 
-    for letter, judge in (("s", of_kept), ("d", closed)):
-        if name[0] == letter and name[1:].isdigit():
-            return judge(stock, folder, seed, int(name[1:]))
-    if name[0] == "c" and name[1:].isdigit():
-        return judged(stock, folder, seed, int(name[1:]))
-    if name[0] == "k" and name[1:].isdigit():
-        return killed(stock, folder, seed, int(name[1:]))
-    if name[0] == "o" and name[1:].isdigit():
-        return judged_option(stock, folder, int(name[1:]))
-    if name[0] == "v" and name[1:].isdigit():
-        return went_through(stock, folder, int(name[1:]))
-    return mistaken(stock, folder, name)
+    if not name[1:].isdigit():
+        return mistaken(stock, folder, name)
+    if name[0] in "vo":
+        return {"v": went_through, "o": judged_option}[name[0]](stock, folder, int(name[1:]))
+    return {"c": judged, "k": killed, "s": of_kept, "d": closed}[name[0]](stock, folder, seed, int(name[1:]))
 
 
 def went_through(stock: Path, folder: Path, number: int) -> Judged:
@@ -91,84 +83,35 @@ def _on_good_data(stock: Path, folder: Path, call: Call) -> Outcome:
     return in_process(call, "stcal", folder)
 
 
-@dataclass(slots=True)
-class _Worker:
-    process: multiprocessing.process.BaseProcess
-    ours: Connection
-    name: str = ""
-    since: float = 0.0
-
-
 def run_all(stock: Path, seed: int, names: Sequence[str], workers: int) -> Iterator[Judged]:
-    """Judge all cases, in any order."""
-    waiting = list(reversed(names))
+    """Judge all cases."""
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    folder = Path(tempfile.mkdtemp(prefix="stcal-fuzz-"))
-    context = multiprocessing.get_context("spawn")
-    at_work: list[_Worker] = []
-    started = 0
-    try:
-        while waiting or at_work:
-            while waiting and len(at_work) < workers:
-                ours, theirs = context.Pipe()
-                arguments = (theirs, stock, folder / str(started), seed)
-                process = context.Process(target=_work, args=arguments, daemon=False)
-                process.start()
-                theirs.close()
-                started += 1
-                at_work.append(_give(_Worker(process, ours), waiting))
-            wait([worker.ours for worker in at_work], timeout=5)
-            for worker in list(at_work):
-                found = _answer(worker)
-                if found is None:
-                    continue
-                yield found
-                if worker.process.is_alive() and waiting:
-                    _give(worker, waiting)
-                else:
-                    _stop(worker)
-                    at_work.remove(worker)
-    finally:
-        for worker in at_work:
-            worker.process.kill()
-            worker.process.join()
-        shutil.rmtree(folder, ignore_errors=True)
+    own = threading.local()
+    with tempfile.TemporaryDirectory(prefix="stcal-fuzz-", ignore_cleanup_errors=True) as folder:
+
+        def judge(name: str) -> Judged:
+            """Judges a case in the process of this thread, which is replaced where it breaks or gives no answer."""
+            if getattr(own, "pool", None) is None:
+                own.pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _limit_memory)
+            place, processes = Path(folder, str(threading.get_ident())), own.pool._processes
+            try:
+                return own.pool.submit(perform, stock, place, seed, name).result(LONGEST_WAIT_S)
+            except BrokenExecutor:
+                own.pool, fault = None, ("crash", f"exit codes {[each.exitcode for each in processes.values()]}")
+            except TimeoutError:
+                for process in processes.values():
+                    process.kill()
+                own.pool, fault = None, ("hang", f"no answer for {LONGEST_WAIT_S:g} s")
+            except Exception:
+                fault = "study", traceback.format_exc()[-1500:]
+            return Judged(name, "", (fault,), None, 0, "")
+
+        with ThreadPoolExecutor(workers) as threads:
+            try:
+                yield from threads.map(judge, names)
+            finally:
+                threads.shutdown(cancel_futures=True)
 
 
-def _give(worker: _Worker, waiting: list[str]) -> _Worker:
-    worker.name, worker.since = waiting.pop(), time.monotonic()
-    worker.ours.send(worker.name)
-    return worker
-
-
-def _answer(worker: _Worker) -> Judged | None:
-    """What a worker found, or what became of it; None while it works."""
-    try:
-        if worker.ours.poll():
-            return worker.ours.recv()
-    except (EOFError, OSError):
-        worker.process.join()
-        return Judged(worker.name, "", (("crash", f"exit code {worker.process.exitcode}"),), None, 0, "")
-    if time.monotonic() - worker.since > LONGEST_WAIT_S:
-        worker.process.kill()
-        worker.process.join()
-        return Judged(worker.name, "", (("hang", f"no answer for {LONGEST_WAIT_S:g} s"),), None, LONGEST_WAIT_S, "")
-    return None
-
-
-def _stop(worker: _Worker) -> None:
-    if worker.process.is_alive():
-        worker.ours.send("")
-    worker.process.join()
-    worker.ours.close()
-
-
-def _work(theirs: Connection, stock: Path, folder: Path, seed: int) -> None:
+def _limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, resource.RLIM_INFINITY))
-    while name := theirs.recv():
-        try:
-            theirs.send(perform(stock, folder, seed, name))
-        except Exception as error:
-            import traceback
-
-            theirs.send(Judged(name, repr(error), (("study", traceback.format_exc()[-1500:]),), None, 0, ""))

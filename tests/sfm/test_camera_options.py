@@ -1,4 +1,4 @@
-"""Options of every command that reads cameras or photographs: ``--camera-name`` and ``--bayer``, walked over all."""
+"""``--camera-name`` of every command that reads cameras, walked over all."""
 
 import inspect
 import sys
@@ -7,7 +7,6 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.errors import InputError
-from stcal.io import images
 from stcal.io.cameras import read
 from tests.commands import CALLS, COMMANDS, Call
 from tests.fuzzing.judged import lay_out
@@ -23,10 +22,6 @@ MORE = (
 )
 """Commands whose call elsewhere has no camera file."""
 OF_CAMERAS = {each.command: each for each in (*CALLS, *MORE) if "--camera @" in each.words}
-WRITE_PHOTOGRAPHS = {"sfm simulate", "sfm design", "sfm plan"}
-"""``images`` is a number there, or a folder that is written."""
-SOURCES = {"handeye", "handeye plan"}
-"""``source`` may be a folder of images there."""
 
 
 @pytest.fixture
@@ -49,13 +44,6 @@ def test_every_command_with_a_camera_chooses_one_of_several():
     assert OF_CAMERAS.keys() == {
         name for name, command in COMMANDS.items() if "camera" in inspect.signature(command).parameters
     }
-
-
-def test_every_command_with_photographs_reads_mosaics():
-    for name, command in COMMANDS.items():
-        options = inspect.signature(command).parameters
-        reads = bool({"images", "exposures"} & options.keys()) and name not in WRITE_PHOTOGRAPHS
-        assert (reads or name in SOURCES) == ("bayer" in options), name
 
 
 def two_cameras(each):
@@ -86,25 +74,3 @@ def test_a_camera_of_several_is_asked_for_and_taken(call, monkeypatch, name):
     monkeypatch.setattr(read, "one_of", chosen)
     assert_error(call(each, "--camera-name", "2", change=two_cameras(each)), 2, "chosen: 2")
     assert taken == ["2"]
-
-
-OF_IMAGES = {
-    each.command: each
-    for each in reversed((*CALLS, *MORE))
-    if "bayer" in inspect.signature(COMMANDS[each.command]).parameters and "@handeye/poses.csv" not in each.words
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", OF_IMAGES)
-def test_mosaics_are_read_as_such(call, monkeypatch, name):
-    """Each image, by every way in which a command comes to it; an image in grey stands for a mosaic."""
-    patterns = []
-
-    def read_as(data, name, pattern):
-        patterns.append(pattern)
-        raise InputError("E-IMAGE-DAMAGED", f"{name}: read as a mosaic of {pattern}")
-
-    monkeypatch.setattr(images, "without_mosaic", read_as)
-    outcome = call(OF_IMAGES[name], "--bayer", "grbg")
-    assert set(patterns) == {"GRBG"}, outcome

@@ -98,28 +98,20 @@ def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
     assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures] == ["silent wrong"]
 
 
-QUICK = [
-    "register: a in metres",
-    "register: rows one late",
-    "verify: measured in inches",
-    "handeye, poses: both inverse",
-    "compare: truth in metres",
-    "compensate: x y z w",
-]
-
-
+BRIEF = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2]
+"""Those of calls that take together less than a minute of processor time; `scripts/full` makes all mistakes."""
 SLOW = [
     pytest.param(name, marks=pytest.mark.slow)
     for name in MISTAKES
-    if name not in QUICK and name.startswith(("identify", "axes", "compensate", "verify", "locate", "register"))
+    if name not in BRIEF and name.startswith(("identify", "axes", "compensate", "verify", "locate", "register"))
 ]
 """Mistakes with robots, instruments and located targets, which no other test tells."""
 
 
-@pytest.mark.parametrize("name", [*QUICK, *SLOW])
+@pytest.mark.parametrize("name", [*BRIEF, *SLOW])
 def test_a_mistake_is_told(stock, tmp_path, name):
-    assert name in MISTAKES
-    assert mistaken(stock, tmp_path / "case", name).failures == ()
+    found = mistaken(stock, tmp_path / "case", name).failures
+    assert {kind for kind, _ in found} <= {"no program could tell"}, found
 
 
 ELSEWHERE = {"sfm demo", "sfm detect", "robot from-photos"}

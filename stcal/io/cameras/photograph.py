@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import camera_from_opencv
 from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.photographs.decoding import heic_turns, is_heic, require_heic
+from stcal.io.photographs.decoding import heic_turns, is_heic, let_pillow_read_heic
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
 """First bytes of JPEG, TIFF and PNG."""
@@ -60,7 +60,7 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     try:
         data = read_bytes(path, IMAGE_BYTES)
         if is_heic(data):
-            require_heic(f"camera file {path}").register_heif_opener()
+            let_pillow_read_heic(f"camera file {path}")
         with Image.open(BytesIO(data)) as image:
             (width, height), exif = image.size, image.getexif().get_ifd(ExifTags.IFD.Exif)
         if is_heic(data) and heic_turns(data) % 2:

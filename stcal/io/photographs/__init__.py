@@ -1,1 +1,1 @@
-"""Photographs that need more than OpenCV's decoders: HEIC, raw files, and mosaics of coloured pixels."""
+"""Photographs that need more than OpenCV's decoders: HEIC, videos, and those that are refused."""

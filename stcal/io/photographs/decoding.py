@@ -1,14 +1,13 @@
-"""What decoders leave out: whether a photograph's file is whole, mosaics of Bayer filters, HEIC and raw files."""
+"""What decoders leave out: whether a photograph's file is whole; HEIC; what is a mosaic of colours or a raw file."""
 
 import re
-import struct
 import zlib
 from importlib.util import find_spec
 from io import BytesIO
-from types import ModuleType
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from stcal.errors import InputError
 
@@ -57,27 +56,12 @@ def _jpeg_ends(data: bytes) -> bool:
     return False
 
 
-PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-"""Colours of the first two rows and columns."""
 LEAST_COLOUR = 0.05
 """Smallest relative difference between neighbours of two colours that tells a mosaic."""
 GREEN_ALIKE = 0.3
 """Largest difference between both greens, as a share of that between green and the other colours."""
 TRIED_PX = 1024
 """Side of the middle of the image that is judged, px."""
-
-
-def demosaiced(mosaic: np.ndarray, pattern: str, name: str) -> np.ndarray:
-    """Return the grey image of a mosaic; ``pattern`` : one of :data:`PATTERNS`.
-
-    Raises InputError: the pattern is unknown, or the image has colours already.
-    """
-    word = pattern.upper()
-    if word not in PATTERNS:
-        raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
-    if mosaic.ndim != 2:
-        raise InputError("E-IMAGE-TYPE", f"{name}: a colour image, not a mosaic; leave --bayer out")
-    return cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{word}2GRAY"))
 
 
 def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
@@ -112,13 +96,15 @@ def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
 
 HEIC = (".heic", ".heif", ".hif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
-_HEIC = "export it as JPEG of its full size, not edited"
-_RAW = "develop it to TIFF without correction of the lens, crop or turn"
-EXTRAS = {
-    **dict.fromkeys(HEIC, ("pillow_heif", "heic", "a HEIC photograph", _HEIC)),
-    **dict.fromkeys(RAW, ("rawpy", "raw", "a raw photograph", _RAW)),
+EXPORT = "export it as JPEG of its full size, not edited"
+UNREAD = {
+    **dict.fromkeys(
+        HEIC,
+        "a HEIC photograph, which is read after `pip install 'stereo-target-calibration[heic]'`; or " + EXPORT,
+    ),
+    **dict.fromkeys(RAW, "a raw photograph; develop it to TIFF or PNG without correction of the lens, crop or turn"),
 }
-"""Optional photographs by suffix: package that reads them, extra that installs it, what they are, a way without."""
+"""What photographs of these suffixes are, and what to do where they are not read."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 """Brands of HEIC files, in the bytes 8 to 12."""
 DNG_VERSION = 50706
@@ -127,13 +113,7 @@ DNG_VERSION = 50706
 
 def readable() -> tuple[str, ...]:
     """Return the suffixes whose package is installed."""
-    return tuple(suffix for suffix, (package, *_) in EXTRAS.items() if find_spec(package) is not None)
-
-
-def reason_unread(suffix: str) -> str:
-    """Return why a photograph of this suffix is not read, and what to do; for suffixes whose package is missing."""
-    _, extra, what, remedy = EXTRAS[suffix]
-    return f"{what}, which is read after `pip install 'stereo-target-calibration[{extra}]'`; or {remedy}"
+    return HEIC if find_spec("pillow_heif") else ()
 
 
 def is_heic(data: bytes) -> bool:
@@ -141,16 +121,16 @@ def is_heic(data: bytes) -> bool:
     return data[4:8] == b"ftyp" and data[8:12] in HEIC_BRANDS
 
 
-def require_heic(name: str) -> ModuleType:
-    """Return the package that reads HEIC.
+def let_pillow_read_heic(name: str) -> None:
+    """Register the package that reads HEIC with Pillow.
 
     Raises InputError: it is not installed; the message begins with ``name``.
     """
     if find_spec("pillow_heif") is None:
-        raise InputError("E-IMAGE-EXTRA", f"{name}: {reason_unread('.heic')}")
+        raise InputError("E-IMAGE-EXTRA", f"{name}: {UNREAD['.heic']}")
     import pillow_heif
 
-    return pillow_heif
+    pillow_heif.register_heif_opener()
 
 
 def heic_grey(data: bytes, name: str) -> np.ndarray:
@@ -158,14 +138,15 @@ def heic_grey(data: bytes, name: str) -> np.ndarray:
 
     Raises InputError: the package is missing, or the data are damaged or mirrored.
     """
-    package = require_heic(name)
+    let_pillow_read_heic(name)
     try:
-        image = np.asarray(package.open_heif(data, convert_hdr_to_8bit=False))
+        with Image.open(BytesIO(data)) as image:
+            colours = np.asarray(image.convert("RGB"))
     except Exception as error:  # damaged containers fail in many ways
         raise InputError("E-IMAGE-UNREADABLE", f"{name}: not readable as HEIC; copy it again") from error
     if b"imir" in _properties(data):
-        raise InputError("E-IMAGE-TYPE", f"{name}: its container mirrors the image; {_HEIC}")
-    return _grey(np.rot90(image, -heic_turns(data)))
+        raise InputError("E-IMAGE-TYPE", f"{name}: its container mirrors the image; {EXPORT}")
+    return np.ascontiguousarray(np.rot90(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), -heic_turns(data)))
 
 
 def _properties(data: bytes) -> bytes:
@@ -183,44 +164,9 @@ def heic_turns(data: bytes) -> int:
 
 def is_dng(data: bytes) -> bool:
     """Return True for a TIFF whose first directory has the tag of a DNG."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
-    if order is None or len(data) < 8:
-        return False
-    (at,) = struct.unpack_from(f"{order}I", data, 4)
-    count = struct.unpack_from(f"{order}H", data, at)[0] if at + 2 <= len(data) else 0
-    places = range(at + 2, min(at + 2 + 12 * count, len(data) - 1), 12)
-    return any(struct.unpack_from(f"{order}H", data, place)[0] == DNG_VERSION for place in places)
-
-
-def raw_grey(data: bytes, name: str) -> np.ndarray:
-    """Return the grey pixels of a raw photograph, uint16, proportional to the light, without rotation or correction.
-
-    Raises InputError: the package is missing, or cannot read the file.
-    """
-    if find_spec("rawpy") is None:
-        raise InputError("E-IMAGE-EXTRA", f"{name}: {reason_unread('.dng')}")
-    import rawpy
-
+    tags = Image.Exif()
     try:
-        with rawpy.imread(BytesIO(data)) as raw:
-            image = raw.postprocess(
-                gamma=(1, 1),
-                no_auto_bright=True,
-                output_bps=16,
-                user_flip=0,
-                use_camera_wb=True,
-                output_color=rawpy.ColorSpace.raw,  # type: ignore[attr-defined]
-            )
-    except rawpy.LibRawError as error:  # type: ignore[attr-defined]
-        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
-        raise InputError(
-            "E-IMAGE-UNREADABLE", f"{name}: not readable as a raw photograph ({reason}); copy it again, or develop it"
-        ) from error
-    return _grey(image)
-
-
-def _grey(image: np.ndarray) -> np.ndarray:
-    image = np.ascontiguousarray(image)
-    if image.ndim == 3 and image.shape[2] >= 3:
-        return cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY)
-    return image if image.ndim == 2 else np.ascontiguousarray(image[..., 0])
+        tags.load(data)
+    except Exception:  # damaged directories fail in many ways
+        return False
+    return DNG_VERSION in tags

@@ -13,7 +13,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
-from stcal.parallel import run_briefly
+from stcal.parallel import run_in_order
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
@@ -48,7 +48,7 @@ class Again:
     def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
         """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
         jobs = [(models, self.board, self.options.flatness_mm, self.joint) for models in parts]
-        return run_briefly(_adjusted, jobs)
+        return run_in_order(_adjusted, jobs, 1)
 
     def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
         """Returns the poses of ``faces`` by the adjustment of a part of the models, and that adjustment.

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
-from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
+from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.equations import rows_of_view
 from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
@@ -193,7 +193,8 @@ def _candidates(known: Known) -> list[list[PlannedView]]:
     """Returns the views that are compared, by group."""
     if not known.setup.board.rows:
         return [body_views(model, known.setup, known.noise) for model in known.models]
-    return run_briefly(candidates, [(known.scene, model, known.setup, known.noise) for model in known.models])
+    jobs = [(known.scene, model, known.setup, known.noise) for model in known.models]
+    return run_in_order(candidates, jobs, 1)
 
 
 def _greedy(
@@ -205,8 +206,8 @@ def _greedy(
     while views and len(chosen) < count:
         progress(f"view {len(chosen) + 1}", 0, len(views))
         positions = PositionsWith.of(known.models, setup, now.derivatives, photographs)
-        parts = [views[i : i + AT_ONCE] for i in range(0, len(views), AT_ONCE)]
-        results = [sigma for part in run_briefly(_positions, [(positions, part) for part in parts]) for sigma in part]
+        jobs = [(positions, views[i : i + AT_ONCE]) for i in range(0, len(views), AT_ONCE)]
+        results = [sigma for part in run_in_order(_positions, jobs, 1) for sigma in part]
         progress(f"view {len(chosen) + 1}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         chosen.append(Choice(views[best], *worst_of(results[best])))

@@ -56,8 +56,6 @@ class RunOptions:
     expect_faces : tuple of str
         Faces that the photographs were to show: the answer is "no" where one is not in the result. If empty, the names
         of the groups tell, where all of them are made of ids of faces, such as ``12`` or ``front-right``.
-    bayer : {"", "RGGB", "BGGR", "GRBG", "GBRG"}
-        Pattern of the sensor whose mosaics the images are; empty if they are ordinary images.
 
     Raises
     ------
@@ -79,7 +77,6 @@ class RunOptions:
     compare: Compare | None = None
     exclude: tuple[str, ...] = ()
     expect_faces: tuple[str, ...] = ()
-    bayer: Literal["", "RGGB", "BGGR", "GRBG", "GBRG"] = ""
 
     def __post_init__(self):
         require_fields(self, "options", workers=1, flatness_mm=LEAST)

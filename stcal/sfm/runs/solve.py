@@ -24,7 +24,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.files import save
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, ImageFiles, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
-from stcal.parallel import Progress, counted, run_briefly
+from stcal.parallel import Progress, counted, run_in_order
 from stcal.report.text import significant
 from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.adjust.scale import find_scale
@@ -550,9 +550,8 @@ def solve_groups(
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:
-        for k, solution in zip(
-            pending, run_briefly(_solved, [(groups[k], scratch / str(k)) for k in pending], step), strict=True
-        ):
+        jobs = [(groups[k], scratch / str(k)) for k in pending]
+        for k, solution in zip(pending, run_in_order(_solved, jobs, 1, lambda done, _: step(done)), strict=True):
             found[k] = solution
             if isinstance(solution, GroupSolution):
                 _save(paths[k], solution)

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
-from stcal.io.device import frames_of, pictures_of
-from stcal.io.images import mosaic_of
+from stcal.io.device import pictures_of
 from stcal.sfm import MeasureOptions, measure
 from stcal.sfm.measurement.live import WIDEST_PX, LiveService, drawn, line_of, served
 from stcal.sfm.measurement.pose import TargetPose
@@ -176,10 +175,6 @@ def test_every_picture_of_a_video_is_read(tmp_path):
     film.release()
     with pictures_of(str(path)) as frames:
         assert [round(float(frame.mean()), -1) for frame in frames] == [0, 100, 200]
-    with mosaic_of("RGGB"), fails_with("E-OPTION-CONFLICT … --bayer RGGB"), pictures_of(str(path)):
-        pass
-    with mosaic_of("RGGB"), fails_with("E-OPTION-CONFLICT … --bayer RGGB"), frames_of(path):
-        pass
 
 
 def live(small_run, *words):

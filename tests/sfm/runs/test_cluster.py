@@ -7,15 +7,14 @@ import socket
 import subprocess
 import sys
 import threading
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from stcal.errors import DetectionError
 from stcal.io.image_jobs import run_on_images, spread
 from stcal.io.images import ImageFile
-from stcal.parallel import run_parallel
+from stcal.parallel import hand_over
 from stcal.sfm import RunOptions, run
 from stcal.workflows import cluster
 from tests.levels import sampled
@@ -49,15 +48,6 @@ class Here(Executor):
         return future
 
 
-class Broken(Executor):
-    """Has lost its workers."""
-
-    def submit(self, function, /, *arguments, **_):
-        future = Future()
-        future.set_exception(BrokenExecutor("all workers lost"))
-        return future
-
-
 @pytest.fixture(scope="module")
 def expected(small_dataset, tmp_path_factory):
     """Results by processes of this machine."""
@@ -66,7 +56,7 @@ def expected(small_dataset, tmp_path_factory):
 
 def test_jobs_go_to_an_executor_a_few_at_a_time():
     with ThreadPoolExecutor(3) as pool:
-        found = dict(run_parallel(pow, [(i, 2) for i in range(50)], executor=pool, at_once=4))
+        found = dict(hand_over(pool, pow, [(i, 2) for i in range(50)], 4))
     assert found == {i: i * i for i in range(50)}
 
 
@@ -78,11 +68,6 @@ def test_a_run_by_an_executor_is_the_same(small_dataset, expected, tmp_path, sen
         assert run_into(tmp_path / "run", small_dataset) == expected
     assert executor.jobs
     assert all((job[1].content is not None) == send for job in executor.jobs)
-
-
-def test_workers_that_are_lost_for_good_are_one_line(small_dataset, tmp_path):
-    with spread(Broken()), fails_with("E-WORKER-DIED … all workers lost"):
-        run_into(tmp_path / "run", small_dataset)
 
 
 def end(_):
@@ -97,13 +82,13 @@ def test_a_process_that_is_ended_from_outside_is_one_line():
 
 def test_a_folder_that_workers_do_not_see_is_one_line(tmp_path):
     file = ImageFile(tmp_path / "elsewhere" / "a.jpg", "a.jpg", ".")
-    with spread(Here()), fails_with("E-WORKER-PATH … elsewhere … --send-images"):
+    with spread(Here(), 3), fails_with("E-WORKER-PATH … elsewhere … --send-images"):
         dict(run_on_images(len, [(file,)]))
 
 
 def test_paths_go_to_workers_from_the_root(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with spread(Here()):
+    with spread(Here(), 3):
         assert dict(run_on_images(lambda file: file.path, [(ImageFile(Path("a.jpg"), "a.jpg", "."),)])) == {
             0: tmp_path / "a.jpg"
         }
@@ -142,8 +127,8 @@ def test_what_is_no_address_is_one_line(address):
 def test_workers_of_other_versions_are_refused():
     own = cluster.versions()
     cluster._require_same({"tcp://a": own}, "tcp://b")
-    with fails_with("E-CLUSTER-VERSIONS … tcp://a … numpy … 1.0"):
-        cluster._require_same({"tcp://a": own | {"numpy": "1.0"}}, "tcp://b")
+    with fails_with("E-CLUSTER-VERSIONS … tcp://a … numpy 1.0"):
+        cluster._require_same({"tcp://a": own.replace("numpy", "numpy 1.0,")}, "tcp://b")
 
 
 @contextlib.contextmanager
@@ -185,10 +170,18 @@ def test_a_run_by_a_cluster_that_loses_a_worker_is_the_same(small_dataset, expec
 def test_a_run_by_a_cluster_that_loses_its_scheduler_ends_in_one_line(small_dataset, tmp_path):
     with two_workers(tmp_path) as (address, scheduler, _):
         progress, killed = killing(scheduler)
-        line = r"the connection to the scheduler was lost; run the same command again, finished detections are kept"
-        with pytest.raises(DetectionError, match=line), cluster.dask_cluster(address):
+        with fails_with(f"E-WORKER-DIED … {address}"), cluster.dask_cluster(address):
             run_into(tmp_path / "run", small_dataset, progress=progress)
         assert killed
+
+
+@pytest.mark.slow
+def test_an_image_that_ends_its_workers_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
+    file = ImageFile(tmp_path / "a.jpg", "a.jpg", ".")
+    with two_workers(tmp_path) as (address, *_), fails_with(f"E-WORKER-DIED … {address}"):  # noqa: SIM117
+        with cluster.dask_cluster(address):
+            dict(run_on_images(end, [(file,)]))
 
 
 @pytest.mark.slow

@@ -38,7 +38,6 @@ OTHER = RunOptions(
     flatness_mm=0.3,
     exclude=("12/a.jpg", "b.jpg"),
     expect_faces=("1", "2"),
-    bayer="GRBG",
 )
 SPECIAL = ("refine_camera", "rim", "compare", "board_only")
 """No value is a default but those that only the joint adjustment knows, and that of runs without faces."""
