@@ -92,7 +92,7 @@ def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
     monkeypatch.setattr(
         kept, "CALLS", [call for call in CALLS if call.command == "sfm run" and "~run" in call.words][:1]
     )
-    monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob("cache/[0-9a-f]*.npz")))
+    monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob(".stcal/cache/[0-9a-f]*.npz")))
     assert kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures == ()
     monkeypatch.setattr(io_cache, "_digest", lambda _: ALL_ARE_EQUAL)
     assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures] == ["silent wrong"]
