@@ -152,6 +152,7 @@ def measure(
         limits = {"token": token, "max_megabytes": max_megabytes}
         _serve((replace(circles, design=design), model, *others), source, host, port, limits, json_file is not None)
         return
+    assert images is not None  # else it was refused above
     table = read_table(joints, "joints") if joints else None
     options = work.MeasureOptions(PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, workers)
     told = shared.designs_told(target, board, with_board=False)

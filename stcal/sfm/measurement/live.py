@@ -174,8 +174,8 @@ def served(service: LiveService, host: str = "127.0.0.1", port: int = 8765) -> I
         address, port = listening.getsockname()[:2]
         if not (ip_address(address.partition("%")[0]).is_loopback or service.token):
             raise InputError("E-OPTION-NEEDS", f"--host {host}: other machines reach it; give a --token")
-        limits = {"limit_concurrency": CONNECTIONS, "timeout_graceful_shutdown": END_S}
-        config = uvicorn.Config(service.app, lifespan="off", ws="none", log_config=None, log_level="error", **limits)
+        config = uvicorn.Config(service.app, lifespan="off", ws="none", log_config=None, log_level="error")
+        config.limit_concurrency, config.timeout_graceful_shutdown = CONNECTIONS, END_S
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)  # signals come to this one
         thread.start()
