@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stcal.geometry.plane import (
-    Plane,
     apply_homography,
     camera_from_plane,
     fit_homographies,
@@ -62,12 +61,6 @@ def test_plane_rms_is_the_spread_about_it():
     assert plane.rms == pytest.approx(0.1, rel=0.05)
     assert plane.rms == pytest.approx(np.sqrt((plane.distance(xyz) ** 2).mean()), rel=1e-9)
     assert plane.offset == pytest.approx(5, abs=0.008)
-
-
-def test_foot_points_lie_on_the_plane_and_are_nearest():
-    plane = Plane([0.6, 0, 0.8], 10.0, 0.0)
-    foot = plane.project(np.array([[1.0, 2, 3]]))
-    np.testing.assert_allclose(foot, [[1 + 7 * 0.6, 2, 3 + 7 * 0.8]], atol=1e-12)  # distance 0.6 + 2.4 − 10 = −7
 
 
 @pytest.mark.parametrize(

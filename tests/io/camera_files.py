@@ -14,35 +14,28 @@ def matrix(lens=LENS, skew: float = 0.0) -> np.ndarray:
     return np.array([[lens[0], skew, lens[2]], [0, lens[1], lens[3]], [0, 0, 1.0]])
 
 
-def perspective(k, lens=LENS, skew: float = 0.0) -> np.ndarray:
+def perspective(k, lens=LENS, skew: float = 0.0, rays=RAYS) -> np.ndarray:
     """OpenCV's projection; it has no skew, which is added to its normalised coordinates."""
-    xy = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), np.eye(3), np.array(k, float))[0].reshape(-1, 2)
+    xy = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), np.array(k, float))[0].reshape(-1, 2)
     return (np.column_stack([xy, np.ones(len(xy))]) @ matrix(lens, skew).T)[:, :2]
 
 
-def equidistant(k, lens=LENS) -> np.ndarray:
+def equidistant(k, lens=LENS, rays=RAYS) -> np.ndarray:
     none = np.zeros((1, 1, 3))
-    return cv2.fisheye.projectPoints(RAYS[:, None], none, none, matrix(lens), np.array(k, float))[0].reshape(-1, 2)
+    return cv2.fisheye.projectPoints(rays[:, None], none, none, matrix(lens), np.array(k, float))[0].reshape(-1, 2)
 
 
-def unified(xi: float, k, lens=LENS, skew: float = 0.0) -> np.ndarray:
+def unified(xi: float, k, lens=LENS, skew: float = 0.0, rays=RAYS) -> np.ndarray:
     """C. Mei, P. Rives, ICRA 2007: the point of the unit sphere is projected from ξ below its middle."""
-    unit = RAYS / np.linalg.norm(RAYS, axis=1)[:, None]
-    flat = np.column_stack([unit[:, :2] / (unit[:, 2:] + xi), np.ones(len(unit))])
-    xy = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), np.eye(3), np.array(k, float))[0].reshape(-1, 2)
-    return (np.column_stack([xy, np.ones(len(xy))]) @ matrix(lens, skew).T)[:, :2]
+    unit = rays / np.linalg.norm(rays, axis=1)[:, None]
+    return perspective(k, lens, skew, np.column_stack([unit[:, :2] / (unit[:, 2:] + xi), np.ones(len(unit))]))
 
 
 NEW_NAMES = ("camera_matrix", "distortion_coefficients", "image_width", "image_height")
 
 
-def storage(more: str = "", k: str = "911.5 0. 639. 0. 910.25 359. 0. 0. 1.", d=D5, names=()) -> str:
-    key, coefficients, width, height = names or (
-        "camera_matrix",
-        "distortion_coefficients",
-        "image_width",
-        "image_height",
-    )
+def storage(more: str = "", k: str = "911.5 0. 639. 0. 910.25 359. 0. 0. 1.", d=D5, names=NEW_NAMES) -> str:
+    key, coefficients, width, height = names
     node = '<{0} type_id="opencv-matrix"><rows>{1}</rows><cols>{2}</cols><dt>d</dt><data>\n {3}</data></{0}>'
     return (
         f'<?xml version="1.0"?>\n<opencv_storage>\n<{width}>1280</{width}>\n<{height}>720</{height}>\n'
@@ -148,7 +141,7 @@ FILES = {
     "Kalibr": (CHAIN, perspective(D4)),
     "mrcal": (MRCAL, perspective(D5)),
     "ROS-Industrial": (
-        "data: []\nintrinsics:\n  fx: 911.5  # px\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
+        "data: []\nfinder: {type: A}\nintrinsics:\n  fx: 911.5  # px\n  fy: 910.25\n  cx: 639.0\n  cy: 359.0\n",
         perspective([]),
     ),
 }

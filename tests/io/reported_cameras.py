@@ -1,8 +1,9 @@
 """Camera files that were reported (``../shared/cases``), and the pixels of RAYS by the numbers that stand in them."""
 
-import cv2
 import numpy as np
 import pycolmap
+
+from tests.io import camera_files
 
 RAYS = np.column_stack([np.random.default_rng(8).uniform(-0.5, 0.5, (40, 2)), np.ones(40)])
 RATIONAL = [0.41, -2.66, 0.0006, -0.0002, 1.52, 0.29, -2.48, 1.45]
@@ -12,23 +13,15 @@ ROS = 610.2, 610.5, 640.3, 401.7
 
 
 def perspective(lens, k) -> np.ndarray:
-    fx, fy, cx, cy = lens
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    return cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(k, float))[0].reshape(-1, 2)
+    return camera_files.perspective(k, lens, rays=RAYS)
 
 
 def equidistant(lens, k) -> np.ndarray:
-    fx, fy, cx, cy = lens
-    matrix, none = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.zeros((1, 1, 3))
-    return cv2.fisheye.projectPoints(RAYS[:, None], none, none, matrix, np.array(k, float))[0].reshape(-1, 2)
+    return camera_files.equidistant(k, lens, RAYS)
 
 
 def omnidir() -> np.ndarray:
-    """C. Mei, P. Rives, ICRA 2007, as OpenCV's omnidir has it."""
-    unit = RAYS / np.linalg.norm(RAYS, axis=1)[:, None]
-    flat = np.column_stack([unit[:, :2] / (unit[:, 2:] + 1.21), np.ones(len(unit))])
-    matrix = np.array([[920.5, 0, 641.2], [0, 921.1, 478.8], [0, 0, 1]])
-    return cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, np.array([-0.31, 0.12, 3e-4, -2e-4]))[0][:, 0]
+    return camera_files.unified(1.21, [-0.31, 0.12, 3e-4, -2e-4], (920.5, 921.1, 641.2, 478.8), rays=RAYS)
 
 
 def metashape() -> np.ndarray:

@@ -235,7 +235,7 @@ STATED = {
     "zero": (("0.3 0.2 0 1e-4", ALONE), "E-CAMERA-COVARIANCE … 0"),
     "too large": (("0.3 0.2 0.2 1e200", ALONE), "E-CAMERA-COVARIANCE … 1 … 1 … 200"),
     "a word": (("0.3 0.2 0.2 small", ALONE), "E-CAMERA-COVARIANCE"),
-    "too few": (("0.3 0.2 0.2", ALONE), "E-CAMERA-COVARIANCE … 3 σ, 4 needed"),
+    "too few": (("0.3 0.2 0.2", ALONE), "E-CAMERA-COVARIANCE … 4 σ"),
     "no correlations": ((SIGMA, []), "E-CAMERA-COVARIANCE … 4 … 4 … 4"),
     "correlation 9": (
         (SIGMA, ["1 9 0 0", "9 1 0 0", *ALONE[2:]]),

@@ -31,17 +31,6 @@ def test_a_reported_file_is_refused_in_one_line(shared_case, place, name):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "cameras255.bin", "cameras256.bin"])
-def test_reported_files_of_many_cameras_are_colmaps(shared_case, tmp_path, name):
-    path = shared_case("colmap_300_cameras") / name
-    (tmp_path / "cameras.bin").write_bytes(path.read_bytes())
-    for other in ("images.bin", "points3D.bin"):
-        (tmp_path / other).write_bytes(bytes(8))
-    theirs = pycolmap.Reconstruction(tmp_path).cameras[3]
-    wanted = np.array([theirs.img_from_cam(ray) for ray in RAYS]) - 0.5
-    np.testing.assert_allclose(project(read_lens(path, "3")), wanted, atol=1e-9)
-
-
 def test_a_reported_stereo_file_of_matlab_has_both_cameras(shared_case):
     path = shared_case("name_choice/stereo.mat")
     stereo = loadmat(path, squeeze_me=True, struct_as_record=False)["stereoParams"]
@@ -53,12 +42,6 @@ def test_a_reported_stereo_file_of_matlab_has_both_cameras(shared_case):
         k[2:4] = theirs.TangentialDistortion
         lens = theirs.K[0, 0], theirs.K[1, 1], theirs.K[0, 2] - 1, theirs.K[1, 2] - 1  # MATLAB counts from 1
         np.testing.assert_allclose(project(read_lens(path, f"stereoParams.{name}")), perspective(lens, k), atol=1e-8)
-
-
-def test_a_reported_database_without_its_log_is_refused(shared_case, tmp_path):
-    (tmp_path / "db.db").write_bytes((shared_case("wal/copy") / "db.db").read_bytes())
-    with fails_with("E-CAMERA-UNREADABLE … db.db-wal … copy both"):
-        read_lens(tmp_path / "db.db")
 
 
 def test_the_reported_database_with_its_log_is_pycolmaps(shared_case, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
-from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, opencv_lens
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.io.cameras.keys import pass_over
 from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
@@ -112,7 +112,7 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
         return _on_plane(rays, "eucm", own)
     xy = rays[:, :2] / rays[:, 2:]
     if model == "FOV":
-        return _field_of_view(xy, own[0])
+        return _scaled(xy, "fov", own)
     r2 = (xy**2).sum(axis=1)
     if model == "DIVISION":  # ideal = distorted / (1 + k r²)
         return xy * (2 / (1 + np.sqrt(1 - 4 * own[0] * r2)))[:, None]
@@ -298,14 +298,10 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
             "E-CAMERA-FOCAL", f"camera file {source}: focal length {focal.tolist()}; positive numbers needed"
         )
     width, height = (int(side) for side in values.get("resolution", (0, 0)))
-    fisheye, fov = distortion == "equidistant", distortion == "fov"
-    own, _ = opencv_lens(np.zeros(0) if fov else coefficients, fisheye, f"camera file {source}")
-    flat = Camera(1, 1, [1, 1], [0, 0], own, fisheye)
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            xy = _on_plane(rays, lens, shape)
-            return centre + focal * (_field_of_view(xy, coefficients[0]) if fov else flat.distort(xy))
+            return centre + focal * _kalibr_distorted(_on_plane(rays, lens, shape), distortion, coefficients)
 
     return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None, source)
 
@@ -327,10 +323,24 @@ def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
     return rays[:, :2] / np.where(below > 0, below, np.nan)[:, None]
 
 
-def _field_of_view(xy: np.ndarray, omega: float) -> np.ndarray:
-    """Return normalised coordinates (n, 2) with the distortion of Devernay and Faugeras."""
-    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius the model is linear
-    return xy * (np.arctan(2 * r * np.tan(omega / 2)) / (omega * r))[:, None]
+def _kalibr_distorted(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
+    if kind != "radtan":
+        return _scaled(xy, kind, k)
+    (x, y), r2 = xy.T, (xy**2).sum(axis=1)
+    radial = xy * (1 + k[0] * r2 + k[1] * r2**2)[:, None]
+    tangential = [2 * k[2] * x * y + k[3] * (r2 + 2 * x * x), k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y]
+    return radial + np.column_stack(tangential)
+
+
+def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
+    """Return normalised coordinates (n, 2) with the radial distortion equidistant, fov, or none."""
+    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius all these models are linear
+    if kind == "fov":
+        return xy * (np.arctan(2 * r * np.tan(k[0] / 2)) / (k[0] * r))[:, None]
+    if kind == "equidistant":
+        angle = np.arctan(r)
+        return xy * (angle * (1 + angle[:, None] ** (2 * np.arange(1, 5)) @ k) / r)[:, None]
+    return xy
 
 
 def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:

@@ -81,7 +81,21 @@ def of_matrix(keys: Keys) -> Lens:
     lens, skew = _lens_of(matrix, keys)
     if kind == "perspective" and not said and given.size == 4:
         _say_no_model(given, keys)
-    given = _coefficients(given, kind, keys)
+    return _camera(keys, lens, given, kind, (width, height, listed), skew, xi)
+
+
+def _camera(
+    keys: Keys, lens: list[float], given: np.ndarray, kind: str, size: tuple, skew: float = 0.0, xi: float = 0.0
+) -> Lens:
+    """Return the camera of fx, fy, cx, cy, coefficients, the kind of lens, and a size as :meth:`Keys.size` has it."""
+    width, height, listed = size
+    last = 4 if kind == "equidistant" else 5
+    given = given[:last] if last < len(given) < 8 and not given[last:].any() else given  # zeros beyond the model's
+    if kind == "equidistant" and len(given) not in (0, 4):
+        raise keys.fault(
+            "E-CAMERA-COEFFICIENTS",
+            f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant; k1 to k4 needed",
+        )
     if listed:
         _require_order(lens, width, height, keys)
     if kind == "unified" or not abs(skew) <= SQUARE * abs(lens[0]):
@@ -112,10 +126,11 @@ def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) 
         elif word in LENSES:
             kinds[name] = LENSES[word]
         elif word not in UNDISTORTED and not (word in INVERSE and not given.any()):
-            why = "its coefficients are those of another formula; calibrate anew with" if word in INVERSE else "use"
+            why = "its coefficients are those of another formula; " if word in INVERSE else ""
             raise keys.fault(
                 "E-CAMERA-MODEL",
-                f"{name} {' '.join(str(value).split())[:60]!r} is not supported; {why} plumb_bob or equidistant",
+                f"{name} {' '.join(str(value).split())[:60]!r} is not supported; {why}calibrate anew with plumb_bob or "
+                "equidistant",
             )
     both = set(kinds.values()) - ({"perspective"} if "unified" in kinds.values() else set())
     if len(both) > 1:
@@ -165,18 +180,6 @@ def _lens_of(matrix: np.ndarray | None, keys: Keys) -> tuple[list[float], float]
     return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float(matrix[0, 1])
 
 
-def _coefficients(given: np.ndarray, kind: str, keys: Keys) -> np.ndarray:
-    """Return the distortion coefficients; zeros beyond those of the kind of lens are left out."""
-    last = 4 if kind == "equidistant" else 5
-    given = given[:last] if last < len(given) < 8 and not given[last:].any() else given
-    if kind == "equidistant" and len(given) not in (0, 4):
-        raise keys.fault(
-            "E-CAMERA-COEFFICIENTS",
-            f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant; k1 to k4 needed",
-        )
-    return given
-
-
 def _say_no_model(given: np.ndarray, keys: Keys) -> None:
     """Name four coefficients without a model, as OpenCV's fisheye has; refuse those that must be a fisheye's."""
     model = "distortion_model: equidistant"
@@ -207,30 +210,28 @@ def _require_order(lens: list[float], width: float, height: float, keys: Keys) -
 def _of_kalibr(keys: Keys) -> Lens:
     """Return the camera of Kalibr's and EuRoC's keys: a list of intrinsics, and the names of lens and distortion."""
     numbers, given = keys.numbers("intrinsics"), keys.numbers("distortion_coeffs", "distortion_coefficients")
-    lens = plain(keys.take("camera_model") or "pinhole")
+    lens = plain(keys.take("camera_model", "type") or "pinhole")
     word = plain(keys.take("distortion_model") or "none")
-    width, height, listed = keys.size()
+    size = keys.size()
     require_known(keys.left, keys.source, undistorted=given is None)
-    distortion = {"perspective": "radtan"}.get(LENSES.get(word, word), LENSES.get(word, word))
+    kind = LENSES.get(word, word)
+    distortion = "radtan" if kind == "perspective" else kind
     if lens not in ("pinhole", "omni", "eucm", "ds") or distortion not in ("radtan", "equidistant", "fov", "none"):
         raise keys.fault(
             "E-CAMERA-MODEL",
             f"{lens[:40]} with {distortion[:40]}; pinhole, omni, eucm, ds with radtan, equidistant, fov or none are "
             "read",
         )
-    given = _coefficients(np.zeros(0) if given is None else given, distortion, keys)
     assert numbers is not None  # by which the format is recognised
+    given = np.zeros(0) if given is None else given
     if lens != "pinhole" or distortion == "fov":
-        values = {"intrinsics": numbers, "distortion_coeffs": given, "resolution": (width, height)}
+        values = {"intrinsics": numbers, "distortion_coeffs": given, "resolution": size[:2]}
         return of_kalibr(lens, distortion, values, keys.source)
     if numbers.size != 4:
         raise keys.fault("E-CAMERA-COEFFICIENTS", f"intrinsics of {numbers.size} numbers; 4 needed")
     if distortion == "none" and given.any():
         raise keys.fault("E-CAMERA-MODEL", "distortion_coeffs without a distortion model; add distortion_model")
-    if listed:
-        _require_order(numbers.tolist(), width, height, keys)
-    given = np.zeros(0) if distortion == "none" else given
-    return camera_from_opencv(numbers.tolist(), given, distortion == "equidistant", width, height, keys.source)
+    return _camera(keys, numbers.tolist(), np.zeros(0) if distortion == "none" else given, kind, size)
 
 
 CAMODOCAL = {
@@ -244,7 +245,7 @@ CAMODOCAL = {
 
 def _of_camodocal(keys: Keys) -> Lens:
     """Return the camera of camodocal's keys, which VINS has, too."""
-    named = keys.take("model_type")
+    named = keys.take("model_type", "type")
     if plain(named) not in CAMODOCAL:
         raise keys.fault("E-CAMERA-MODEL", f"model_type {str(named)[:40]!r}; PINHOLE, MEI, KANNALA_BRANDT are read")
     kind, lens_keys, names = CAMODOCAL[plain(named)]
@@ -258,11 +259,9 @@ def _of_camodocal(keys: Keys) -> Lens:
     lens = [keys.number(name) for name in lens_keys.split()]
     given = np.array([keys.number(name, 0.0) for name in names.split()])
     xi = keys.number("xi") if kind == "unified" else 0.0
-    width, height, _ = keys.size()
+    size = keys.size()
     require_known(keys.left, keys.source)
-    if kind == "unified":
-        return of_parts(lens, 0.0, given, kind, width, height, keys.source, xi)
-    return camera_from_opencv(lens, given, kind == "equidistant", width, height, keys.source)
+    return _camera(keys, lens, given, kind, size, xi=xi)
 
 
 def _of_industrial(keys: Keys) -> CameraModel:

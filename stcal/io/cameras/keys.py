@@ -32,7 +32,7 @@ HARMLESS_BEGINNINGS = tuple(_BEGINNINGS.split())
 HARMLESS_ENDS = ("stddev", "std", "error", "errors", "sigma", "uncertainty", "covariance", "rms", "topic")
 """Ends of such keys: uncertainties."""
 SUSPECT = re.compile(
-    r"([kd]|type|xi|alpha|alphac|beta|gamma[12]?|skew|shear|tau[xy]?|[kpsb]\d\d?|t\d|sk[xy]|mu|mv|mx|my|f|fx|fy|cx|cy|u0|v0|ppx|ppy)"
+    r"([kd]|xi|alpha|alphac|beta|gamma[12]?|skew|shear|tau[xy]?|[kpsb]\d\d?|t\d|sk[xy]|mu|mv|mx|my|f|fx|fy|cx|cy|u0|v0|ppx|ppy)"
 )
 """Names of parameters of lenses, of which a reader takes those of its format."""
 SUSPECT_PART = re.compile(

@@ -45,8 +45,8 @@ def camera_chosen(name: str) -> Iterator[None]:
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
     """Read a camera file of any supported kind, which is recognised by the content.
 
-    ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of
-    the camera in a file of several.
+    ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of the camera in a file
+    of several.
 
     Raises InputError: the file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
     """
@@ -136,12 +136,19 @@ def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray |
         return None
     count = len(names)
     try:
-        if len(stated[SIGMA]) != 1 or [len(row) for row in stated[CORRELATION]] != [count] * count:
+        if [len(row) for row in stated[SIGMA]] != [count] or [len(row) for row in stated[CORRELATION]] != [
+            count
+        ] * count:
             raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
         sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
-        if len(sigma) != count:
-            raise InputError("E-CAMERA-COVARIANCE", f"{len(sigma)} σ, {count} needed")
-        _require_sigmas(sigma, correlation, names)
+        for name, sigma_of_name, with_itself in zip(names, sigma, np.diagonal(correlation), strict=True):
+            # the covariance hides such errors
+            if not 0 < sigma_of_name <= MAX_SIDE_PX or not abs(with_itself - 1) <= SQUARE_WITHIN:
+                raise InputError(
+                    "E-CAMERA-COVARIANCE",
+                    f"σ of {name} is {sigma_of_name:g}, its correlation with itself {with_itself:g}; a positive number "
+                    f"up to {MAX_SIDE_PX}, and 1 needed",
+                )
         covariance = correlation * np.outer(sigma, sigma)
         require_covariance(covariance, count, Rows(tuple(names)), definite=True)
     except (InputError, ValueError) as error:
@@ -151,19 +158,6 @@ def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray |
             "again, or remove these comments",
         ) from error
     return covariance
-
-
-def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]) -> None:
-    """Refuse invalid σ, and correlations of a parameter with itself other than 1: the covariance hides such errors."""
-    for name, sigma_of_name, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
-        if not 0 < sigma_of_name <= MAX_SIDE_PX:
-            raise InputError(
-                "E-CAMERA-COVARIANCE", f"σ of {name} is {sigma_of_name:g}, a positive number up to {MAX_SIDE_PX} needed"
-            )
-        if not abs(self_correlation - 1) <= SQUARE_WITHIN:
-            raise InputError(
-                "E-CAMERA-COVARIANCE", f"correlation of {name} with itself is {self_correlation:g}, 1 needed"
-            )
 
 
 def _starts_with(path: Path, head: bytes) -> bool:
