@@ -234,7 +234,7 @@ class Axes:
             ends, values = np.log(ends), np.log(np.maximum(values, ends[0]))
         return (values - ends[0]) / (ends[1] - ends[0])
 
-    def lines(self, lines: Iterable[Sequence], colour: str = "none", width: float = 1.0, **look) -> None:
+    def lines(self, lines: Iterable, colour: str = "none", width: float = 1.0, **look) -> None:
         """Draws lines, each given by its x (k,) and y (k,)."""
         self.drawing.lines([self.at(*line) for line in lines], colour, width, **look)
 
