@@ -268,7 +268,7 @@ class Axes:
         from scipy.ndimage import zoom
 
         share = (values - low) / ((high - low) or 1.0)
-        share = zoom(share, max(1, 240 // max(share.shape)), order=1) if smooth else share
+        share = np.asarray(zoom(share, max(1, 240 // max(share.shape)), order=1) if smooth else share)
         known = np.isfinite(share)
         share = np.clip(np.where(known, share, 0), 0, 1)
         if bands:

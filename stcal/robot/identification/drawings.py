@@ -117,7 +117,7 @@ def space_figure(shown: Drawn):
             axes.arrows(start, ends[mask][:, [i, j]] - start, 1.3 * crowded, arrow_colour)
             axes.marks(*start.T, kind="dot", size=2, colour=arrow_colour)
         axes.lines([((low[0], low[0] + scale * bar), (low[1], low[1]))], INK, 2)
-        axes.words(*low, f"{bar:g} mm", (0, -7), anchor="start")
+        axes.words(low[0], low[1], f"{bar:g} mm", (0, -7), anchor="start")
     cut_off = f"; cut, as they are too long: {(cut < 1).sum()}" if (cut < 1).any() else ""
     drawing.words((drawing.width - 6, 8), f"{scale:g} times{cut_off}", SMALL + 1, "end")
     return drawing
