@@ -311,9 +311,9 @@ def space_figure(findings: Findings):
         for kind, colour in ((True, COLOURS[0]), (False, COLOURS[1])):
             own = inlier == kind
             axes.arrows(place[own][:, [i, j]], arrow[own][:, [i, j]], 1.1, colour)
-            axes.marks(*place[own][:, [i, j]].T, "dot", 2.5, colour)
+            axes.marks(*place[own][:, [i, j]].T, kind="dot", size=2.5, colour=colour)
         ends = (place + arrow)[beyond][:, [i, j]]
-        axes.marks(*ends.T, "ring", 4, COLOURS[1])
+        axes.marks(*ends.T, kind="ring", size=4, colour=COLOURS[1])
         for row, (x, y) in zip(beyond[:MOST_LABELS].tolist(), ends.tolist(), strict=False):
             axes.words(x, y, f"{length[row]:.2g}", (4, -5), size=SMALL - 1, anchor="start")
     drawing.words((drawing.width - 6, 7), f"{scale:,g} times", SMALL + 1, "end")
@@ -350,7 +350,7 @@ def field_figure(findings: Findings, field: Field) -> Drawing:
         axes.shade(size, (u[0], v[0], u[-1], v[-1]), 0, levels[-1], YELLOW_RED, len(levels) - 1)
         third = 3 - i - j
         near = np.abs(own[:, third] - middle[third]) < (high - low)[third] / 8
-        axes.marks(*own[near][:, [i, j]].T, "dot", 3, INK)
+        axes.marks(*own[near][:, [i, j]].T, kind="dot", size=3, colour=INK)
         corners = (low[i], high[i], high[i], low[i], low[i]), (low[j], low[j], high[j], high[j], low[j])
         axes.lines([corners], INK, 0.7, dash=DASH)
     right, top, bottom = drawing.width - 38, boxes[0][1], boxes[0][3]

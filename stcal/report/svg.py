@@ -234,7 +234,7 @@ class Axes:
             ends, values = np.log(ends), np.log(np.maximum(values, ends[0]))
         return (values - ends[0]) / (ends[1] - ends[0])
 
-    def lines(self, lines: Iterable[Sequence], colour: str = "none", width: float = 1.0, **look) -> None:
+    def lines(self, lines: Iterable, colour: str = "none", width: float = 1.0, **look) -> None:
         """Draws lines, each given by its x (k,) and y (k,)."""
         self.drawing.lines([self.at(*line) for line in lines], colour, width, **look)
 
@@ -268,7 +268,7 @@ class Axes:
         from scipy.ndimage import zoom
 
         share = (values - low) / ((high - low) or 1.0)
-        share = zoom(share, max(1, 240 // max(share.shape)), order=1) if smooth else share
+        share = np.asarray(zoom(share, max(1, 240 // max(share.shape)), order=1) if smooth else share)
         known = np.isfinite(share)
         share = np.clip(np.where(known, share, 0), 0, 1)
         if bands:

@@ -198,7 +198,7 @@ def corner_figure(found: Reprojection) -> Drawing:
     circle = _circle(float(np.quantile(np.linalg.norm(found.residuals_px, axis=1), 0.95)))
     axes = Axes.equal(drawing, drawing.panels()[0], np.vstack([residuals, circle]), down=True)
     axes.frame("x, px", "y, px (down)", "y")
-    axes.marks(*residuals.T, "dot", 2.2, GOOD, 0.6)
+    axes.marks(*residuals.T, kind="dot", size=2.2, colour=GOOD, opacity=0.6)
     axes.lines([circle.T], INK, 0.8)
     return drawing
 
@@ -220,7 +220,7 @@ def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray
     seen, off = seen[sample], enlargement(off, width) * off[sample]
     known = np.isfinite(off).all(1)
     axes.lines(np.stack([seen, seen + off], axis=2)[known], BAD, 0.8)
-    axes.marks(*seen.T, "dot", 1.6, INK)
+    axes.marks(*seen.T, kind="dot", size=1.6, colour=INK)
     axes.frame("x, px", "y, px")
     return drawing
 

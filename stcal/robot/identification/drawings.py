@@ -115,9 +115,9 @@ def space_figure(shown: Drawn):
         for mask, arrow_colour in ((good, colour), (~good, COLOURS[1] if colour != COLOURS[1] else COLOURS[0])):
             start = place[mask][:, [i, j]]
             axes.arrows(start, ends[mask][:, [i, j]] - start, 1.3 * crowded, arrow_colour)
-            axes.marks(*start.T, "dot", 2, arrow_colour)
+            axes.marks(*start.T, kind="dot", size=2, colour=arrow_colour)
         axes.lines([((low[0], low[0] + scale * bar), (low[1], low[1]))], INK, 2)
-        axes.words(*low, f"{bar:g} mm", (0, -7), anchor="start")
+        axes.words(low[0], low[1], f"{bar:g} mm", (0, -7), anchor="start")
     cut_off = f"; cut, as they are too long: {(cut < 1).sum()}" if (cut < 1).any() else ""
     drawing.words((drawing.width - 6, 8), f"{scale:g} times{cut_off}", SMALL + 1, "end")
     return drawing

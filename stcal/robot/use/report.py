@@ -265,7 +265,7 @@ def _places(result: PoseDesign, up: int) -> Drawing:
     axes = Axes.equal(drawing, drawing.panels()[0], np.vstack([at, at + z, np.zeros((1, 2))]))
     axes.frame("x, mm", f"{'xyz'[up]}, mm", "xy")
     axes.arrows(at, z, 1.1, COLOURS[2])
-    axes.marks(*at.T, "dot", 4, COLOURS[0])
+    axes.marks(*at.T, kind="dot", size=4, colour=COLOURS[0])
     axes.marks(0, 0, "square", 6, INK)
     return drawing
 

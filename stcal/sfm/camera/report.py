@@ -151,7 +151,7 @@ def _map(result: CameraCalibration, values: np.ndarray, label: str) -> Drawing:
     bands = max(1, int(np.ceil(shown.max() / step)))
     axes.shade(shown, (0, 0, camera.width - 1, camera.height - 1), 0, bands * step, VIRIDIS, bands)
     for model in result.intrinsics.models:
-        axes.marks(*model.measured_px.T, "dot", 0.8, "#ffffff", 0.5)
+        axes.marks(*model.measured_px.T, kind="dot", size=0.8, colour="#ffffff", opacity=0.5)
     axes.frame("x, px", "y, px")
     _, top, right, bottom = axes.box
     axes.drawing.scale((right + 8, top + 16, right + 15, bottom - 10), 0, bands * step, label, VIRIDIS)
