@@ -7,7 +7,7 @@ from io import BytesIO
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageFile
 
 from stcal.errors import InputError
 
@@ -139,11 +139,14 @@ def heic_grey(data: bytes, name: str) -> np.ndarray:
     Raises InputError: the package is missing, or the data are damaged or mirrored.
     """
     let_pillow_read_heic(name)
+    lenient, ImageFile.LOAD_TRUNCATED_IMAGES = ImageFile.LOAD_TRUNCATED_IMAGES, False  # WeasyPrint turns it on
     try:
         with Image.open(BytesIO(data)) as image:
             colours = np.asarray(image.convert("RGB"))
     except Exception as error:  # damaged containers fail in many ways
         raise InputError("E-IMAGE-UNREADABLE", f"{name}: not readable as HEIC; copy it again") from error
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = lenient
     if b"imir" in _properties(data):
         raise InputError("E-IMAGE-TYPE", f"{name}: its container mirrors the image; {EXPORT}")
     return np.ascontiguousarray(np.rot90(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), -heic_turns(data)))

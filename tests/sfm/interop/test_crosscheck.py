@@ -37,8 +37,9 @@ INSTALL = "install it with `sudo apt-get install colmap`"
 
 
 def state_of(folder) -> dict[str, str]:
-    """Every file below a folder, and a digest of its content; the cache is no result."""
-    files = [path for path in folder.rglob("*") if path.is_file() and ".stcal/cache" not in path.as_posix()]
+    """Every file of a run's results, with its marker, and a digest of its content."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.parent != folder / ".stcal"]
+    files = [path for path in files if ".stcal/cache" not in path.as_posix()] + [folder / RUN_MARKER]
     return {path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest() for path in files}
 
 

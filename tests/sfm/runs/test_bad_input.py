@@ -408,8 +408,8 @@ def test_missing_toml(small_set, stcal_sfm, kind):
 
 CAMERAS = {
     "missing": (None, ("No such file", "give a readable file")),
-    "empty": ("", ("neither COLMAP's cameras.txt nor OpenCV's YAML or XML", "check its form")),
-    "prose": ("a camera, no doubt", ("neither COLMAP's cameras.txt", "check its form")),
+    "empty": ("", ("COLMAP, OpenCV", "no keys", "check its form")),
+    "prose": ("a camera, no doubt", ("COLMAP, OpenCV", "check its form")),
     "two cameras": (
         "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1",
         ("2 cameras, 1 needed; choose of 1, 2 with `stcal camera",),

@@ -62,7 +62,11 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
         return None
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if all(isinstance(item, Mapping) for item in value) and (content := _of_pairs(value, form, where)) is not None:
+    if (
+        isinstance(value, list)
+        and isinstance(value[0], Mapping)
+        and (content := _of_pairs(value, form, where)) is not None
+    ):
         return content
     side = _side_of(value, where)
     return None if side is None else Content(form, (side,))
