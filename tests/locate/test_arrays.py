@@ -26,13 +26,6 @@ def grey():
     return rendered(LAYOUT, place, (320, 240), np.random.default_rng(1))
 
 
-def test_tags_stand_where_they_are_put():
-    assert LAYOUT.tags == (("DICT_4X4_50", 3), ("DICT_4X4_50", 7))
-    assert np.allclose(LAYOUT.corners_mm[0], [[-15, -15], [15, -15], [15, 15], [-15, 15]])
-    # turned from X to Y: top left goes to where top right was
-    assert np.allclose(LAYOUT.corners_mm[1], [[62.5, -12.5], [62.5, 12.5], [37.5, 12.5], [37.5, -12.5]])
-
-
 @pytest.mark.parametrize(
     "camera", [CAMERA, CameraModel((500, 500), (159.5, 119.5), np.zeros(8), "PINHOLE", 320, 240, "")]
 )
@@ -50,12 +43,13 @@ def test_colour_and_depth_of_an_array_do_not_matter(grey):
         assert np.linalg.norm(pose.translation - plain.camera_from_obj.translation) < 3 * plain.sigma_mm()
 
 
-def test_an_image_without_tags_says_what_it_shows(grey):
+def test_a_wrong_dictionary_is_named(grey):
     other = TagLayout.from_tags("5X5_50", [1], [[0.0, 0.0]], 30.0)
     result = locate_image(grey, other, CAMERA)
     assert result.pose is None
     assert result.verdict.reasons[0].startswith("no tag of DICT_5X5_50")
     assert "shows 2 of DICT_4X4" in result.verdict.reasons[0]
+    assert "correct dictionary" in result.verdict.reasons[0]
 
 
 def test_images_that_are_none_of_the_cameras(grey):
@@ -67,7 +61,11 @@ def test_images_that_are_none_of_the_cameras(grey):
         locate_image(grey / 255, LAYOUT, CAMERA)
 
 
-def test_tags_that_no_dictionary_has():
+def test_tags_of_a_layout():
+    assert LAYOUT.tags == (("DICT_4X4_50", 3), ("DICT_4X4_50", 7))
+    assert np.allclose(LAYOUT.corners_mm[0], [[-15, -15], [15, -15], [15, 15], [-15, 15]])
+    # turned from X to Y: top left goes to where top right was
+    assert np.allclose(LAYOUT.corners_mm[1], [[62.5, -12.5], [62.5, 12.5], [37.5, 12.5], [37.5, -12.5]])
     with fails_with("E-TAG-DICTIONARY … 4x4_51"):
         TagLayout.from_tags("4x4_51", [1], [[0.0, 0.0]], 30.0)
     with fails_with("E-TAG-ID-RANGE … 50 … DICT_4X4_50"):

@@ -85,7 +85,7 @@ def test_no_flipped_pose_is_accepted():
     assert ambiguous > 50
 
 
-def test_both_minima_are_refined():
+def test_both_minima_are_refined_and_covered_by_one_covariance_where_they_are_one():
     truth = Rigid.exp([0.4, 0, 0, 0, 0, 1500.0])
     layout = example_layout(0.03, 0.2)
     seen = merge(simulated_exposures(layout, truth, np.random.default_rng(0), shown=((0,),)), layout).seen
@@ -94,13 +94,6 @@ def test_both_minima_are_refined():
     assert tilts[0] < -0.2
     assert tilts[1] > 0.2
     assert 0 <= pose.delta_chi2 < 60
-
-
-def test_two_poses_that_are_one_are_covered_by_one_covariance():
-    truth = Rigid.exp([0.4, 0, 0, 0, 0, 1500.0])
-    layout = example_layout(0.03, 0.2)
-    seen = merge(simulated_exposures(layout, truth, np.random.default_rng(0), shown=((0,),)), layout).seen
-    pose = locate(seen, layout, CAMERA)
     assert judge(pose, VerdictOptions(max_sigma_deg=90.0))[1].decision == "ambiguous"
     away = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
     wide = covering_both(pose)

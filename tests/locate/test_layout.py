@@ -10,6 +10,7 @@ from tests.support.tags import example_layout
 
 HEAD = 'type = "tags"\n'
 TAG = '[[tag]]\ndictionary = "4x4_50"\nid = {}\n'
+NEGATIVE = f"covariance_mm2 = {[[0.0] * k + [-1.0 if k else 1.0] for k in range(8)]}\n"
 PLACED = TAG + "size_mm = 20.0\nx_mm = {}\ny_mm = {}\nangle_deg = {}\n"
 
 
@@ -64,13 +65,7 @@ def test_a_plan_may_leave_places_open(tmp_path):
         (TAG.format(1) + "corners_mm = [[0, 0], [0, 9], [9, 9], [9, 0]]\n", "E-TAG-CORNERS"),
         (TAG.format(1).replace("4x4_50", "9x9_50"), "E-KEY-VALUE"),
         ("covariance_mm2 = [[1.0]]\n" + PLACED.format(1, 0, 0, 0), "E-KEY-VALUE … covariance_mm2 … 8"),
-        (
-            "covariance_mm2 = ["
-            + ", ".join(str([0.0] * k + [-1.0 if k else 1.0]) for k in range(8))
-            + "]\n"
-            + PLACED.format(1, 0, 0, 0),
-            "E-KEY-VALUE … covariance_mm2 … -1 … 0 … 1",
-        ),
+        (NEGATIVE + PLACED.format(1, 0, 0, 0), "E-KEY-VALUE … covariance_mm2 … -1 … 0 … 1"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path, text, reason):

@@ -94,18 +94,14 @@ def test_the_gate(det_j, error, ratio, same, reasons):
     assert all(text.startswith(start) for text, start in zip(verdict.reasons, reasons, strict=True))
 
 
+def test_a_pose_that_fits_exactly_has_a_ratio():
+    flat = np.pad(LAYOUT.corners_mm.reshape(-1, 2), ((0, 0), (0, 1)))
+    corners = CAMERA.project(TRUTH @ flat).reshape(-1, 4, 2)
+    exact = Tags(LAYOUT.tags, corners, np.tile(np.eye(2), (len(corners), 4, 1, 1)))
+    assert locate_as_patent([exact], LAYOUT, CAMERA).verdict.decision == "accept"
+
+
 def test_without_tags_there_is_no_pose():
     empty = Tags((), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
     with fails_with("E-LOCATE-NO-TAG"):
         locate_as_patent([empty], LAYOUT, CAMERA)
-
-
-def test_a_pose_that_fits_exactly_has_a_ratio():
-    found = locate_as_patent(exact_tags(), LAYOUT, CAMERA)
-    assert found.verdict.decision == "accept"
-
-
-def exact_tags() -> list[Tags]:
-    flat = np.pad(LAYOUT.corners_mm.reshape(-1, 2), ((0, 0), (0, 1)))
-    corners = CAMERA.project(TRUTH @ flat).reshape(-1, 4, 2)
-    return [Tags(LAYOUT.tags, corners, np.tile(np.eye(2), (len(corners), 4, 1, 1)))]

@@ -31,11 +31,9 @@ def test_the_best_exposure_is_shown_not_the_darkest(scene):
     shown = located.tags.readable()
     assert [len(each.tags) for each in shown] == [6, 6, 6]
     best = best_exposure(shown, LAYOUT)
-    assert best is not None
     assert best.name.endswith("1.png")
     page = run_report([located], scenes, LAYOUT, MODEL).page()
-    first = page.split("<figcaption>")[1]
-    assert first.startswith(f"{best.name}: 6 of 6 tags")
+    assert page.split("<figcaption>")[1].startswith(f"{best.name}: 6 of 6 tags")
 
 
 def test_more_tags_of_the_layout_come_before_sharper_ones(scene):

@@ -121,11 +121,7 @@ def test_supports_are_those_of_leaving_out_one_after_the_other(model, width):
     rng = np.random.default_rng(round(10 * width))
     found = 0
     for _ in range(60):
-        xyz = rng.normal(size=(12, 3)) * [
-            100,
-            width if model == "rigid" else 100,
-            width / 2 if model == "rigid" else width,
-        ]
+        xyz = rng.normal(size=(12, 3)) * ([100, width, width / 2] if model == "rigid" else [100, 100, width])
         xyz[rng.integers(12)] += [0, 5 * rng.random(), 5 * rng.random()]
         values = [spreads(np.delete(xyz, i, axis=0)) for i in range(len(xyz))]
         off = [value[2] if model == "affine" else np.hypot(value[1], value[2]) for value in values]

@@ -6,11 +6,7 @@ import pytest
 from stcal.register import Liu2017Options, register
 from stcal.register.liu2017 import affine_least_squares, liu2017
 from tests.outcome import fails_with
-from tests.support.point_pairs import cube, make_scene
-
-
-def scene(seed, *args, **options):
-    return make_scene(np.random.default_rng(seed), *args, **options)
+from tests.support.point_pairs import cube, scene
 
 
 def test_twelve_parameters_are_the_normal_equations():
@@ -68,6 +64,8 @@ def test_samples_of_thirty_never_find_a_clean_draw():
     s = scene(3, 100, 0.33, off_mm=(5, 5))
     with fails_with("E-LIU-SAMPLE … 30 … 85"):
         register(s.xyz_a, s.xyz_b, method="liu2017", liu2017_options=Liu2017Options(tries=100))
+    with fails_with("E-LIU-SAMPLE … 20 … 30"):
+        liu2017(s.xyz_a[:20], s.xyz_b[:20], Liu2017Options())
     with fails_with("E-LIU-SAMPLE … 3 … 3"):
         liu2017(s.xyz_a, s.xyz_b, Liu2017Options(tries=20, orthogonal_within=1e-9))
 
@@ -97,9 +95,3 @@ def test_three_times_better_than_twelve_parameters(share):
 def test_options_that_cannot_be(options, message):
     with fails_with(message):
         Liu2017Options(**options)
-
-
-def test_too_few_points():
-    s = scene(5, 20)
-    with fails_with("E-LIU-SAMPLE … 20 … 30"):
-        liu2017(s.xyz_a, s.xyz_b, Liu2017Options())

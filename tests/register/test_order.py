@@ -38,16 +38,12 @@ def test_a_move_is_located_with_its_size(model, method):
     assert size == pytest.approx(1.0, rel=0.15)
 
 
-def test_a_large_move_is_located_too():
-    a, b = points(2)
-    found = register(a, moved_from(26, b, Rigid.exp([0, 0, 0.01, 10, 0, 0])), folds=0, allow_ambiguous=True)
-    assert any(note.startswith("from row 27 on") for note in found.notes)
-
-
-def test_two_transforms_are_refused_with_the_row_between_them():
+def test_a_large_move_is_located_too_and_two_transforms_refused_with_the_row_between_them():
     a, b = points(2)
     with fails_with("E-REGISTER-TWO-TRANSFORMS … from row 26 on … separately"):
         register(a, moved_from(25, b, MOVE), folds=0)
+    found = register(a, moved_from(26, b, Rigid.exp([0, 0, 0.01, 10, 0, 0])), folds=0, allow_ambiguous=True)
+    assert any(note.startswith("from row 27 on") for note in found.notes)
 
 
 def test_a_drift_is_told_from_a_jump():
@@ -64,13 +60,10 @@ def sound(seed: int) -> bool:
     return moved_meanwhile(problem, problem.fit()) is not None
 
 
-def test_sound_points_do_not_move():
-    assert sum(map(sound, range(60))) <= 4  # 1 % at most; five or more once in 2500 runs
-
-
-@pytest.mark.full
-def test_sound_points_move_at_most_as_often_as_stated():
-    assert sum(map(sound, range(3000))) <= 45
+@pytest.mark.parametrize(("sets", "most"), [(60, 4), pytest.param(3000, 45, marks=pytest.mark.full)])
+def test_sound_points_do_not_move(sets, most):
+    """1 % at most; of 60 five or more once in 2500 runs."""
+    assert sum(map(sound, range(sets))) <= most
 
 
 def test_a_bent_frame_in_the_order_of_its_rows_is_no_move():

@@ -44,11 +44,8 @@ def test_text_tells_transform_outliers_and_reach():
     assert "no systematic residuals seen" in text
     assert re.search(r"held out \(6 folds\), inliers +38 ", text)
     assert max(map(len, text.splitlines())) < 320
-
-
-def test_every_row_of_a_few_is_listed():
-    text = registration_report(found_of(n=FEW_ROWS - 4)).text()
-    assert len(re.findall(r"line \d+ +(?:inlier|OUTLIER)", text)) == FEW_ROWS - 4
+    few = registration_report(found_of(n=FEW_ROWS - 4)).text()
+    assert len(re.findall(r"line \d+ +(?:inlier|OUTLIER)", few)) == FEW_ROWS - 4
 
 
 def test_rows_that_do_not_correspond_are_no_noise():
@@ -136,26 +133,20 @@ def test_page_of_a_plane():
 
 
 @pytest.mark.slow
-def test_the_same_page_twice():
-    assert registration_report(found_of()).page() == registration_report(found_of.__wrapped__()).page()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("count", "tolerance"), [(40, 0.35), pytest.param(100, 0.25, marks=pytest.mark.slow)])
-def test_sigma_of_the_transform_by_place(count, tolerance):
+def test_sigma_of_the_transform_by_place():
     """By Monte Carlo: the spread of the fitted transform at a point far from the others."""
     rng = np.random.default_rng(1)
     a = rng.uniform(-100, 100, (20, 3))
     place = np.array([500.0, 0.0, 0.0])
     seen, stated = [], []
-    for trial in range(count):
+    for trial in range(100):
         b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
         result = register(a, b, method="least-squares", folds=0)
         seen.append(result.b_from_a @ place)
         if trial < 5:
             stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
-    # 100 trials know a σ to 7 %, 40 to 11 %; the own σ of five are good to 9 % / √5
-    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=tolerance)
+    # 100 trials know a σ to 7 %; the own σ of five are good to 9 % / √5
+    np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.25)
 
 
 @pytest.mark.slow

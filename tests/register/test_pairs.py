@@ -51,6 +51,7 @@ def test_noise_of_three_kinds(written):
 @pytest.mark.parametrize(
     ("rows", "head", "message"),
     [
+        ([], HEAD, "E-TABLE-EMPTY"),
         ([*ROWS, "1,2,nan,4,5,6"], HEAD, "E-TABLE-NUMBER … 6 … az_mm … 'nan'"),
         ([*ROWS, "1,2,3,4,much,6"], HEAD, "E-TABLE-NUMBER … 6 … by_mm … 'much'"),
         ([*ROWS, "1,2,3,4,5"], HEAD, "E-TABLE-CELLS … 6 … 5 … 6"),

@@ -12,13 +12,9 @@ from stcal.register.models import MODELS, fit
 from stcal.register.pairs import PointNoise, Problem
 from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
 from tests.outcome import fails_with
-from tests.support.point_pairs import SIGMA_MM, directions, make_scene
+from tests.support.point_pairs import SIGMA_MM, directions, scene
 
 RIGID = MODELS["rigid"]
-
-
-def scene(seed, *args, **options):
-    return make_scene(np.random.default_rng(seed), *args, **options)
 
 
 def cost_ratio(s, found) -> float:
@@ -95,22 +91,17 @@ def test_two_transforms_are_refused_or_told(kind, share, sets):
         assert min(rms) < 4 * SIGMA_MM
 
 
-@pytest.mark.parametrize("sets", [4, pytest.param(10, marks=pytest.mark.slow)])
-def test_half_of_the_points_shifted_by_little(sets):
+def test_half_of_the_points_shifted_by_little():
     """One transform between two groups 2 mm apart looks like noise of 0.6 mm; it is none."""
-    refused = 0
-    for trial in range(sets):
+    for trial in range(4):
         s = scene([trial, 2], 30, 0.5, "one shift", (2, 2))
         with fails_with("E-REGISTER-TWO-TRANSFORMS"):
             register(s.xyz_a, s.xyz_b, folds=0)
-        refused += 1
-    assert refused == sets
 
 
-@pytest.mark.parametrize("sets", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_groups_that_no_consensus_tells_apart(sets):
+def test_groups_that_no_consensus_tells_apart():
     """At 1 mm, 7 σ, between them: trimming sees one set of larger σ, two transforms are seen."""
-    for trial in range(sets):
+    for trial in range(2):
         s = scene([trial, 9], 80, 0.5, "one shift", (1, 1))
         found = register(s.xyz_a, s.xyz_b, folds=0, allow_ambiguous=True)
         assert found.ambiguous
@@ -174,12 +165,11 @@ def test_deletion_residuals_are_those_of_the_fit_without_the_point():
         assert with_it[i] == pytest.approx(without[i], rel=1e-6)
 
 
-@pytest.mark.parametrize("sets", [4, pytest.param(10, marks=pytest.mark.slow)])
-def test_a_far_point_may_be_off_by_what_the_fit_cannot_know(sets):
+def test_a_far_point_may_be_off_by_what_the_fit_cannot_know():
     """Points of 20 mm tell the place of one 3 m away to 150 times their noise: none of that is an outlier."""
     rng = np.random.default_rng(25)
     a = np.vstack([rng.uniform(-10, 10, (20, 3)), [[3000, 0, 0]]])
-    for trial in range(sets):
+    for trial in range(4):
         b = a + np.random.default_rng(trial).normal(0, SIGMA_MM, a.shape)
         assert register(a, b, folds=0).inliers.all()
 
@@ -216,21 +206,16 @@ def test_noise_is_not_called_bent():
         assert register(s.xyz_a, s.xyz_b, folds=0).notes == ()
 
 
-def test_rows_in_any_order_give_the_same_points():
+def test_the_same_seed_gives_the_same_answer_and_rows_in_any_order_the_same_points():
     s = scene(9, 40, 0.3)
-    found = register(s.xyz_a, s.xyz_b, folds=0)
+    found, again = (register(s.xyz_a, s.xyz_b, folds=6) for _ in range(2))
+    assert (found.b_from_a.matrix() == again.b_from_a.matrix()).all()
+    assert found.samples == again.samples > 0
+    assert (found.held_out.error_mm == again.held_out.error_mm).all()
     order = np.random.default_rng(1).permutation(40)
     shuffled = register(s.xyz_a[order], s.xyz_b[order], folds=0, seed=5)
     np.testing.assert_array_equal(found.inliers[order], shuffled.inliers)
     np.testing.assert_allclose(found.b_from_a.matrix(), shuffled.b_from_a.matrix(), atol=1e-9)
-
-
-def test_the_same_seed_gives_the_same_answer():
-    s = scene(10, 120, 0.5)
-    one, two = (register(s.xyz_a, s.xyz_b, seed=3) for _ in range(2))
-    assert (one.b_from_a.matrix() == two.b_from_a.matrix()).all()
-    assert one.samples == two.samples > 0
-    assert (one.held_out.error_mm == two.held_out.error_mm).all()
 
 
 def test_many_points():
@@ -256,8 +241,7 @@ def test_exact_points():
 @pytest.mark.parametrize("model", ["similarity", "affine"])
 def test_other_models(model):
     s = scene(13, 60, 0.4)
-    b = 1.01 * s.xyz_b
-    found = register(s.xyz_a, b, model=model, folds=0)
+    found = register(s.xyz_a, 1.01 * s.xyz_b, model=model, folds=0)
     assert (found.inliers == s.clean).all()
     if model == "similarity":
         assert found.b_from_a.scale == pytest.approx(1.01, abs=5 * np.sqrt(found.covariance[6, 6]))
@@ -313,19 +297,10 @@ class TestFewPoints:
         with fails_with("E-REGISTER-DISAGREE … 3 … 4 … rigid … 4"):
             register(s.xyz_a, b)
 
-    def test_one_wrong_of_five_is_found(self):
-        s = scene(19, 5)
-        b = s.xyz_b.copy()
-        b[1] += [0, 20, 0]
-        found = register(s.xyz_a, b)
-        assert found.outliers.tolist() == [1]
-
-    @pytest.mark.parametrize(("model", "n"), [("rigid", 2), ("similarity", 2), ("affine", 4)])
-    def test_too_few(self, model, n):
+    @pytest.mark.parametrize(("model", "n", "needed"), [("rigid", 2, 3), ("similarity", 2, 3), ("affine", 4, 5)])
+    def test_too_few(self, model, n, needed):
         s = scene(20, n)
-        with pytest.raises(
-            DegenerateError, match=rf"{n} point pairs, {3 if n == 2 else 5} needed for the {model} model"
-        ):
+        with pytest.raises(DegenerateError, match=f"{n} point pairs, {needed} needed for the {model} model"):
             register(s.xyz_a, s.xyz_b, model=model)
 
 
@@ -360,10 +335,10 @@ def test_the_score_has_its_minimum_where_outliers_begin():
     assert value[0] < -100
 
 
-@pytest.mark.parametrize("sets", [10, pytest.param(30, marks=pytest.mark.slow)])
-def test_false_alarms_of_the_search_are_rare(sets):
+@pytest.mark.slow
+def test_false_alarms_of_the_search_are_rare():
     """The bound on all sets together is generous: none of the sets without outliers may come near."""
-    for trial in range(sets):
+    for trial in range(30):
         s = scene([trial, 5], 15)
         total = ((s.xyz_b - align_rigid(s.xyz_b, s.xyz_a) @ s.xyz_a) ** 2).sum()
         problem = Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise())

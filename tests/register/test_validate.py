@@ -7,11 +7,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
 from stcal.register.result import held_out
-from tests.support.point_pairs import SIGMA_MM, make_scene
-
-
-def scene(seed, *args, **options):
-    return make_scene(np.random.default_rng(seed), *args, **options)
+from tests.support.point_pairs import SIGMA_MM, scene
 
 
 def test_leave_one_out_is_what_it_says():

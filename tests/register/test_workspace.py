@@ -122,23 +122,6 @@ def test_points_of_different_sigma():
     assert errors["told"] < 0.7 * errors["untold"]
 
 
-@pytest.mark.slow
-def test_few_points_and_many():
-    a, b = bent(0, 5)
-    assert fitted(a, b)[1] is None
-    a, b = bent(0, 3 * MOST_POINTS)
-    assert len(fitted(a, b)[1].rows) == MOST_POINTS
-
-
-def test_other_models_leave_less_to_the_field():
-    a, b = bent(5, 100)
-    sizes = []
-    for model in ("rigid", "affine"):
-        found = register(a, b, model=model, method="least-squares", folds=0)
-        sizes.append(residual_field(found, a, b).size_mm)
-    assert sizes[1] < sizes[0]
-
-
 def test_cubes_by_hand():
     """A grid, undisturbed within 100 mm of its middle, the rest shifted by 5 mm."""
     steps = np.linspace(-200, 200, 9)
@@ -158,6 +141,12 @@ def test_cubes_by_hand():
     outer = result.errors[3]
     assert outer[0].mean_mm == pytest.approx(5 * 604 / 729, rel=0.02)
     assert outer[3].mean_mm == pytest.approx(5 * 125 / 729, rel=0.05)
+
+
+@pytest.mark.slow
+def test_few_points_have_no_field_and_many_are_not_all_used():
+    assert fitted(*bent(0, 5))[1] is None
+    assert len(fitted(*bent(0, 3 * MOST_POINTS))[1].rows) == MOST_POINTS
 
 
 @pytest.mark.slow
@@ -182,5 +171,4 @@ def test_cubes_without_points_or_width():
     flat = np.vstack([rng.uniform(-50, 50, (20, 3)) * [1, 1, 0], rng.uniform(-200, 200, (60, 3))])
     found = register(flat, B_FROM_A @ flat, model="affine", method="least-squares", folds=0)
     result = cubes(found, flat, B_FROM_A @ flat)
-    assert result is not None
     assert result.sides_mm[0] > 100  # the plane in the middle determines no affine transform: left out

@@ -9,8 +9,12 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
 from stcal.robot.kinematics.inverse import inverse
+from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 
+TOOL, WORLD = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])
+"""Of :func:`seen_arm`."""
 MARKERS = ("left", "right", "elbow")
 """Of :func:`two_arms`."""
 LEFT, RIGHT = Rigid.exp([0.5, 0.2, 0.1, 100, 250, 300]), Rigid.exp([-0.5, 0.3, -0.1, 100, -250, 300])
@@ -29,6 +33,12 @@ def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0, heavier:
     compliance, rest = np.abs(values[: 2 * n]), values[2 * n :]
     none = Elasticity(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros((n, 4)), DOWN)
     return replace(robot, elasticity=with_values(none, np.append(compliance, rest)))
+
+
+def seen_arm(rng: np.random.Generator, rows: int, share: float = 0.6) -> tuple[Robot, Measurements]:
+    """An arm as made, and what an instrument sees over the middle ``share`` of its ranges."""
+    true = placed(made(mh80(), rng), WORLD, {"": TOOL})
+    return true, measured(true, joint_vectors(true, rows, rng, share), rng)
 
 
 def two_arms(convention: Convention = "standard") -> Robot:

@@ -113,6 +113,11 @@ def make_scene(
     return PointPairScene(xyz_a, xyz_b, b_from_a, clean)
 
 
+def scene(seed, *args, **options) -> PointPairScene:
+    """:func:`make_scene` of its own generator."""
+    return make_scene(np.random.default_rng(seed), *args, **options)
+
+
 def parameter_error(found: Transform, truth: Transform) -> np.ndarray:
     """The step (p,) from truth to found: that of :func:`~stcal.register.models.unit_covariance`."""
     (linear, translation), (true_linear, true_translation) = parts(found), parts(truth)

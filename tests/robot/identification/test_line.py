@@ -14,6 +14,7 @@ from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import made, measured, placed
 from tests.levels import sampled
 from tests.outcome import fails_with
+from tests.support.arms import TOOL, WORLD
 
 DOWN = Rigid.exp([0, np.pi * 0.9, 0, 0, 0, 0]).rotation
 
@@ -21,8 +22,7 @@ DOWN = Rigid.exp([0, np.pi * 0.9, 0, 0, 0, 0]).rotation
 def at_one_orientation(places: np.ndarray):
     """The arm as made, and what was measured where its flange is at (m, 3)."""
     rng = np.random.default_rng(0)
-    tool, world = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])
-    true = placed(made(mh80(), rng), world, {"": tool})
+    true = placed(made(mh80(), rng), WORLD, {"": TOOL})
     found = inverse(true, Poses(np.tile(DOWN, (len(places), 1, 1)), places))
     assert found.usable.all()
     return true, measured(true, found.q, rng)

@@ -5,20 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors
+from tests.support.arms import seen_arm
 
 
 def drawn(rows: int, share: float, seed: int, observe: str = "pose"):
-    """An arm as made, with what was measured over the middle ``share`` of its ranges."""
-    rng = np.random.default_rng(seed)
-    tool, world = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])
-    true = placed(made(mh80(), rng), world, {"": tool})
-    data = measured(true, joint_vectors(mh80(), rows, rng, share), rng)
+    true, data = seen_arm(np.random.default_rng(seed), rows, share)
     return true, data if observe == "pose" else replace(data, rotations=None)
 
 
@@ -29,12 +25,8 @@ def test_six_poses_for_thirty_parameters_are_said():
     assert found.fitted_mm.mean() < 0.1 < 0.3 < found.predicted.ranges_mm.mean()
     assert found.notes[-2].startswith("6 poses give 36 numbers for 30 parameters: none can be held out")
     assert "times that at the measured rows" in found.notes[-1]
-
-
-@pytest.mark.slow
-def test_few_poses_are_said():
-    found = identify(mh80(), drawn(8, 0.6, 0)[1])
-    assert any("48 numbers for 30 parameters: σ estimated from so few" in note for note in found.notes)
+    more = identify(mh80(), drawn(8, 0.6, 0)[1])
+    assert any("48 numbers for 30 parameters: σ estimated from so few" in note for note in more.notes)
 
 
 def test_rows_of_a_small_part_of_the_ranges_are_said():

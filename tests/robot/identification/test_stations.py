@@ -10,20 +10,17 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
+from tests.support.arms import seen_arm
 
 MOVED = Rigid.exp([0.2, -0.1, 1.5, 4000, -3000, 200])
 """second_from_first."""
 
 
-def drawn(kind: str, rows: int = 60, second: int = 25, seed: int = 0) -> Measurements:
+def drawn(kind: str, rows: int = 60, second: int = 25) -> Measurements:
     """Rows from two stations; ``second`` : how many are of B."""
-    rng = np.random.default_rng(seed)
-    true = placed(
-        made(mh80(), rng), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200]), {"": Rigid.exp([0.3, 0.2, 0, 90, 50, 99])}
-    )
-    data = measured(true, joint_vectors(true, rows, rng), rng)
+    rng = np.random.default_rng(0)
+    data = seen_arm(rng, rows)[1]
     from_b = np.arange(rows) % 2 == 1
     from_b &= np.cumsum(from_b) <= second
     poses = Poses(data.rotations, data.points())
@@ -51,18 +48,20 @@ def test_two_stations_are_as_good_as_one_but_for_six_numbers(kind):
 
 
 @pytest.mark.slow
-def test_stations_taken_for_one_are_refused():
-    with fails_with("E-IDENTIFY-MISFIT … misses the measurements"):
-        identify(mh80(), replace(drawn("position"), stations=()))
+def test_stations_taken_for_one_and_rows_of_another_are_refused():
+    data = drawn("position")
+    names = list(data.stations)
+    names[1:40:4] = ["A"] * len(names[1:40:4])
+    for stations in ((), tuple(names)):
+        with fails_with("E-IDENTIFY-MISFIT … robot MH80 misses the measurements"):
+            identify(mh80(), replace(data, stations=stations))
 
 
 @pytest.mark.slow
 def test_distances_of_positions_go_within_stations():
-    data = drawn("position")
-    found = identify(mh80(), data, IdentifyOptions(observe="distance", folds=0))
-    one = identify(
-        mh80(), replace(drawn("position", second=0), stations=()), IdentifyOptions(observe="distance", folds=0)
-    )
+    options = IdentifyOptions(observe="distance", folds=0)
+    found = identify(mh80(), drawn("position"), options)
+    one = identify(mh80(), replace(drawn("position", second=0), stations=()), options)
     assert found.rank == one.rank
     assert np.sqrt((found.fitted_mm**2).mean()) < 0.15
 
@@ -70,15 +69,6 @@ def test_distances_of_positions_go_within_stations():
 def test_a_station_of_two_rows_is_named():
     with fails_with("E-STATION-FEW … 2"):
         identify(mh80(), drawn("position", second=2))
-
-
-@pytest.mark.slow
-def test_rows_of_another_station_are_named():
-    data = drawn("position")
-    names = list(data.stations)
-    names[1:40:4] = ["A"] * len(names[1:40:4])
-    with fails_with("E-IDENTIFY-MISFIT … robot MH80 misses"):
-        identify(mh80(), replace(data, stations=tuple(names)))
 
 
 def test_the_column_is_read(tmp_path):

@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import read_table
 from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
@@ -17,6 +17,7 @@ from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forwa
 from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.robot.use.design import DesignOptions, choose, design
+from stcal.robot.use.report import design_report
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])
@@ -31,18 +32,12 @@ def test_indices_by_hand():
     assert found.o4 == pytest.approx(0.5)  # 2² / 8
     assert found.o5 == pytest.approx(8 / 7)  # 1 / (1/2 + 1/4 + 1/8)
     assert ObservabilityIndices.of([3.0, 0.0], 1).values() == dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
-
-
-def test_indices_of_many_poses_neither_overflow_nor_depend_on_order():
-    sigma = np.geomspace(1e-12, 1e12, 400)
+    sigma = np.geomspace(1e-12, 1e12, 400)  # of many poses: no overflow, and in any order
     assert ObservabilityIndices.of(sigma, 1).o1 == pytest.approx(1)
     assert ObservabilityIndices.of(sigma[::-1], 1).o4 == pytest.approx(1e-36)
-
-
-@pytest.mark.parametrize(("sigma", "count"), [([], 3), ([1.0, -1.0], 3), ([1.0], 0), ([np.nan], 1)])
-def test_no_index_of_nothing(sigma, count):
-    with fails_with("E-ARRAY-SHAPE"):
-        ObservabilityIndices.of(sigma, count)
+    for sigma, count in (([], 3), ([1.0, -1.0], 3), ([1.0], 0), ([np.nan], 1)):
+        with fails_with("E-ARRAY-SHAPE"):
+            ObservabilityIndices.of(sigma, count)
 
 
 @pytest.mark.parametrize(("limits", "low", "high"), [({"upper": 1.0}, 1.0 - 2 * np.pi, 1.0), ({}, -np.pi, np.pi)])
@@ -113,8 +108,6 @@ def test_identification_states_the_indices_that_the_design_promised(observe):
 
 def test_exchange_finds_the_best_of_all_sets_of_a_small_problem():
     """Against every set of three out of twelve."""
-    from itertools import combinations
-
     hits = 0
     for seed in range(10):
         rows = np.random.default_rng(seed).normal(size=(12, 2, 4))
@@ -128,11 +121,8 @@ def test_exchange_finds_the_best_of_all_sets_of_a_small_problem():
         assert volume(chosen) > best - 1.0
         hits += volume(chosen) > best - 1e-9
     assert hits >= 6  # single exchanges may end in a local best, mostly they do not
-
-
-def test_no_pose_is_taken_twice_however_good_it_is():
     rows = np.full((6, 1, 1), 0.1) * np.eye(2)
-    rows[2] *= 100
+    rows[2] *= 100  # no pose is taken twice however good it is
     chosen, _ = choose(rows, 3)
     assert 2 in chosen
     assert len(set(chosen.tolist())) == 3
@@ -168,8 +158,6 @@ def test_same_seed_same_poses_within_limits_and_box():
 
 def test_what_no_pose_shows_is_left_out_and_told():
     """A tool on the last axis: two tilts of that axis look like two shifts."""
-    from stcal.robot.use.report import design_report
-
     result = design(mh80(), DesignOptions(count=20, candidates=200))
     assert (result.seen, result.parameters) == (25, 27)
     assert result.chosen.o3 > 0
@@ -194,19 +182,14 @@ def test_mistakes_are_named():
         design(sliding)
 
 
-def test_command_line(tmp_path, monkeypatch, capsys):
+def test_command_line(tmp_path, stcal_robot):
     (tmp_path / "robot.toml").write_text(robot_toml(ARM))
-    out = tmp_path / "poses.csv"
-    arguments = ["--robot", str(tmp_path / "robot.toml"), "--count", "15", "--candidates", "150", "--out", str(out)]
-    arguments += ["--report", str(tmp_path / "poses.html"), "--json", str(tmp_path / "poses.json")]
-    monkeypatch.setattr(
-        "sys.argv", ["stcal", "robot", "design", *arguments, "--box", "-2500,-2500,-500,2500,2500,3000"]
-    )
-    with pytest.raises(SystemExit) as caught:
-        main()
-    assert caught.value.code == 0
-    assert "15 poses for 27 parameters" in capsys.readouterr().out
-    html, content = (tmp_path / "poses.html").read_text(), json.loads((tmp_path / "poses.json").read_text())
+    out, page, file = (tmp_path / f"poses.{kind}" for kind in ("csv", "html", "json"))
+    words = "--robot", tmp_path / "robot.toml", "--count", 15, "--candidates", 150
+    words += "--out", out, "--report", page, "--json", file
+    code, said, _ = stcal_robot("design", *words, "--box", "-2500,-2500,-500,2500,2500,3000")
+    assert (code, "15 poses for 27 parameters" in said) == (0, True)
+    html, content = page.read_text(), json.loads(file.read_text())
     for name, value in content["chosen"].items():
         assert f'<th scope="row" class="l">{name}</th><td>{value:.4g}</td>' in html
     assert html.count("<img") == 3
@@ -214,7 +197,4 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     q = np.column_stack([table.numbers(f"q{i}_deg") for i in range(1, 7)])
     reached = forward(ARM, np.radians(q))
     np.testing.assert_allclose(reached.translation, table.poses("nominal_").translation, atol=1e-6)
-    monkeypatch.setattr("sys.argv", ["stcal", "robot", "design", *arguments, "--box", "1,2,three"])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    assert caught.value.code == 2
+    assert stcal_robot("design", *words, "--box", "1,2,three")[0] == 2

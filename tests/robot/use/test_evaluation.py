@@ -12,7 +12,7 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
+from stcal.robot.kinematics.model import Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.report import evaluated_csv, evaluation_file, evaluation_report, names_of
@@ -93,11 +93,9 @@ def test_only_what_is_asked_for_is_fitted(wrong):
             assert found == pytest.approx(SIGMA_MM * np.sqrt(3), rel=0.25)
         else:
             assert 1 < found < 40
-    fixed = evaluate({"a": robot}, data, "tool" if wrong == "base" else "base").robots[0]
-    if wrong == "base":
-        assert fixed.robot.world_from_base.matrix() == pytest.approx(robot.world_from_base.matrix())
-    else:
-        assert fixed.robot.tools[""].matrix() == pytest.approx(robot.tools[""].matrix())
+    fixed = evaluate({"a": robot}, data, "tool" if wrong == "base" else "base").robots[0].robot
+    given, found = (each.world_from_base if wrong == "base" else each.tools[""] for each in (robot, fixed))
+    assert found.matrix() == pytest.approx(given.matrix())
 
 
 REFITS = ("none", "base", "tool", "base-tool")
@@ -154,25 +152,16 @@ def test_clean_rows_are_hardly_ever_wrong():
 
 def test_what_a_file_leaves_is_said_and_whether_identification_takes_it_up():
     true = arm()
-    rows = list(true.rows)
-    rows[2] = replace(rows[2], theta=rows[2].theta + 1e-3)
-    shifted = replace(true, rows=tuple(rows))
-    [found] = evaluate({"a": shifted}, seen(true, 5, 60)).robots
+    rows = tuple(replace(row, theta=row.theta + 1e-3 * (i == 2)) for i, row in enumerate(true.rows))
+    result = evaluate({"a": replace(true, rows=rows)}, seen(true, 5, 60))
+    [found] = result.robots
     assert [each.what for each in found.left][:1] == ["the zero of joint 3"]
     assert found.beyond == ()
-    text = evaluation_report(evaluate({"a": shifted}, seen(true, 5, 60))).text()
+    text = evaluation_report(result).text()
     assert "a: residuals go with the zero of joint 3: " in text
     assert "a: parameters identified from these rows would explain all of it" in text
     [clean] = evaluate({"a": true}, seen(true, 5, 60)).robots
     assert clean.left == ()
-
-
-def test_the_identified_robot_is_better_on_the_other_half():
-    true, nominal = arm(), mh80()
-    robot = identify(nominal, seen(true, 6, 40), IdentifyOptions(folds=0)).robot
-    result = evaluate({"nominal": nominal, "identified": robot}, seen(true, 7, 40))
-    assert result.best == "identified"
-    assert Figures.of(result.robots[1].errors_mm).rms < 0.15
 
 
 @pytest.mark.slow
@@ -192,9 +181,7 @@ def test_distances_have_their_own_errors(refit):
 @pytest.mark.slow
 def test_another_arm_is_refused_in_one_line():
     data = seen(arm(), 9)
-    other = Robot(
-        "other", "standard", (DHRow(0, np.pi / 2, 300, 0), DHRow(400, 0, 0, 0), DHRow(350, 0, 0, 0)), (Joint(),) * 3
-    )
+    other = Robot("other", "standard", mh80().rows[:3], (Joint(),) * 3)
     with fails_with("E-ROBOT-MISMATCH … 6 … 3"):
         evaluate({"a": arm(), "b": other}, data)
     rows = tuple(replace(row, alpha=-row.alpha) for row in mh80().rows)
@@ -234,14 +221,6 @@ def test_identify_and_verify_read_what_was_written(tmp_path):
     read = read_measurements(tmp_path / "d.csv", true)
     assert read.lengths()[0] == pytest.approx(distances.lengths()[0], abs=1e-6)
     assert (read.lengths()[1] == 0).all()
-
-
-def test_residuals_in_the_base_do_not_depend_on_where_the_instrument_stands():
-    true, data = arm(), seen(arm(), 11)
-    moved = Rigid.exp([0.5, -1, 2, 1000, 0, -300])
-    there = replace(data, positions=moved @ data.points())
-    one, other = (evaluate({"a": true}, each).robots[0].residuals for each in (data, there))
-    assert one == pytest.approx(other, abs=1e-6)
 
 
 @pytest.mark.slow

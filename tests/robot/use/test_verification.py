@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
 from stcal.robot.use.report import verification_report
 from stcal.robot.use.verification import MeasuredPoses, Verification, read_measured, verification_file, verify
@@ -34,7 +33,7 @@ def written(folder: Path, lines: list[str], head: str = HEAD) -> Path:
 def lines_of(name: str, leave_out: int | None = None) -> list[str]:
     rows = zip(COMMANDED, measured(name), strict=True)
     return [
-        f"{name}," + ",".join(map(repr, [*c, *m])).replace("np.float64(", "").replace(")", "")
+        f"{name}," + ",".join(f"{v!r}" for v in [*c.tolist(), *m.tolist()])
         for i, (c, m) in enumerate(rows)
         if i != leave_out
     ]
@@ -89,18 +88,14 @@ def test_poses_by_name_in_any_order(tmp_path):
     after = [f"{n},{row}" for n, row in zip(names, lines_of("after"), strict=True)][::-1]
     result = verify(read_measured(written(tmp_path, before + after, head)))
     np.testing.assert_allclose(result.sets[1].error_mm, [0.1, -0.1, 0.2, 0.0], atol=1e-9)
+    twice = verify(read_measured(written(tmp_path, [*lines_of("before"), lines_of("before")[0]])))
+    assert len(twice.poses) == 6  # without names the same command twice is two poses
+    assert twice.sets[0].error_mm[-1] == pytest.approx(0, abs=1e-9)
     with fails_with("E-TABLE-ROW-REPEATED … 7 … before … 2"):
         read_measured(written(tmp_path, [*before, before[0]], head))
     moved = [row.replace("after,30", "after,31") for row in after]
     with fails_with("E-VERIFY-COMMANDED … 1 … before … after"):
         verify(read_measured(written(tmp_path, before + moved, head)))
-
-
-def test_the_same_command_twice_is_two_poses(tmp_path):
-    rows = lines_of("before")
-    result = verify(read_measured(written(tmp_path, [*rows, rows[0]])))
-    assert len(result.poses) == 6
-    assert result.sets[0].error_mm[-1] == pytest.approx(0, abs=1e-9)
 
 
 def test_too_few_and_other_units_are_named(tmp_path):
@@ -124,22 +119,15 @@ def test_no_error_at_all_gives_no_reduction(tmp_path):
     json.dumps(content, allow_nan=False)
 
 
-def test_command_line(tmp_path, monkeypatch, capsys):
+def test_command_line(tmp_path, stcal_robot):
     path = written(tmp_path, lines_of("before") + lines_of("after"))
-    made = [tmp_path / "plot.svg", tmp_path / "v.json", tmp_path / "v.html"]
-    command = ["stcal", "robot", "verify", str(path), "--overwrite", "--plot"]
-    monkeypatch.setattr("sys.argv", [*command, *map(str, (made[0], "--json", made[1], "--report", made[2]))])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    assert caught.value.code == 0
-    assert "71.4 %" in capsys.readouterr().out
-    assert "<svg" in made[0].read_text()
-    assert json.loads(made[1].read_text())["sets"][0]["mean_mm"] == pytest.approx(0.35)
-    assert "RMS of all pairs" in made[2].read_text()
-    monkeypatch.setattr("sys.argv", [*command, "x.png"])
-    with pytest.raises(SystemExit) as caught:
-        main()
-    assert caught.value.code == 2
+    plot, file, page = tmp_path / "plot.svg", tmp_path / "v.json", tmp_path / "v.html"
+    code, out, _ = stcal_robot("verify", path, "--plot", plot, "--json", file, "--report", page)
+    assert (code, "71.4 %" in out) == (0, True)
+    assert "<svg" in plot.read_text()
+    assert json.loads(file.read_text())["sets"][0]["mean_mm"] == pytest.approx(0.35)
+    assert "RMS of all pairs" in page.read_text()
+    assert stcal_robot("verify", path, "--plot", "x.png")[0] == 2
 
 
 @pytest.mark.parametrize(("off_mm", "warned"), [(0.01, False), (15.0, False), (4100.0, True)])
@@ -162,9 +150,8 @@ def ten_poses(change) -> str:
     rng = np.random.default_rng(4)
     commanded = rng.uniform(-500, 500, (10, 3))
     at = Rigid.exp([0.4, -1.0, 2.0, 500.0, -300.0, 90.0]) @ (commanded + rng.normal(0, 0.2, commanded.shape))
-    change(at)
     names = tuple(f"P{i}" for i in range(1, 11))
-    data = MeasuredPoses("x.csv", range(2, 12), ("after",) * 10, names, commanded, at)
+    data = MeasuredPoses("x.csv", range(2, 12), ("after",) * 10, names, commanded, change(at))
     return verify(data).sets[0].doubt()
 
 
@@ -190,40 +177,22 @@ def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():
 
 def test_a_compensation_that_gained_nothing_and_a_scale_are_named():
     assert "set after errs as set before does" in ten_of_two_sets(1.0, 1.0).warnings()[0]
-    assert (
-        "1.00200 times the commanded ones, which is most of their error"
-        in verify(MeasuredPoses("t", range(2, 12), ("a",) * 10, tuple("abcdefghij"), TEN, 1.002 * TEN)).warnings()[0]
-    )
+    ten = np.random.default_rng(6).uniform(-500, 500, (10, 3))
+    larger = verify(MeasuredPoses("t", range(2, 12), ("a",) * 10, tuple("abcdefghij"), ten, 1.002 * ten))
+    assert "1.00200 times the commanded ones, which is most of their error" in larger.warnings()[0]
 
 
-TEN = np.random.default_rng(6).uniform(-500, 500, (10, 3))
-
-
-def exchange(at: np.ndarray) -> None:
-    at[[2, 6]] = at[[6, 2]]
-
-
-def displace(at: np.ndarray) -> None:
-    at[4] += [0, 300, 0]
-
-
-def test_exchanged_and_wrong_poses_are_named():
-    assert ten_poses(lambda at: None) == ""
-    assert ten_poses(exchange) == "set after: poses P3, P7 are exchanged; correct the order of the rows"
-    assert ten_poses(displace) == "set after: pose P5: not where commanded, the others are; correct or remove"
-    assert "check units and the order" in ten_poses(lambda at: at.__imul__(1.1))
-    assert "as if the commanded ones were inches" in ten_poses(lambda at: at.__imul__(25.4))
-
-
-def late(at: np.ndarray) -> None:
-    at[:] = np.roll(at, 1, axis=0)
-
-
-def slip(at: np.ndarray) -> None:
-    at[0] += [0, 5, 0]
-
-
-def test_a_row_that_is_late_and_one_pose_of_a_few_millimetres_are_named():
+def test_exchanged_late_and_wrong_poses_are_named():
     """The first pose is in all distances from it: its error looks like one of all others."""
-    assert "stand one row too low: they fit the commanded ones above" in ten_poses(late)
-    assert ten_poses(slip).startswith("set after: pose P1 (")
+    none = np.zeros((10, 3))
+    far, little = none + [0, 300, 0] * (np.arange(10) == 4)[:, None], none + [0, 5, 0] * (np.arange(10) == 0)[:, None]
+    assert ten_poses(lambda at: at) == ""
+    exchanged = ten_poses(lambda at: at[[0, 1, 6, 3, 4, 5, 2, 7, 8, 9]])
+    assert exchanged == "set after: poses P3, P7 are exchanged; correct the order of the rows"
+    wrong = ten_poses(lambda at: at + far)
+    assert wrong == "set after: pose P5: not where commanded, the others are; correct or remove"
+    assert ten_poses(lambda at: at + little).startswith("set after: pose P1 (")
+    late = ten_poses(lambda at: np.roll(at, 1, axis=0))
+    assert "stand one row too low: they fit the commanded ones above" in late
+    assert "check units and the order" in ten_poses(lambda at: 1.1 * at)
+    assert "as if the commanded ones were inches" in ten_poses(lambda at: 25.4 * at)
