@@ -68,10 +68,8 @@ def verbose() -> bool:
 
 
 class StageProgress:
-    """Progress of the stages of a command, as a context manager and callable (stage, done, total).
-
-    It shows a bar on a terminal, else plain lines, with the remaining time. It shows nothing if the command is quiet.
-    """
+    """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else plain lines, or
+    quiet."""
 
     def __init__(self):
         self.bar = None
@@ -122,10 +120,7 @@ def time_left(taken_s: float, done: int, total: int) -> str:
 
 
 def printable(text: str) -> str:
-    """Returns the text without characters that a terminal would execute.
-
-    A space replaces white space other than a line's end, a question mark each character that cannot be printed.
-    """
+    """Returns the text with white space as a space, and other unprintable characters as question marks."""
     return "".join(c if c.isprintable() or c == "\n" else _instead(c) for c in text)
 
 

@@ -203,10 +203,8 @@ def square(size_mm: float) -> np.ndarray:
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rotation (2, 2) and translation (2,) into the frame in the middle of a tag with ``corners`` (4, 2).
-
-    The fit is a least-squares fit of a square to the corners; the size of the square does not matter.
-    """
+    """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square of any size to its
+    corners."""
     nominal = square(1.0)
     middle = corners.mean(0)
     along = np.sum((corners - middle) * nominal)

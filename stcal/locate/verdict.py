@@ -170,16 +170,8 @@ PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs o
 def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
-    """Returns the mistake in a layout whose correction makes all tags fit; None if there is no such mistake.
-
-    Parameters
-    ----------
-    detected : corners of the layout's tags, px
-    layout : the layout as it is
-    camera : the camera at the size of the image
-    prior : covariance of the intrinsics
-    pose : the pose by the layout as it is; None if none was found
-    """
+    """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by the layout as it
+    is."""
     if len(detected) < LEAST_TAGS:
         return None
     side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()

@@ -28,13 +28,10 @@ SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
 
 @contextlib.contextmanager
 def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
-    """Hand the work on single images to a Dask cluster for the duration of the context.
+    """Hand the work on single images to a Dask cluster within the context. ``address`` : ``tcp://host:8786`` of its
+    scheduler; ``send_images`` : by content, else by path on shared storage.
 
-    ``address`` : address of the scheduler, ``tcp://host:8786``; ``send_images`` : whether images are sent by content.
-    Otherwise they are sent by path, on storage that all workers share.
-
-    Raises InputError: the extra ``dask`` is not installed, no scheduler answers, it has no workers, or a worker has
-    other versions.
+    Raises InputError: no extra ``dask``, no scheduler, no workers, or a worker of other versions.
     """
     with _connected(address) as workers, spread(workers, AT_ONCE * workers.threads, send_images):
         yield
@@ -42,10 +39,8 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def executor_of(address: str | None = None) -> Iterator[Executor]:
-    """Yield the workers of a Dask cluster, or, without an address, processes of this machine, one per core.
-
-    Raises InputError: for the reasons given in :func:`dask_cluster`.
-    """
+    """Yield the workers of a Dask cluster or, without an address, of this machine, one per core; raises as
+    :func:`dask_cluster`."""
     with ProcessPoolExecutor() if address is None else _connected(address) as executor:
         yield executor
 
@@ -73,8 +68,7 @@ def _connected(address: str) -> Iterator["_Workers"]:
 
 @contextlib.contextmanager
 def _silent(package: str) -> Iterator[None]:
-    """Silence the logs of a package. Dask logs each lost worker and each closed connection; a fault shows by
-    its effect."""
+    """Silence the logs of a package, such as Dask's on each lost worker; a fault shows by its effect."""
     every = logging.root.manager.loggerDict.items()
     logs = [log for name, log in every if isinstance(log, logging.Logger) and name.split(".")[0] == package]
     levels = [log.level for log in logs]
@@ -88,8 +82,7 @@ def _silent(package: str) -> Iterator[None]:
 
 
 def _require_address(address: str) -> None:
-    """Refuse addresses without a scheduler: for some of them, and for answers of other programs, Dask's client waits
-    for ever."""
+    """Refuse addresses without a scheduler, for some of which Dask's client waits for ever."""
     from distributed.core import rpc
     from distributed.security import Security
 
@@ -112,8 +105,7 @@ def _require_address(address: str) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions here of the packages on which a result depends; empty for a package that is not installed by
-    its name."""
+    """Returns the versions of packages on which a result depends; empty for those not installed by name."""
     version_of = {"stcal": stcal.__version__}
     for name in SAME[1:]:
         try:

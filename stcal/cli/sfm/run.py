@@ -224,10 +224,7 @@ def budget(
 
 
 def _require_pdf(page: Path | None, run: Path) -> None:
-    """Refuses, before the work, a PDF without a page or a place.
-
-    Raises InputError if there is no page, or the extra ``pdf`` is not installed.
-    """
+    """Refuses, before the work, a PDF without a page or the extra ``pdf``."""
     from stcal.report.document import require_pdf
 
     if page is None:

@@ -81,8 +81,7 @@ class Components:
         return mean * self.units[:, None] * self.units
 
     def _root(self, best: np.ndarray) -> np.ndarray:
-        """Returns a square root (p, f) of the covariance of log σ, for the f components that are not at their lower
-        limit."""
+        """Returns a square root (p, f) of the covariance of log σ, for the f components above their lower limit."""
         free = np.flatnonzero(best > self.least + STEP)
         moves = STEP * np.eye(len(best))[free]
         gradient = self.parts.at(np.concatenate([best + moves, best - moves]))[1]
@@ -97,11 +96,8 @@ class Components:
 
 
 def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (m, width) and weights (m,) for a standard normal distribution.
-
-    In many dimensions they are those of the cubature of degree three (Arasaratnam & Haykin, IEEE Trans. Automatic
-    Control 54, 2009), else of the product rule.
-    """
+    """Returns points (m, width) and weights (m,) for a standard normal distribution: the product rule, or in many
+    dimensions the cubature of degree three (Arasaratnam & Haykin 2009)."""
     if width > MOST_PRODUCT:
         away = np.sqrt(width) * np.eye(width)
         return np.vstack([away, -away]), np.full(2 * width, 0.5 / width)
@@ -117,8 +113,7 @@ def components(
     rows: NominalRows,
     deviations: Deviations,
 ) -> Components:
-    """Returns the parts of an adjustment: those of the data whose σ is estimated, then the groups of the robot's
-    dimensions."""
+    """Returns the parts of an adjustment: those of the data whose σ is estimated, then groups of dimensions."""
     units = solution.units
     white = weighting.whiten(solution.residuals, measured)
     derivative = weighting.whiten(jacobian(solution.state, measured), measured) * units
@@ -208,9 +203,6 @@ def estimated(
 
 
 def _kept(kind: Kind) -> float:
-    """Returns the share of the square of normal residuals that is left when they are cut off at Huber's limit.
-
-    With this share (Huber's Proposal 2) outliers hardly move σ, and without outliers σ is not too small.
-    """
+    """Returns the share of the square of normal residuals below Huber's limit (Huber's Proposal 2)."""
     width, limit = WIDTH[kind], huber_limit(kind) ** 2
     return float(chdtr(width + 2, limit) + limit / width * chdtrc(width, limit))

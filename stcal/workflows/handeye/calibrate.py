@@ -167,17 +167,10 @@ def calibrate(
     progress: Progress = lambda *_: None,
     offset_known: bool = False,
 ) -> Outcome:
-    """Returns the result and its errors on poses held out.
+    """Returns the result, of each method if :data:`ALL`, of the best way if :data:`AUTO`, and its errors on poses held
+    out. Clocks that differ are tried as a cause of residuals, unless ``offset_known``.
 
-    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
-
-    All methods are compared where ``method`` is :data:`ALL`;
-    the way of solving that predicts best is used where it is :data:`AUTO`.
-
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    Raises StcalError: as :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     with naming_left_out(given.left_out):
         pairs, views = given.pairs, given.views
@@ -246,23 +239,8 @@ def with_arm(
 ) -> Outcome:
     """Returns the calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
 
-    Parameters
-    ----------
-    outcome : calibration of the same poses, by the robot's file
-    arm : the arm at the joint values of these poses
-    options : options of the outcome
-    prior : prior of the intrinsics
-    rows : (s, k) poses to hold out; none where empty
-    workers, progress : as in :func:`stcal.handeye.cross_validate`
-
-    Returns
-    -------
-    Outcome
-
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye`.
+    ``outcome`` : calibration by the robot's file; ``arm`` : at the joint values of the same poses; ``options`` : of the
+    outcome; ``prior`` : of the intrinsics; ``rows`` : (s, k) poses to hold out. Raises StcalError.
     """
     pairs, views, setup = outcome.pairs, outcome.views, outcome.result.setup
     if pairs is None or views is None:
@@ -310,12 +288,9 @@ their order counts as that of a motion; and least number of such poses."""
 def at_offset(
     given: HandEyeInput, setup: Setup, options: HandEyeOptions
 ) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
-    """Returns the same input with the robot's poses at the estimated offset.
+    """Returns the input with the robot's poses at the estimated offset, and numberings of a symmetric board corrected.
 
-    Numberings of a symmetric board are corrected.
-
-    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: for the reasons given in
-    :func:`~stcal.handeye.time_offset.estimate_offset`.
+    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: as :func:`estimate_offset`.
     """
     timed = given.timed
     if timed is None:
@@ -363,11 +338,8 @@ def lag_tried(
     given: HandEyeInput, setup: Setup, options: HandEyeOptions, result: HandEye
 ) -> tuple[HandEye, tuple[str, ...]]:
     """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
-    with the lag is then taken from the result's notes.
-
-    The poses are those of ``given`` and ``result``, with no offset applied. Where poses have no times, their order
-    gives velocities if they follow one another smoothly.
-    """
+    with the lag goes. Without times, the order of smooth rows gives velocities. No offset may be applied to
+    ``given``."""
     pairs = given.pairs
     timed = _moving(given)
     if timed is None or options.four_dof or len(result.outliers) != len(pairs):
@@ -405,11 +377,8 @@ def lag_tried(
 
 
 def _moving(given: HandEyeInput) -> Timed | None:
-    """Returns the robot's poses as a stream that tells its velocities at the images, by times or by the order of the
-    rows; None where neither does.
-
-    Where there is about one sample for each image, the poses must follow one another smoothly.
-    """
+    """Returns the robot's poses as a stream with velocities at the images, by times or by the order of smooth rows, or
+    None. About one sample for each image must be smooth too."""
     pairs, timed = given.pairs, given.timed
     if timed is not None and not _close(timed):
         return None
@@ -435,8 +404,7 @@ def _close(timed: Timed) -> bool:
 
 
 def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
-    """Returns Student's t of an offset that is solved for with X and Z, to first order, from the poses that are not
-    outliers."""
+    """Returns Student's t of an offset solved for with X and Z, to first order, without outliers."""
     good = np.flatnonzero(~result.outliers)
     loop, x = Loop.of(pairs[good], setup), result.mount_from_camera
     residuals = loop.residuals(x, result.stand_from_board, result.scale)
@@ -470,8 +438,7 @@ LEAST_REACHED = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned:
-    """``result`` : from the poses taken; ``poses`` : poses to take; ``joints`` : joint values (k,) of these by column,
-    deg or mm, with a robot file; ``notes`` : on the poses."""
+    """``poses`` : to take, after ``result``; ``joints`` : (k,) of these by column, deg or mm, with a robot file."""
 
     result: HandEye
     poses: NextPoses
@@ -522,8 +489,7 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
 
 def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Returns the joint values (n,) of the last pose taken that the robot reaches, and notes on poses that it does
-    not."""
+    """Returns the joint values (n,) of the last pose that the robot reaches, and notes on those that it does not."""
     flange = given.pairs.base_from_flange
     solutions = inverse(robot, flange, _middle(robot))
     beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
