@@ -402,22 +402,18 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
     pixels = found.corners_px[own].reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
     board_px2 = np.tile(np.eye(2), (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
+    seen_from_px = np.linalg.inv(camera.distort_jacobian(board_seen)[1] * camera.focal[:, None])
     return ImageCorners(
         name,
         pose,
         view.xyz_board,
         board_seen,
-        _normalised(board_px2, board_seen, camera),
+        seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2),
         np.array([rows[found.tags[k]] for k in own]),
         ideal,
         _tag_covariances(found, own),
         float(camera.focal.mean()),
     )
-
-
-def _normalised(covariance_px2: np.ndarray, ideal: np.ndarray, camera: Camera) -> np.ndarray:
-    normalised_from_px = np.linalg.inv(camera.distort_jacobian(ideal)[1] * camera.focal[:, None])
-    return normalised_from_px @ covariance_px2 @ np.swapaxes(normalised_from_px, 1, 2)
 
 
 def _tag_covariances(found: Tags, own: list[int]) -> np.ndarray:

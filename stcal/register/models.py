@@ -4,7 +4,6 @@ Residuals are b − b_from_a a in frame b. ``precision`` describes their noise: 
 (n,) for weights 1/σ², (n, 3, 3) for inverse covariances.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -193,7 +192,8 @@ def _about(
 ) -> NormalEquations:
     """Returns the normal equations of the parameters about a point ``origin`` of a, with inverse covariances."""
     cost, normal, gradient = 0.0, np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
-    for rows in _chunks(len(xyz_a)):
+    for first in range(0, len(xyz_a), CHUNK):
+        rows = slice(first, first + CHUNK)
         by_step = jacobian(model, transform, xyz_a[rows] - origin)
         weighted = np.swapaxes(by_step, 1, 2) @ precision[rows]
         residual = xyz_b[rows] - transform @ xyz_a[rows]
@@ -252,7 +252,3 @@ def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transf
             "E-REGISTER-SCALE", "registration: the scale is not determined; are the covariances true?"
         )
     return Similarity(scale, Rigid(rotation, there - scale * rotation @ origin))
-
-
-def _chunks(n: int) -> Iterator[slice]:
-    return (slice(i, i + CHUNK) for i in range(0, n, CHUNK))

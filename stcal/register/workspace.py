@@ -163,14 +163,11 @@ def _motions(model: Model, transform: Transform, xyz_a: np.ndarray, about: np.nd
     """Returns the residuals due to small motions of the transform, (m, 3, p), for parameters scaled to about 1."""
     origin = about.mean(0)
     extent = float(np.abs(about - origin).max())
-    return jacobian(model, transform, xyz_a - origin) / np.where(_in_mm(model), extent, 1.0)
-
-
-def _in_mm(model: Model) -> np.ndarray:
-    """Returns the mask of the parameters whose motions grow with the distance from the origin."""
     if model.name == "affine":
-        return np.tile([True, True, True, False], 3)
-    return np.array([True] * 3 + [False] * 3 + [True])[: model.parameters]
+        grow = np.tile([True, True, True, False], 3)
+    else:
+        grow = np.array([True] * 3 + [False] * 3 + [True])[: model.parameters]
+    return jacobian(model, transform, xyz_a - origin) / np.where(grow, extent, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -276,7 +276,7 @@ def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
         remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
             remedy = "if the size in its file is in metres, correct that"
-        if _typical_length(_of_side(loop, other)) > HALL_MM:
+        if np.median(np.linalg.norm(_of_side(loop, other).translation, axis=1)) > HALL_MM:
             factor, which = 1e-3, other
             role = "robot" if other == "robot" else "camera"
             remedy = (
@@ -305,10 +305,6 @@ def _as_of_radians(loop: Loop, by_images: bool) -> str:
 
 def _of_side(loop: Loop, side: str) -> Poses:
     return loop.stand_from_mount if side == "robot" else loop.camera_from_board
-
-
-def _typical_length(poses: Poses) -> float:
-    return float(np.median(np.linalg.norm(poses.translation, axis=1)))
 
 
 def _read_as(reading: Reading, poses: Poses, inverted: bool = False) -> Poses:
@@ -375,7 +371,9 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         labels, cost = _settled(loop, variants, labels)
         if cost < least:
             best, least = labels, cost
-    best = _most_as_they_are(best, every)
+    # Label k of a view means C S_k. All views are turned by S_common⁻¹ from the right, so that most stay as they are.
+    common_inverse = every[int(np.bincount(best).argmax())].inverse()
+    best = np.array([_nearest(every[k] @ common_inverse, every) for k in best])
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
     covariance, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
     carried = _carried(as_numbered, poses)
@@ -432,14 +430,6 @@ def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.
             break
         labels = better
     return labels, float(np.min(costs, axis=0).sum())
-
-
-def _most_as_they_are(labels: np.ndarray, every: tuple[Rigid, ...]) -> np.ndarray:
-    """Returns the same numbering after one turn of all views, chosen so that most views stay as they are."""
-    common = int(np.bincount(labels).argmax())
-    common_inverse = every[common].inverse()
-    # Label k of a view means C S_k. All are turned by S_common⁻¹ from the right; S_k S_common⁻¹ is again in the group.
-    return np.array([_nearest(every[k] @ common_inverse, every) for k in labels])
 
 
 def _nearest(turn: Rigid, every: tuple[Rigid, ...]) -> int:

@@ -93,7 +93,9 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
     x = (about * turn).as_matrix()
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
-    t_x, t_z, _ = _translations(_scaled(loop, scale), np.arange(len(loop))[None], x[None], False)
+    eye = loop.camera_from_board
+    scaled = replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
+    t_x, t_z, _ = _translations(scaled, np.arange(len(loop))[None], x[None], False)
     return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
 
 
@@ -130,11 +132,6 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
     s = len(subsets)
     solved = (np.linalg.pinv(rows.reshape(s, -1, rows.shape[3]), rcond=1e-9) @ right.reshape(s, -1, 1))[:, :, 0]
     return solved[:, :3], solved[:, 3:6], solved[:, 6] if with_scale else np.ones(s)
-
-
-def _scaled(loop: Loop, scale: float) -> Loop:
-    eye = loop.camera_from_board
-    return replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:

@@ -79,7 +79,9 @@ def agreeing(state: State, measured: Observed, weighting: Weighting) -> np.ndarr
         errors, derivative = linear(state, measured)
         units = parameter_units(derivative)
         if step:
-            weighting = _reweighed(weighting, errors, measured)
+            white = weighting.whiten(errors, measured)
+            medians = {n: float(np.median(np.abs(white[:, at]))) for n, at in weighting.columns(white.shape[1]).items()}
+            weighting = weighting.with_values({n: weighting.value(n) * (value or 1.0) for n, value in medians.items()})
         problem = _Problem(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
         r, w, k = problem.slope.shape
         half = (r + k // w + 1) // 2 + 1
@@ -93,14 +95,6 @@ def agreeing(state: State, measured: Observed, weighting: Weighting) -> np.ndarr
         if not searched and (good == before).all():
             break
     return good
-
-
-def _reweighed(weighting: Weighting, left: np.ndarray, measured: Observed) -> Weighting:
-    """Returns the weighting with σ from the medians of the residuals ``left`` (r, w), of positions and of
-    orientations."""
-    white = weighting.whiten(left, measured)
-    medians = {name: float(np.median(np.abs(white[:, at]))) for name, at in weighting.columns(white.shape[1]).items()}
-    return weighting.with_values({name: weighting.value(name) * (value or 1.0) for name, value in medians.items()})
 
 
 def _trimmed(problem: _Problem, half: int) -> np.ndarray:

@@ -298,19 +298,13 @@ def _without_errors(
             length = np.linalg.norm(adjustment.weighting.whiten(errors, measured), axis=1)
             weights = huber_weights(length, huber_limit(measured.kind))
             adjustment = replace(adjustment, solution=replace(adjustment.solution, residuals=errors, weights=weights))
-        if not _errors_change(adjustment, good):
+        now_good = adjustment.solution.weights >= GROSS
+        if (now_good == good).all() or now_good.mean() < MOSTLY_GOOD:
             return adjustment
-        good, state = adjustment.solution.weights >= GROSS, adjustment.solution.state
+        good, state = now_good, adjustment.solution.state
         known = (adjustment.rows, adjustment.weighting, adjustment.deviations)
     note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
     return replace(adjustment, notes=(*adjustment.notes, note))
-
-
-def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
-    """Returns True if the set of gross errors is not that of ``good`` (r,); False if most observations would be
-    errors."""
-    now = found.solution.weights >= GROSS
-    return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
 
 
 def _by_medians(

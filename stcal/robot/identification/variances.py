@@ -146,22 +146,12 @@ def components(
     count, expected, doubt, least, most = (np.array(values, float) for values in numbers)
     together, curved = NormalEquations.stacked(equations_of_parts), curvature_of(solution, measured, weighting)
     if curved is not None:
-        together, fixed = _bent(together, fixed, np.isfinite(doubt), curved * units[:, None] * units)
+        # At the minimum the data pull as much as held and fixed parts hold; this changes with the σ of these parts.
+        held = np.isfinite(doubt)
+        bends = Bent.of(fixed.normal + together.normal[held].sum(0), curved * units[:, None] * units).bends()
+        bent = np.where(held[:, None, None], bends.T @ together.normal @ bends, together.normal)
+        together, fixed = replace(together, normal=bent), replace(fixed, normal=bends.T @ fixed.normal @ bends)
     return Components(Parts(together, count, fixed, expected, doubt), least, most, units)
-
-
-def _bent(
-    each: NormalEquations, fixed: NormalEquations, held: np.ndarray, curved: np.ndarray
-) -> tuple[NormalEquations, NormalEquations]:
-    """Returns the parts after second derivatives have taken ``curved`` (k, k) from the ``held`` (p,) and fixed ones.
-
-    At the minimum the data pull as much as these parts hold. This pull changes with the σ of these parts, not of the
-    data.
-    """
-    normal = fixed.normal + each.normal[held].sum(0)
-    bends = Bent.of(normal, curved).bends()
-    bent = np.where(held[:, None, None], bends.T @ each.normal @ bends, each.normal)
-    return replace(each, normal=bent), replace(fixed, normal=bends.T @ fixed.normal @ bends)
 
 
 def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:

@@ -331,12 +331,10 @@ def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
         twist[i, c] = value
     turn = Rotation.from_rotvec(twist[:, :3]).as_matrix()
     translation = chain.translation + np.einsum("nij,nj->ni", chain.rotation, twist[:, 3:])
-    return replace(chain, rotation=_orthogonal(chain.rotation @ turn), translation=translation)
-
-
-def _orthogonal(rotation: np.ndarray) -> np.ndarray:
-    """Removes rounding errors from rotations (n, 3, 3), by one step of Newton's iteration for the polar factor."""
-    return 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
+    rotation = chain.rotation @ turn
+    # One step of Newton's iteration for the polar factor removes rounding errors.
+    rotation = 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
+    return replace(chain, rotation=rotation, translation=translation)
 
 
 def _from_base_to_tool(robot: Robot, tool: str) -> Chain:

@@ -96,7 +96,7 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
     error = problem.errors(goal, q)
     damping = np.full(len(q), 1e-2)
     for _ in range(ROUNDS):
-        going = ~_done(error)
+        going = ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
         rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
         if not len(rows):
             break
@@ -113,10 +113,6 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
         keep = ~stuck
         rows, goal, error, damping = rows[keep], goal[keep], error[keep], damping[keep]
     return _position_exact(problem, poses, q, bounds) if problem.under_actuated else q
-
-
-def _done(off: np.ndarray) -> np.ndarray:
-    return (np.abs(off[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(off[:, 3:]).max(axis=1) <= DONE_MM)
 
 
 def _step(

@@ -362,7 +362,8 @@ def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ..
 def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
     """Returns a note if all poses are so near the base's origin that metres or inches would also be within reach."""
     far = float(np.linalg.norm(poses.translation, axis=1).max())
-    reach = max(reach_mm(robot, name) for name in set(targets.tools)) + _base_mm(robot)
+    first_joint = replace(robot, world_from_base=Rigid()).chain().translation[0]
+    reach = max(reach_mm(robot, name) for name in set(targets.tools)) + float(np.linalg.norm(first_joint))
     fitting = [unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach]
     if not fitting:
         return ()
@@ -371,11 +372,6 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
         f"all targets lie within {far:.3g} mm of the base's origin, where no arm works that reaches {reach:.4g} mm: if "
         f"the unit of x, y, z is {UNIT_WORDS[unit]}, call the columns x_{unit} …",
     )
-
-
-def _base_mm(robot: Robot) -> float:
-    """Returns the distance from the base's origin to the first joint, mm."""
-    return float(np.linalg.norm(replace(robot, world_from_base=Rigid()).chain().translation[0]))
 
 
 def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str, ...]:

@@ -380,8 +380,11 @@ def _moving(given: HandEyeInput) -> Timed | None:
     """Returns the robot's poses as a stream with velocities at the images, by times or by the order of smooth rows, or
     None. About one sample for each image must be smooth too."""
     pairs, timed = given.pairs, given.timed
-    if timed is not None and not _close(timed):
-        return None
+    if timed is not None:
+        samples = timed.stream.seconds
+        after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
+        if np.median(samples[after] - samples[after - 1]) > LONGEST_S:
+            return None
     if timed is not None and timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
         return timed
     if len(pairs) < LEAST_ROWS:
@@ -394,13 +397,6 @@ def _moving(given: HandEyeInput) -> Timed | None:
     steps_rms = np.sqrt((steps**2).sum(2).mean(0))
     smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps_rms, strict=True))
     return timed if smooth else None
-
-
-def _close(timed: Timed) -> bool:
-    """Returns True if samples of the stream are so close about most images that poses between them are known."""
-    samples = timed.stream.seconds
-    after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
-    return float(np.median(samples[after] - samples[after - 1])) <= LONGEST_S
 
 
 def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
@@ -485,7 +481,9 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
         return Planned(result, plan_poses(given.pairs, result, count, outline, camera, None, seed), {}, ())
     near, notes = _taken(robot, given)
     planned = plan_poses(given.pairs, result, count, outline, camera, _reach(robot, near), seed)
-    return Planned(result, planned, _joints(robot, planned.base_from_flange, near), notes)
+    q = inverse(robot, planned.base_from_flange, near).q
+    joints = dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))
+    return Planned(result, planned, joints, notes)
 
 
 def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -516,8 +514,3 @@ def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
         return np.array([status == REACHED for status in inverse(robot, flange, near).status])
 
     return reachable
-
-
-def _joints(robot: Robot, flange: Poses, near: np.ndarray) -> dict[str, np.ndarray]:
-    q = inverse(robot, flange, near).q
-    return dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))
