@@ -140,8 +140,8 @@ def timed_tree() -> float:
     """Seconds of the identification of an elastic tree of joints, its files read."""
     from stcal.robot import IdentifyOptions, identify
     from stcal.robot.kinematics.model import Robot, Tree
-    from stcal.robot.simulated import joint_vectors, made, measured
     from tests.support.arms import LEFT, MARKERS, RIGHT, elastic, two_arms
+    from tests.support.simulated_arms import joint_vectors, made, measured
 
     body, rng = two_arms(), np.random.default_rng(0)
     tree = Tree({2: (1, LEFT), 8: (1, RIGHT), 14: (1, HEAD)}, {"left": 7, "right": 13, "elbow": 4, "head": 17})

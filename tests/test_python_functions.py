@@ -24,11 +24,11 @@ from stcal.cli.main import app
 from stcal.io.files import json_text
 from stcal.locate.layout import layout_toml
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors
 from stcal.robot.use.report import evaluation_file
 from tests.commands import COMMANDS
 from tests.locate.drawn_target import CAMERA, LAYOUT, photo, tilted
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "howto" / "python.md"
 ROW = re.compile(r"^\| `stcal([ -])([\w -]+)` \| (.+) \|$", re.MULTILINE)

@@ -32,8 +32,8 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import InverseProblem, solve
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80
-from stcal.robot.simulated import made
 from stcal.workflows.register_robot import grown, positions
+from tests.support.simulated_arms import made
 
 MIDDLE = np.array([800.0, 200.0, 700.0])
 POINTS, TESTS = 100, 50

@@ -29,7 +29,6 @@ from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets
 from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
@@ -38,6 +37,7 @@ from stcal.sfm.measurement.target import TargetCircles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
 from tests.support.image_poses import KnownTarget, known_target, pose_error, see
+from tests.support.simulated_arms import joint_vectors, made, placed
 
 PUBLISHED = {"mean": (0.6493, 0.4742), "std": (0.5596, 0.2967), "max": (2.1259, 1.3311)}
 """Table 3 of the paper, mm: before, after."""

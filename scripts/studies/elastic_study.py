@@ -35,9 +35,9 @@ from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, elastic, two_arms
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 NEW_POSES = 50
 SIGMA_MM, SIGMA_RAD = 0.05, 2e-4

@@ -21,8 +21,8 @@ from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 NEW_POSES = 50
 MIXED = (1.0, 50.0)

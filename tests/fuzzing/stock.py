@@ -22,7 +22,6 @@ from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.data.model import detections_csv
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.pattern import make_pattern, sides_of
@@ -37,6 +36,7 @@ from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, s
 from tests.shared import own_copy
 from tests.support.arms import elastic
 from tests.support.handeye import simulated
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 """As the tests' small data set."""

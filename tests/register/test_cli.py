@@ -13,9 +13,9 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, placed
 from tests.outcome import ended, fails_with
 from tests.support.arms import elastic
+from tests.support.simulated_arms import joint_vectors, made, placed
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

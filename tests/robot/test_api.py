@@ -12,8 +12,8 @@ from stcal import robot
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 
 def write(path, header, rows) -> None:

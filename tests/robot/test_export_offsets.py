@@ -12,7 +12,7 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, measured, placed
+from tests.support.simulated_arms import joint_vectors, measured, placed
 
 COUPLING = np.eye(6)
 COUPLING[2, 1] = COUPLING[5, 3] = 1.0

@@ -15,7 +15,6 @@ from stcal.io.table import Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import made
 from stcal.robot.use.targets import Targets
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
@@ -24,6 +23,7 @@ from stcal.workflows import from_photos as work
 from stcal.workflows.from_photos import FromPhotos, files_of, story
 from tests.outcome import fails_with
 from tests.support.image_poses import known_target, see
+from tests.support.simulated_arms import made
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])

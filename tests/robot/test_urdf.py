@@ -11,10 +11,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors
 from stcal.robot.urdf import load_urdf, require_urdf_written, robot_urdf
 from tests.outcome import fails_with
 from tests.support.arms import two_arms
+from tests.support.simulated_arms import joint_vectors
 
 TOOLS = {"": Rigid.exp([0.1, 0.2, -0.3, 10, 20, 150]), "ball": Rigid.exp([0, 0.5, 0, -40, 0, 90])}
 WORLD = Rigid.exp([0.1, 0.2, 0.3, 1000, -500, 200])

@@ -19,9 +19,9 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, placed
 from tests.outcome import fails_with
 from tests.support.arms import two_arms
+from tests.support.simulated_arms import joint_vectors, made, placed
 
 SIGMA = 0.03
 WORLD = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0])

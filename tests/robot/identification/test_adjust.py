@@ -11,8 +11,8 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 TOOL, WORLD = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])
 LENGTHS, ANGLES = [0, 2], [1, 3, 4]

@@ -11,8 +11,8 @@ from stcal.robot.identification.adjustment import Weighting, huber_limit, jacobi
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 WEIGHTING = Weighting(0.05, 2e-4)
 

@@ -15,11 +15,11 @@ from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate
 from stcal.robot.use.report import evaluation_report
 from tests.outcome import fails_with
 from tests.support.arms import elastic
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 
 def drawn(rows: int, seed: int, share: float = 1.0):

@@ -15,9 +15,9 @@ from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import Robot, mh80
-from stcal.robot.simulated import joint_vectors, measured
 from stcal.row_order import Change
 from tests.robot.identification.test_solve import simulated
+from tests.support.simulated_arms import joint_vectors, measured
 
 NOISE = Weighting(0.05, 2e-4)
 QUICK = IdentifyOptions(folds=0)

@@ -11,9 +11,9 @@ from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import made, measured, placed
 from tests.levels import sampled
 from tests.outcome import fails_with
+from tests.support.simulated_arms import made, measured, placed
 
 DOWN = Rigid.exp([0, np.pi * 0.9, 0, 0, 0, 0]).rotation
 

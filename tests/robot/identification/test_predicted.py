@@ -10,7 +10,7 @@ from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 
 def drawn(rows: int, share: float, seed: int, observe: str = "pose"):

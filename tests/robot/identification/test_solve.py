@@ -21,8 +21,8 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.scripts import load_script
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 QUICK = IdentifyOptions(folds=0)
 

@@ -14,8 +14,8 @@ from stcal.robot.identification.start import start
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 LAST = "quaternions were x, y, z, w in the order of their columns"
 

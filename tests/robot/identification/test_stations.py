@@ -10,8 +10,8 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 MOVED = Rigid.exp([0.2, -0.1, 1.5, 4000, -3000, 200])
 """second_from_first."""

@@ -27,9 +27,9 @@ from stcal.robot.kinematics.forward import elasticity_values, forward, joint_fra
 from stcal.robot.kinematics.forward import jacobian as by_joints
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Robot
-from stcal.robot.simulated import joint_vectors, made, measured
 from tests.outcome import fails_with
 from tests.support.arms import MARKERS, RIGHT, elastic, two_arms
+from tests.support.simulated_arms import joint_vectors, made, measured
 
 
 def seen_by(robot: Robot, rng, each=60):

@@ -12,10 +12,10 @@ from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import read_measurements
 from stcal.robot.kinematics.model import mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.targets import read_targets
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 WPR, ABC, OPEN = ("w_deg", "p_deg", "r_deg"), ("a_deg", "b_deg", "c_deg"), ("rx_deg", "ry_deg", "rz_deg")
 ORDER = {WPR: "xyz", ABC: "ZYX", OPEN: "XYZ"}

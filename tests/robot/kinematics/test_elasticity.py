@@ -21,8 +21,8 @@ from stcal.robot.kinematics.forward import (
     with_values,
 )
 from stcal.robot.kinematics.model import Elasticity, Robot, mh80
-from stcal.robot.simulated import joint_vectors
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors
 
 TOOL = Rigid.exp([0.1, 0.2, 0.3, 50, 60, 70])
 ALONE = ("",) * 20

@@ -21,7 +21,7 @@ from stcal.robot.kinematics.forward import (
     moved_chain,
 )
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made
+from tests.support.simulated_arms import joint_vectors, made
 
 
 def arm(seed: int, joints: int, convention: str) -> Robot:

@@ -13,8 +13,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import branches, inverse
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made
 
 TOOL = Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])
 

@@ -10,9 +10,9 @@ from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells, read_ta
 from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))
 POSES = Poses.of([Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([-0.4, 0, 0.3, 40, 50, 60])])

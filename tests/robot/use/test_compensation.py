@@ -16,11 +16,11 @@ from stcal.io.table import POSE, pose_cells
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Joint, mh80
-from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file
 from stcal.robot.use.targets import read_targets
 from tests.outcome import fails_with
 from tests.support.arms import elastic
+from tests.support.simulated_arms import joint_vectors, made
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 FEW = 6

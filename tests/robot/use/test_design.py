@@ -15,9 +15,9 @@ from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.model import Joint, mh80
-from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.robot.use.design import DesignOptions, choose, design
 from tests.outcome import fails_with
+from tests.support.simulated_arms import joint_vectors, made, measured
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])
 ARM = replace(mh80(), tools={"": TOOL})

@@ -13,12 +13,12 @@ from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
-from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.report import evaluated_csv, evaluation_file, evaluation_report, names_of
 from stcal.robot.use.verification import read_measured, verify
 from tests.outcome import fails_with
 from tests.robot.identification.test_solve import rokae
+from tests.support.simulated_arms import joint_vectors, made, measured, placed
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
 SIGMA_MM = 0.05
