@@ -175,12 +175,8 @@ Scheduler = Annotated[
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
 
 
-QuaternionOrder = Literal["wxyz", "xyzw"]
-"""Order of the four columns of a quaternion."""
-
-
 Quaternions = Annotated[
-    QuaternionOrder,
+    Literal["wxyz", "xyzw"],
     "Read quaternions by the names of their columns (wxyz), or take the columns in their order as x, y, z, w (xyzw).",
 ]
 Rotation = Annotated[

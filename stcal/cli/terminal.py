@@ -132,15 +132,14 @@ def _instead(character: str) -> str:
 
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
     """Prints the values, unless the command is quiet. Names from files may contain any characters."""
-    if not _quiet.get():
-        print(_coloured(printable(sep.join(map(str, values)))) + end, end="")  # at once: threads may say something too
-
-
-def _coloured(text: str) -> str:
-    """Colours the words of verdicts if standard output is a terminal and `NO_COLOR` (no-color.org) is not set."""
-    if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
-        return text
-    return VERDICTS.sub(lambda match: f"{match['before']}\x1b[{COLOURS[match['word']]}m{match['word']}\x1b[0m", text)
+    if _quiet.get():
+        return
+    text = printable(sep.join(map(str, values)))
+    if sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":  # no-color.org
+        text = VERDICTS.sub(
+            lambda match: f"{match['before']}\x1b[{COLOURS[match['word']]}m{match['word']}\x1b[0m", text
+        )
+    print(text + end, end="")  # at once: threads may say something too
 
 
 @contextmanager

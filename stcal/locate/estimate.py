@@ -320,7 +320,13 @@ def problem_of(
     ideal = camera.normalised_from_pixel(pixels)
     px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     seen_by_px = np.linalg.inv(px_by_seen)
-    common = np.concatenate([_by_edges(detected, seen_by_px), _by_tag(len(detected), seen_by_px)], axis=2)
+    k, tag = len(detected), np.arange(len(detected))
+    by_edges, by_tag = np.zeros((k, 4, 2, k)), np.zeros((k, 4, 2, k, 2))  # px, by shifts of edges and of whole tags
+    by_edges[tag, :, :, tag] = corners_by_edges(detected.corners_px)
+    by_tag[tag, :, :, tag] = np.eye(2)
+    common = np.concatenate(
+        [seen_by_px @ by_edges.reshape(4 * k, 2, k), seen_by_px @ by_tag.reshape(4 * k, 2, 2 * k)], axis=2
+    )
     common_covariance = np.diag(
         np.append(detected.edge_sigma_px**2, np.full(2 * len(detected), layout.tag_sigma_px**2))
     )
@@ -334,21 +340,6 @@ def problem_of(
     return PlanarProblem(
         xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance
     )
-
-
-def _by_edges(detected: SeenTags, back: np.ndarray) -> np.ndarray:
-    """Returns the derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
-    k = len(detected)
-    jacobian = np.zeros((k, 4, 2, k))
-    jacobian[np.arange(k), :, :, np.arange(k)] = corners_by_edges(detected.corners_px)
-    return back @ jacobian.reshape(4 * k, 2, k)
-
-
-def _by_tag(k: int, back: np.ndarray) -> np.ndarray:
-    """Returns the derivative (4k, 2, 2k) of the corners by the shift of each whole tag, px."""
-    jacobian = np.zeros((k, 4, 2, k, 2))
-    jacobian[np.arange(k), :, :, np.arange(k)] = np.eye(2)
-    return back @ jacobian.reshape(4 * k, 2, 2 * k)
 
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:

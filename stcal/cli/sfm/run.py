@@ -14,10 +14,6 @@ from stcal.io.files import keep_apart
 app = typer.Typer()
 
 
-ComparedWith = Literal["paper"]
-"""Method with which a run's result is compared."""
-
-
 Solve = Literal["joint", "chain", "paper"]
 """Way in which the groups are solved."""
 
@@ -60,7 +56,7 @@ def run(
     ] = False,
     board_only: Annotated[bool, "Use only the board, even if other circles are in view: λ and residuals."] = False,
     compare: Annotated[
-        ComparedWith | None,
+        Literal["paper"] | None,
         "Solve the same photographs as published too (paper), and show what each later step improves.",
     ] = None,
     exclude: shared.Exclude = None,

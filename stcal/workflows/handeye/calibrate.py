@@ -118,7 +118,8 @@ def calibrate_handeye(
         given, options, offset = at_offset(given, setup, options)
     validation = Splits(repeats, held_out, seed, workers, motions)
     told = progress or (lambda *_: None)
-    return with_offset(calibrate(given, setup, method, options, validation, told, time_offset), offset)
+    outcome = calibrate(given, setup, method, options, validation, told, time_offset)
+    return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
 def _of_no_covariance(given: HandEyeInput, result: HandEye) -> tuple[str, ...]:
@@ -324,13 +325,6 @@ def at_offset(
         understood=(*given.understood, *notes),
     )
     return given, replace(options, symmetries=()), offset
-
-
-def with_offset(outcome: Outcome, offset: TimeOffset | None) -> Outcome:
-    """Returns the outcome with the offset in the report, and its σ in those of the transforms."""
-    if offset is None:
-        return outcome
-    return replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
 @one_thread()
