@@ -26,10 +26,6 @@ if TYPE_CHECKING:
     from stcal.workflows.handeye.robot_at_images import Timing
 
 
-SetupName = Literal["eye-in-hand", "eye-to-hand"]
-"""Name of the setup, by the carrier of the camera."""
-
-
 @dataclass(frozen=True, slots=True)
 class PoseFiles:
     """Options of the files with the poses, or photographs, and of what these do not state."""
@@ -52,7 +48,7 @@ class PoseFiles:
         "circles, tags, or several boards.",
     ] = None
     setup: Annotated[
-        SetupName | None,
+        Literal["eye-in-hand", "eye-to-hand"] | None,
         "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file "
         "decides; if it does not say, eye-in-hand.",
     ] = None
@@ -81,10 +77,6 @@ class PoseFiles:
         from stcal.handeye.data.formats.record import Said
 
         return Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
-
-    def is_folder(self) -> bool:
-        """Returns whether the poses are found in photographs of a folder."""
-        return self.source is not None and self.source.is_dir()
 
     def pairs(self, timing: "Timing") -> "Source":
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
@@ -132,10 +124,6 @@ class PoseFiles:
 POSE_FILES = PoseFiles()
 SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
-
-
-CameraFrameName = Literal["optical", "link"]
-"""Name of one of ROS's two frames of a camera."""
 
 
 def handeye(
@@ -215,7 +203,7 @@ def handeye(
     parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
     child: Annotated[str, "Name the camera like this in ROS and URDF."] = "",
     camera_frame: Annotated[
-        CameraFrameName,
+        Literal["optical", "link"],
         "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical frame "
         "below it.",
     ] = "optical",
@@ -251,7 +239,7 @@ def handeye(
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     timing = Timing(time_tolerance, image_times, time_offset)
-    pairs, folder = files.pairs(timing), files.is_folder()
+    pairs, folder = files.pairs(timing), files.source is not None and files.source.is_dir()
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None

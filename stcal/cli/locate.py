@@ -19,10 +19,6 @@ app = typer.Typer(
 NOTHING_ACCEPTED = 3
 
 
-MethodName = Literal["joint", "patent"]
-"""Name of the method that finds and judges the pose."""
-
-
 @app.command()
 def schedule(
     shortest: Annotated[float, "Start with this exposure time, in any unit.", Arg()],
@@ -117,7 +113,8 @@ def run(
     camera: shared.CameraFile,
     out: Annotated[Path | None, "Write the accepted poses to this file (CSV).", WRITES] = None,
     method: Annotated[
-        MethodName, "Use joint, all exposures together, or patent, each exposure separately as published."
+        Literal["joint", "patent"],
+        "Use joint, all exposures together, or patent, each exposure separately as published.",
     ] = "joint",
     hand_eye: Annotated[
         Path | None, "Add poses in the robot's base, using this result of `stcal handeye` (JSON)."

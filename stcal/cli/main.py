@@ -69,12 +69,8 @@ def _version(
 
 
 def environment() -> dict[str, str]:
-    """Returns the versions by name, as loaded. A library that is missing or does not load is reported as such.
-
-    Returns
-    -------
-    versions : stcal, Python, system, the libraries, and the native COLMAP on the PATH
-    """
+    """Returns versions by name: stcal, Python, system, libraries or that one is missing, the native COLMAP on the
+    PATH."""
     version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
     return version_of | {name: _library(module) for name, module in LIBRARIES.items()} | {"native colmap": _native()}
 

@@ -169,12 +169,8 @@ Scheduler = Annotated[
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
 
 
-QuaternionOrder = Literal["wxyz", "xyzw"]
-"""Order of the four columns of a quaternion."""
-
-
 Quaternions = Annotated[
-    QuaternionOrder,
+    Literal["wxyz", "xyzw"],
     "Read quaternions by the names of their columns (wxyz), or take the columns in their order as x, y, z, w (xyzw).",
 ]
 Rotation = Annotated[
@@ -213,8 +209,7 @@ class Joined:
     def table(
         self, given: Path | None, what: str, prefixes: tuple[str, str] = ("", ""), quaternions: "Order" = "wxyz"
     ) -> "Path | Table":
-        """Returns the file given as argument, or the table of --a and --b joined. Notes on rows left out are
-        printed."""
+        """Returns the file given, or the table of --a and --b joined, printing notes on rows left out."""
         seconds = [self.second] if self.second else []
         tables = several_tables(given, self.first, seconds, self.key, what, prefixes, quaternions)
         return tables[0] if isinstance(tables, list) else tables
@@ -232,10 +227,7 @@ def several_tables(
     prefixes: tuple[str, str] = ("", ""),
     quaternions: "Order" = "wxyz",
 ) -> "Path | Table | list[Table]":
-    """Returns the file given as argument, or a table for each --b joined with --a.
-
-    Notes on rows left out are printed.
-    """
+    """Returns the file given, or a table for each --b joined with --a, printing notes on rows left out."""
     if (given is None) == (first is None) or (first is None) != (not seconds):
         raise InputError("E-OPTION-FILES", f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
@@ -353,10 +345,8 @@ def protect_outputs(application: typer.Typer) -> None:
 
 
 def _grouped(command: Callable) -> Callable:
-    """Returns the command with the options of each group, a dataclass, as parameters of its own in the group's place.
-
-    A group's default may be an instance, whose values are the defaults; otherwise its fields have defaults.
-    """
+    """Returns the command with the options of each group, a dataclass, as parameters. An instance as a group's default
+    has their defaults."""
     signature = inspect.signature(command, eval_str=True)
     groups: dict[str, type] = {
         name: each.annotation
@@ -481,13 +471,8 @@ def input_notes() -> Iterator[None]:
 def designs_told(
     target: Path | None, board: Path | None, with_target: bool = True, with_board: bool = True
 ) -> Iterator[None]:
-    """Prints which reference designs are assumed, and which faces of the target's file are nearly alike.
-
-    Errors within the context name the assumed designs.
-
-    ``target``, ``board`` : files that were given; ``with_target``, ``with_board`` : whether the reference design
-    replaces a file that was not given.
-    """
+    """Prints which reference designs are assumed (unless switched off), and which faces are nearly alike; errors within
+    the context name the designs."""
     from stcal.boards.target import body_of
     from stcal.sfm.detect.sightings import likeness_notes
 

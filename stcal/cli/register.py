@@ -9,10 +9,6 @@ from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
-ModelName = Literal["rigid", "similarity", "affine"]
-"""Model of the transform."""
-
-
 Method = Literal["robust", "least-squares", "liu2017"]
 """Method of the fit."""
 
@@ -21,7 +17,7 @@ def register(
     pairs_file: Annotated[
         Path | None, "Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV).", Arg("PAIRS")
     ] = None,
-    model: Annotated[ModelName, "Fit a transform of this kind."] = "rigid",
+    model: Annotated[Literal["rigid", "similarity", "affine"], "Fit a transform of this kind."] = "rigid",
     method: Annotated[Method, "Fit with this method; liu2017 is the published one, always affine."] = "robust",
     threshold: Annotated[
         float | None,

@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 XML = (".urdf", ".xml")
 
 
-ConventionName = Literal["standard", "modified"]
-"""Convention of Denavit–Hartenberg rows."""
-
-
 def convert(
     source: Annotated[
         Path,
@@ -37,7 +33,9 @@ def convert(
         "End at this link of a URDF; if not given, at the only possible one. Repeat it for the hands of several arms "
         "on a trunk.",
     ] = None,
-    convention: Annotated[ConventionName, "Write Denavit-Hartenberg rows in this convention."] = "standard",
+    convention: Annotated[
+        Literal["standard", "modified"], "Write Denavit-Hartenberg rows in this convention."
+    ] = "standard",
     nominal: Annotated[
         Path | None, "Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
     ] = None,
@@ -182,10 +180,6 @@ def _length(text: str, data: "Measurements") -> float | None:
         raise InputError("E-OPTION-VALUE", f"--orientations {text}: a length in mm, auto or off needed") from error
 
 
-Kind = Literal["pose", "position", "distance"]
-"""Quantity that is used of the measurements."""
-
-
 Model = Literal["rigid", "elastic", "auto"]
 """Model of the arm."""
 
@@ -200,7 +194,8 @@ def identify(
         Path | None, "Write mastering offsets and differences of D-H values to this file (CSV).", WRITES
     ] = None,
     observe: Annotated[
-        Kind | None, "Use this part of the measurements; if not given, everything that was measured."
+        Literal["pose", "position", "distance"] | None,
+        "Use this part of the measurements; if not given, everything that was measured.",
     ] = None,
     sigma_mm: Annotated[
         float | None, "Set σ of a measured position, mm per axis; estimated if not given.", Opt(min=1e-9, max=1e4)
@@ -265,10 +260,6 @@ def identify(
     write_if(report, document.page)
 
 
-RefitParts = Literal["none", "base", "tool", "base-tool"]
-"""Transforms that are fitted again to the new measurements."""
-
-
 def evaluate(
     robot_files: Annotated[
         list[Path], "Read a robot from this file (TOML); repeat it for more robots.", Opt("--robot")
@@ -277,7 +268,8 @@ def evaluate(
         Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
     ] = None,
     refit: Annotated[
-        RefitParts, "Fit this to the data, keeping each robot's own axes; everything else comes from its file."
+        Literal["none", "base", "tool", "base-tool"],
+        "Fit this to the data, keeping each robot's own axes; everything else comes from its file.",
     ] = "base-tool",
     out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
     quaternions: shared.Quaternions = "wxyz",
@@ -385,16 +377,12 @@ def compensate(
         )
 
 
-ObservedKind = Literal["pose", "position"]
-"""Quantity that the instrument measures."""
-
-
 def design(
     robot_file: shared.RobotFile,
     count: Annotated[int, "Choose this many poses.", Opt(min=1, max=2000)] = 40,
     seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
-    observe: Annotated[ObservedKind, "Plan for an instrument that measures this."] = "position",
+    observe: Annotated[Literal["pose", "position"], "Plan for an instrument that measures this."] = "position",
     candidates: Annotated[int, "Choose from this many random poses.", Opt(min=2, max=100_000)] = 1000,
     sigma_mm: Annotated[float, "Assume this σ of measured positions, mm per axis."] = 0.05,
     sigma_rad: Annotated[float, "Assume this σ of measured orientations, rad per axis."] = 2e-4,

@@ -68,10 +68,8 @@ def verbose() -> bool:
 
 
 class StageProgress:
-    """Progress of the stages of a command, as a context manager and callable (stage, done, total).
-
-    It shows a bar on a terminal, else plain lines, with the remaining time. It shows nothing if the command is quiet.
-    """
+    """Progress of a command's stages, called with (stage, done, total): a bar on a terminal, else plain lines, or
+    quiet."""
 
     def __init__(self):
         self.bar = None
@@ -122,10 +120,7 @@ def time_left(taken_s: float, done: int, total: int) -> str:
 
 
 def printable(text: str) -> str:
-    """Returns the text without characters that a terminal would execute.
-
-    A space replaces white space other than a line's end, a question mark each character that cannot be printed.
-    """
+    """Returns the text with white space as a space, and other unprintable characters as question marks."""
     return "".join(c if c.isprintable() or c == "\n" else _instead(c) for c in text)
 
 
@@ -137,15 +132,14 @@ def _instead(character: str) -> str:
 
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
     """Prints the values, unless the command is quiet. Names from files may contain any characters."""
-    if not _quiet.get():
-        print(_coloured(printable(sep.join(map(str, values)))) + end, end="")  # at once: threads may say something too
-
-
-def _coloured(text: str) -> str:
-    """Colours the words of verdicts if standard output is a terminal and `NO_COLOR` (no-color.org) is not set."""
-    if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
-        return text
-    return VERDICTS.sub(lambda match: f"{match['before']}\x1b[{COLOURS[match['word']]}m{match['word']}\x1b[0m", text)
+    if _quiet.get():
+        return
+    text = printable(sep.join(map(str, values)))
+    if sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":  # no-color.org
+        text = VERDICTS.sub(
+            lambda match: f"{match['before']}\x1b[{COLOURS[match['word']]}m{match['word']}\x1b[0m", text
+        )
+    print(text + end, end="")  # at once: threads may say something too
 
 
 @contextmanager

@@ -158,10 +158,7 @@ def _solved(
 def _with_sigma(
     result: HandEye, pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions
 ) -> HandEye:
-    """Returns the result of a closed form with covariances, or any other as it is.
-
-    Raises StcalError: the closed form fails without one of the poses.
-    """
+    """Returns the result of a closed form with covariances by the jackknife, or any other as it is."""
     if result.covariance is not None:
         return result
     solution = solved(pairs, setup, result.method, views, options)
@@ -170,10 +167,8 @@ def _with_sigma(
 
 
 def _shown(result: HandEye, options: HandEyeOptions, views: Views | None, share: float = 1.0) -> bool:
-    """True if the board's size and the intrinsics differ from their files by more than chance, where solved for.
-
-    ``share`` : share of the poses from which the result comes; its σ are those of all poses.
-    """
+    """True if board and intrinsics, where solved for from this ``share`` of the poses, differ from their files beyond
+    chance."""
     tests = []
     if options.with_scale and result.sigma_scale:
         tests.append((((result.scale - 1) / result.sigma_scale) ** 2, 1))
@@ -194,11 +189,8 @@ class _Trial:
     rows: np.ndarray
 
     def best(self, split: int | None = None) -> Candidate:
-        """Returns the first candidate that is not behind the best by more than chance, by all poses except those of the
-        ``split``.
-
-        Candidates that solve for what these poses do not show are left out.
-        """
+        """Returns the first candidate that is not behind the best by more than chance, without the poses of the
+        ``split``; none that solves for what these poses do not show."""
         rows = self.rows if split is None else np.where(np.isin(self.rows, self.rows[split]), -1, self.rows)
         if (rows < 0).all():  # a single split: no other poses were held out
             rows = self.rows
@@ -229,10 +221,8 @@ class _Trial:
 
 
 def _difference(off: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
-    """Returns the mean over poses of the differences ``off``, (s, k), and its standard error.
-
-    ``rows`` : (s, k) numbers of the poses; entries below 0 are ignored.
-    """
+    """Returns the mean over poses of differences ``off`` (s, k), and its standard error; ``rows`` (s, k) below 0 are
+    ignored."""
     valid = rows >= 0
     poses = np.unique(rows[valid])
     means = np.array([off[valid & (rows == pose)].mean() for pose in poses])
@@ -252,27 +242,15 @@ def choose(
 ) -> Choice:
     """Solves with camera and board as filed and with either as unknown, by poses, by corners and in closed form.
 
-    A candidate with unknown board or camera takes part where they differ from their files by more than chance. The
-    errors on held-out poses decide: the 3-D error at the board if there are corners, else that of the board's
-    origin. Solutions without some poses are one step from the solution of all.
+    A candidate with unknown board or camera takes part where they differ from their files by more than chance.
+    :func:`~stcal.handeye.validate.deciding_error` on held-out poses decides. Solutions without some poses are one step
+    from the solution of all.
 
-    Parameters
-    ----------
-    pairs, setup, views, options : see :func:`~stcal.handeye.handeye`; the scale and the intrinsics of ``options`` are
-        overwritten
-    prior : prior of the intrinsics; they are never solved for if None
-    rows : (s, k) poses to hold out in each split
-    workers : number of processes; as many as cores if None
-    progress : called with the number of solutions done, and the number of all solutions of the stage
+    ``options`` : its scale and intrinsics are overwritten; ``prior`` : of the intrinsics; they are never solved for if
+    None; ``rows`` : (s, k) poses to hold out in each split; ``progress`` : called with the number of solutions done,
+    and of all.
 
-    Returns
-    -------
-    Choice
-
-    Raises
-    ------
-    StcalError
-        The first candidate, which trusts all files, fails; see :func:`~stcal.handeye.handeye`.
+    Raises StcalError: the first candidate, which trusts all files, fails.
     """
     if options.symmetries:
         repaired = repair(pairs, setup, options.symmetries, views)

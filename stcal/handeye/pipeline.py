@@ -24,11 +24,8 @@ from stcal.parallel import one_thread
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validated:
-    """A result with its errors on poses held out.
-
-    ``held_out`` : errors, None if too few poses would be left; ``options`` : those of the way of solving that was
-    used; ``choice`` : all ways that were tried, if the user named none; ``notes`` : why errors are missing.
-    """
+    """A result with its errors on held-out poses. ``held_out`` : None if too few would be left; ``options`` : as used;
+    ``choice`` : the ways that were tried, if none was named; ``notes`` : why errors are missing."""
 
     result: HandEye
     held_out: HeldOutPoses | None
@@ -51,13 +48,8 @@ def validated(
 ) -> Validated:
     """Returns the result of a method, or of the way that predicts best, with σ that hold for poses held out.
 
-    ``prior`` : prior of the intrinsics, where they may be solved for; ``rows`` : (s, k) poses to hold out in each
-    split, none if s is 0; ``choosing`` : whether to choose among all ways of solving
-
-    Raises
-    ------
-    StcalError
-        As :func:`stcal.handeye.handeye`.
+    ``prior`` : of intrinsics that may be solved for; ``rows`` : (s, k) poses to hold out; ``choosing`` : among all
+    ways. Raises StcalError: as :func:`stcal.handeye.handeye`.
     """
     notes: tuple[str, ...] = ()
     if choosing and len(rows):

@@ -106,11 +106,8 @@ class HandEyeOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """Input of one call.
-
-    ``pairs``, ``views`` : after repair of the numbering; ``guess`` : function of a loop and ``with_scale`` that returns
-    the first X, Z and scale; ``seen`` : observability; ``notes`` : notes so far.
-    """
+    """Input of one call. ``pairs``, ``views`` : after repair of the numbering; ``guess`` : returns first X, Z and scale
+    of a loop and ``with_scale``; ``seen`` : observability; ``notes`` : notes so far."""
 
     pairs: HandEyePoses
     loop: Loop
@@ -144,20 +141,9 @@ def handeye(
     views: Views | None = None,
     options: HandEyeOptions | None = None,
 ) -> HandEye:
-    """Returns the result of one method, with σ estimated from its own residuals.
-
-    The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method if none is named, and widens σ
-    by the errors on held-out poses; here the method is ``reprojection`` with views, else ``pose``, if None.
-
-    Raises
-    ------
-    InputError
-        The method or setup is unknown, ``reprojection`` has no views, or the poses follow another convention.
-    DegenerateError
-        The poses do not determine the answer; the message says which motion is missing.
-    ConvergenceError
-        The method fails on these poses.
-    """
+    """Returns the result of one method, with σ estimated from its own residuals; ``reprojection`` with views, else
+    ``pose``, if None. Parameters and errors as for :func:`stcal.handeye.handeye`, which chooses a method and widens
+    σ."""
     return solved(pairs, setup, method, views, options).result
 
 
@@ -202,13 +188,8 @@ class Solved:
     solution: PoseSolution | Adjusted | None = None
 
     def without(self, out: np.ndarray) -> HandEye:
-        """Returns the result without the poses ``out``, (k,) rows: X, Z, scale, camera and board. All else, σ and
-        outliers among them, is that of all poses.
-
-        Adjustments move from the solution of all poses by its equations; other methods are solved again.
-
-        Raises StcalError: the method fails without these poses.
-        """
+        """Returns X, Z, scale, camera and board without the poses ``out``, (k,) rows; σ, outliers and all else as of
+        all poses. Adjustments take one step; other methods are solved again. Raises StcalError: they fail."""
         task, solution = self.task, self.solution
         if solution is None:
             again = _by_equations(task.only(np.setdiff1d(np.arange(len(task.loop)), out)), self.result.method)
@@ -398,10 +379,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
 
 
 def _of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
-    """Returns notes on a camera file that the corners contradict.
-
-    ``camera_gain`` : gain of other intrinsics; ``sigma`` : holds the factors by which the file's σ were widened.
-    """
+    """Returns notes on a camera file that corners contradict; ``sigma`` : has factors of its widened σ."""
     notes: tuple[str, ...] = ()
     if camera_gain > CAMERA_GAIN:
         notes += (
@@ -415,10 +393,8 @@ def _of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, .
 
 
 def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, tuple[str, ...]]:
-    """Solves with the robot's stated σ, or with estimated σ and a note if the poses contradict the stated σ.
-
-    A robot that is held too tightly does not show in its own residuals: its errors appear in camera and board instead.
-    """
+    """Solves with the robot's stated σ, or estimated ones and a note if poses contradict them: errors of a robot held
+    too tightly appear in camera and board instead."""
     noise, loop = task.options.noise, task.loop
     solution, stated = solved(loop, noise), loop.robot_covariance
     if stated is not None:
@@ -445,10 +421,7 @@ def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, 
 def _contradicted(
     stated: tuple[float, ...], found: tuple[float, ...], given: dict[str, float], free: dict[str, float], poses: int
 ) -> bool:
-    """True if the robot errs by more than is stated.
-
-    Its estimated σ are larger, or, if it is stated as exact, corners or board poses fit worse with an exact robot.
-    """
+    """True if the robot's estimated σ exceed the stated, or corners or board poses fit worse with an exact robot."""
     dof = max(3 * (poses - LEAST_WITH_SCALE), 3)
     limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
     if all(stated):

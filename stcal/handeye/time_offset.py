@@ -42,16 +42,11 @@ UNKNOWNS = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeOffset:
-    """Lead of the robot's clock over the camera's.
+    """Lead of the robot's clock over the camera's: an image stamped t was taken when it showed t + ``seconds``.
 
-    Parameters
-    ----------
-    seconds : robot's clock minus camera's: an image stamped t was taken when the robot's clock showed t + ``seconds``
-    sigma_s : σ of the offset, from an adjustment of X, Z and the offset
-    slope : (12,) change of X and Z, (rotation rad, translation mm) of each, per second of offset
-    kept : (m,) poses whose time, corrected by the offset, lies within the stream
-    base_from_flange : the robot's poses at the corrected times of the poses kept, mm
-    speed_rad_s, speed_mm_s : RMS speed of the flange at the images
+    ``sigma_s`` : σ of ``seconds``; ``slope`` : (12,) change of X and Z per second of offset (rad, mm); ``kept`` : (m,)
+    poses whose corrected time lies within the stream; ``base_from_flange`` : poses then, mm; ``speed_rad_s``,
+    ``speed_mm_s`` : RMS speed of the flange.
     """
 
     seconds: float
@@ -94,27 +89,11 @@ def estimate_offset(
 ) -> TimeOffset:
     """Estimates offset, X and Z by least squares of the loop's residuals, with σ estimated as by method ``pose``.
 
-    Parameters
-    ----------
-    pairs : the m pairs; only their poses of the board are used
-    stream : the robot's poses over time by its clock
-    seconds : (m,) times of the pairs after the stream's origin, by the camera's clock, s
-    setup : {"eye-in-hand", "eye-to-hand"}: what carries the camera
-    noise : known σ of the errors
-    with_scale : True if the board's size is an unknown
+    ``pairs`` : only their poses of the board are used; ``seconds`` : (m,) times of the pairs after the stream's origin,
+    by the camera's clock; ``noise`` : known σ; ``with_scale`` : whether the board's size is an unknown.
 
-    Returns
-    -------
-    TimeOffset
-
-    Raises
-    ------
-    InputError
-        There are too few poses, or too few of them lie within the stream.
-    DegenerateError
-        The flange stands still at the images, or its motions do not determine the offset.
-    ConvergenceError
-        The offset does not converge.
+    Raises InputError: too few poses, or too few within the stream. Raises DegenerateError: the flange stands still at
+    the images, or its motions leave the offset open. Raises ConvergenceError: the offset does not converge.
     """
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:

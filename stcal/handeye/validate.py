@@ -209,10 +209,8 @@ def _without(pairs: HandEyePoses, out: np.ndarray, error: DegenerateError) -> De
 
 
 def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, out: np.ndarray) -> None:
-    """Checks that the poses besides ``out``, (k,), determine the answer.
-
-    Raises DegenerateError: they do not. The message names the poses that were held out.
-    """
+    """Raises DegenerateError if the poses besides ``out``, (k,), which the message names, do not determine the
+    answer."""
     remaining = np.setdiff1d(np.arange(len(pairs)), out)
     try:
         check(Loop.of(pairs[remaining], setup), setup, pairs.where, options.four_dof)
@@ -221,8 +219,7 @@ def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEye
 
 
 def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
-    """Returns the errors (k,), mm, by which ways of solving are chosen: ``board_mm`` of :class:`HeldOutPoses`, or
-    ``translation_mm`` without views."""
+    """Returns errors (k,), mm, that choose among solutions: ``board_mm``, or ``translation_mm`` without views."""
     loop, scale = Loop.of(pairs, result.setup), result.scale
     if views is None:
         residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
@@ -277,18 +274,8 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
 
 @one_thread()
 def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, rows: np.ndarray) -> str:
-    """Returns a note if method ``pose`` predicts held-out poses far better in the other setup, else an empty string.
-
-    Parameters
-    ----------
-    pairs, setup, options : see :func:`~stcal.handeye.handeye`
-    rows : (s, k) poses to hold out
-
-    Returns
-    -------
-    str
-        The note, with the errors in both setups, or an empty string.
-    """
+    """Returns a note with both errors if method ``pose`` predicts held-out poses ``rows`` (s, k) far better in the
+    other setup, else ""."""
     opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     plain = replace(options, intrinsics=None, symmetries=())
     rows = rows[:SETUP_SPLITS]
@@ -377,11 +364,8 @@ def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
 
 
 def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
-    """Returns a result with covariances by the delete-one jackknife (Quenouille 1956, Tukey 1958).
-
-    ``without_one`` : results without each of the m poses. Their scatter is (m − 1)⁻² of what solutions of independent
-    samples would have.
-    """
+    """Returns a result with covariances by the delete-one jackknife (Quenouille 1956, Tukey 1958): solutions without
+    each of m poses scatter (m − 1)⁻² as much as independent ones."""
     m, covariances = len(without_one), {}
     for key, moved in _differences(without_one, result).items():
         moved = moved - moved.mean(0)
@@ -401,10 +385,7 @@ def _differences(others: list[HandEye], result: HandEye) -> dict[str, np.ndarray
 
 
 def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, options: HandEyeOptions) -> HandEye:
-    """Returns a result with covariances that contain the errors that the board's poses have in common, if any.
-
-    These are what a solution moves by if the poses err by one σ of each.
-    """
+    """Returns a result with covariances that contain what one σ of each common error of the board's poses moves it."""
     common, seen = pairs.camera_from_board_common, pairs.camera_from_board
     if common is None:
         return result
@@ -428,22 +409,13 @@ scatters as much if the poses err as assumed."""
 
 
 def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
-    """Returns how much solutions without some poses scatter about the solution of all, relative to what its σ predict.
+    """Returns how much solutions without some poses scatter about that of all, relative to its σ, RMS over splits and
+    six parameters: 1 is expected; NaN without covariance or solutions.
 
     If k of m poses with independent errors are held out, the difference has the covariance C k / (m − k), where C is
-    the covariance of the solution (the delete-k jackknife of Shao & Wu, Ann. Statist. 17, 1989). It is a little larger
-    if few poses are left, because their information varies (the mean of an inverse Wishart matrix exceeds the inverse
-    of the mean). Errors that are correlated, or not equally large in all poses, make the scatter larger.
-
-    Parameters
-    ----------
-    result : solution from all poses
-    held_out : cross-validation of the same poses, with ``mount_from_camera``
-
-    Returns
-    -------
-    float
-        RMS over splits and the six parameters. 1 is expected; NaN if the covariance or the solutions are missing.
+    that of the solution (the delete-k jackknife of Shao & Wu, Ann. Statist. 17, 1989); a little more if few poses are
+    left, as their information varies (the mean of an inverse Wishart matrix exceeds the inverse of the mean). Errors
+    that are correlated, or differ in size, make it larger.
     """
     if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
         return float("nan")

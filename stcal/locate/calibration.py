@@ -121,13 +121,8 @@ class _Group:
 
 
 def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
-    """Minimises Huber's loss over 6m + 8n unknowns; the poses are eliminated image by image.
-
-    The board is the datum and exact. A factor on the σ of the board's measured points, and additional σ of the tags'
-    corners, are estimated from residuals and redundancy (variance components: Förstner 1979).
-
-    Raises ConvergenceError: the iteration does not converge.
-    """
+    """Minimises Huber's loss over 6m + 8n unknowns, poses eliminated; the board is the datum and exact. Variance
+    components (Förstner 1979) give a factor on its points' σ, and additional σ of tags. Raises ConvergenceError."""
     corners = start.reshape(-1, 2).copy()
     poses = Poses.of([image.pose for image in images])
     noise = _first_noise(images, poses, corners)
@@ -206,11 +201,8 @@ def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linear:
-    """Problem linearised about a state.
-
-    ``cost`` : Huber's loss; ``blocks`` : residuals of board and tags by image; ``normal``, ``right`` : (8n, 8n), (8n,)
-    normal equations of the corners after elimination of the ``poses``.
-    """
+    """``cost`` : Huber's; ``blocks`` : board and tags by image; ``normal``, ``right`` : (8n, 8n), (8n,) without the
+    ``poses``."""
 
     cost: float
     blocks: list[tuple[_Group, _Group]]
@@ -410,22 +402,18 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
     pixels = found.corners_px[own].reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
     board_px2 = np.tile(np.eye(2), (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
+    seen_from_px = np.linalg.inv(camera.distort_jacobian(board_seen)[1] * camera.focal[:, None])
     return ImageCorners(
         name,
         pose,
         view.xyz_board,
         board_seen,
-        _normalised(board_px2, board_seen, camera),
+        seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2),
         np.array([rows[found.tags[k]] for k in own]),
         ideal,
         _tag_covariances(found, own),
         float(camera.focal.mean()),
     )
-
-
-def _normalised(covariance_px2: np.ndarray, ideal: np.ndarray, camera: Camera) -> np.ndarray:
-    normalised_from_px = np.linalg.inv(camera.distort_jacobian(ideal)[1] * camera.focal[:, None])
-    return normalised_from_px @ covariance_px2 @ np.swapaxes(normalised_from_px, 1, 2)
 
 
 def _tag_covariances(found: Tags, own: list[int]) -> np.ndarray:
@@ -442,10 +430,8 @@ def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
 
 
 def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -> list[ImageCorners]:
-    """Chooses in each image the numbering of a symmetric board that places the tags where the others have them.
-
-    The image with most tags comes first, then each time the one that shares most tags with those before.
-    """
+    """Chooses in each image the numbering of a symmetric board that places tags as elsewhere, those with most in common
+    first."""
     turned, place_of_tag, left = list(images), {}, list(range(len(images)))
     while left:
         i = max(left, key=lambda i: (sum(row in place_of_tag for row in images[i].rows), len(images[i].rows), -i))
@@ -513,11 +499,8 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
 
 
 def _by_board_corners(corners: np.ndarray, origin: int, turn: np.ndarray) -> np.ndarray:
-    """Returns the derivative (8n, 8n) of all corners' coordinates in {obj} by their coordinates on the board.
-
-    The derivative is of first order. The rotation of {obj} changes by the mean of the small rotations of the origin
-    tag's corners about its middle.
-    """
+    """Returns the derivative (8n, 8n), first order, of corners in {obj} by those on the board; {obj} turns by the mean
+    small rotation of the origin tag's corners."""
     n = corners.size // 2
     rows = slice(4 * origin, 4 * origin + 4)
     flat = corners.reshape(-1, 2)

@@ -141,8 +141,7 @@ class GoalChain(Brief):
 def _mounted(
     hand_eye: HandEyeResult | Rigid | str | Path, robot_poses: Mapping[str, Rigid] | str | Path | None
 ) -> tuple[str, UncertainRigid]:
-    """Returns the name of the camera's pose, and the pose. For a transform without a name, the presence of robot poses
-    decides."""
+    """Returns name and pose of the camera; robot poses decide which name an unnamed transform has."""
     if isinstance(hand_eye, Rigid):
         return FIXED if robot_poses is None else MOVING, UncertainRigid.exact(hand_eye)
     if isinstance(hand_eye, str | Path):
@@ -164,10 +163,8 @@ def _mounted(
 def read_registered(
     registration: RegistrationResult | str | Path, offset: Rigid | str | Path | None = None
 ) -> GoalChain:
-    """Reads the result of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
-
-    Raises InputError: a file does not follow ``data_layout.md``, or the registration is not rigid.
-    """
+    """Reads the result of ``stcal register`` of a fixed camera (a) and the robot's base (b); raises InputError: not
+    rigid, or a file not as in ``data_layout.md``."""
     if isinstance(registration, str | Path):
         advice = "give the file of stcal register --out"
         read = read_result(registration, RegistrationRead, "registration file", advice)
@@ -196,10 +193,7 @@ def _offset(offset: Rigid | str | Path | None) -> Rigid:
 
 
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "scene") -> dict[str, UncertainRigid]:
-    """Reads base_from_flange of each scene from the columns ``x_mm … qz``, or ``base_from_flange_x_mm …``.
-
-    Column ``key`` names the scenes.
-    """
+    """Reads base_from_flange of each scene, column ``key``, from ``x_mm … qz`` or ``base_from_flange_x_mm …``."""
     table = read_table(path, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
@@ -228,13 +222,9 @@ UNITS = ("m", "in")
 
 
 def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str, ...]:
-    """Returns notes on doubtful robot poses or hand-eye transforms, judged by camera_from_obj of the scenes.
-
-    A target that stands still while the flange turns reveals the convention. A single scene, a flange that stands still
-    too, or a target that moves reveal nothing.
-
-    Raises InputError: the target would stand still in another unit or convention only; the message says which.
-    """
+    """Returns notes on doubtful robot poses or hand-eye transforms by camera_from_obj of scenes: a target that stands
+    still while the flange turns reveals the convention. Raises InputError: it stands still in another unit or
+    convention only."""
     scenes = [scene for scene in seen if scene in chain.flange]
     if chain.moving and len(scenes) > 1:
         flange = Poses.of([chain.flange[scene].rigid for scene in scenes])

@@ -77,11 +77,8 @@ class PlanarProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedCorners:
-    """Residuals of h poses.
-
-    ``residual`` : (h, n, 2) measured minus projected; ``by_pose`` : (h, n, 2, 6) and ``by_corner`` : (h, n, 2, 2) its
-    negative derivatives; ``before`` : (h,) whether all corners are in front of the camera.
-    """
+    """``residual`` : (h, n, 2) of h poses, measured minus projected; ``by_pose`` : (h, n, 2, 6), ``by_corner`` : (h, n,
+    2, 2) negative derivatives; ``before`` : (h,) all corners in front of the camera."""
 
     poses: Poses | PoseStack
     residual: np.ndarray
@@ -128,11 +125,7 @@ def _descend(problem: PlanarProblem, whiten: np.ndarray, poses: PoseStack, huber
 
 
 def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Weighed:
-    """Estimates a pose with the full covariance of its corners.
-
-    The covariance is the sum of image noise (divided by Huber's ``weights`` (n,)), shared errors, and the layout's
-    covariance.
-    """
+    """Estimates a pose by image noise over Huber's ``weights`` (n,), shared errors, and the layout's covariance."""
     root = np.repeat(np.sqrt(weights), 2)
     noise = problem.noise / (root[:, None] * root)
     common = problem.common.reshape(2 * len(problem.xy), -1)
@@ -327,7 +320,13 @@ def problem_of(
     ideal = camera.normalised_from_pixel(pixels)
     px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     seen_by_px = np.linalg.inv(px_by_seen)
-    common = np.concatenate([_by_edges(detected, seen_by_px), _by_tag(len(detected), seen_by_px)], axis=2)
+    k, tag = len(detected), np.arange(len(detected))
+    by_edges, by_tag = np.zeros((k, 4, 2, k)), np.zeros((k, 4, 2, k, 2))  # px, by shifts of edges and of whole tags
+    by_edges[tag, :, :, tag] = corners_by_edges(detected.corners_px)
+    by_tag[tag, :, :, tag] = np.eye(2)
+    common = np.concatenate(
+        [seen_by_px @ by_edges.reshape(4 * k, 2, k), seen_by_px @ by_tag.reshape(4 * k, 2, 2 * k)], axis=2
+    )
     common_covariance = np.diag(
         np.append(detected.edge_sigma_px**2, np.full(2 * len(detected), layout.tag_sigma_px**2))
     )
@@ -341,21 +340,6 @@ def problem_of(
     return PlanarProblem(
         xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance
     )
-
-
-def _by_edges(detected: SeenTags, back: np.ndarray) -> np.ndarray:
-    """Returns the derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
-    k = len(detected)
-    jacobian = np.zeros((k, 4, 2, k))
-    jacobian[np.arange(k), :, :, np.arange(k)] = corners_by_edges(detected.corners_px)
-    return back @ jacobian.reshape(4 * k, 2, k)
-
-
-def _by_tag(k: int, back: np.ndarray) -> np.ndarray:
-    """Returns the derivative (4k, 2, 2k) of the corners by the shift of each whole tag, px."""
-    jacobian = np.zeros((k, 4, 2, k, 2))
-    jacobian[np.arange(k), :, :, np.arange(k)] = np.eye(2)
-    return back @ jacobian.reshape(4 * k, 2, 2 * k)
 
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:
@@ -436,10 +420,7 @@ PRIOR_SHARE, PRIOR_WEIGHT = 0.5, 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """Shift of the tags' middles between two exposures.
-
-    ``tags`` : number of tags in common; ``shift_px`` : median of their shifts; ``sigma_px`` : σ of one tag's shift.
-    """
+    """Of tags' middles between exposures. ``tags`` : in common; ``shift_px`` : median; ``sigma_px`` : of one tag's."""
 
     exposures: tuple[str, str]
     tags: int
@@ -466,13 +447,9 @@ class Merged:
 
 
 def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] = ()) -> Merged:
-    """Returns weighted means of the corners over the exposures, with their covariance.
-
-    Exposures of one scene share much of a corner's error: print, lens, sampling of its edges by the pixels. The shared
-    part does not average out. It is estimated by comparing the differences between exposures with their stated σ. If
-    the differences exceed these, the σ are increased. The σ due to print, lens and flatness (the layout's ``sigma_px``)
-    is common to all exposures.
-    """
+    """Returns weighted means of the corners over the exposures, with their covariance. The part of their errors that
+    exposures share (print, lens, sampling), by differences against stated σ, does not average out; larger differences
+    increase the σ."""
     rows = layout.rows()
     places = [{rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows} for tags in exposures]
     used = np.array(sorted({row for place in places for row in place}), int)
@@ -503,10 +480,8 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
 
 
 def _stacked(exposures, places, used: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns corners (e, n, 4, 2), covariances of each and of a tag's four, and σ of the edges' common shift, (e, n).
-
-    For tags that are not seen these are NaN, 1 px² and 0.
-    """
+    """Returns corners (e, n, 4, 2), covariances of each and of a tag's four, σ of edges' common shift (e, n); NaN, 1
+    px², 0 if unseen."""
     corners = np.full((len(exposures), len(used), 4, 2), np.nan)
     edge = np.zeros(corners.shape[:2])
     covariance = np.tile(np.eye(2), (len(exposures), len(used), 4, 1, 1))
@@ -522,10 +497,7 @@ def _stacked(exposures, places, used: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _differing_share(corners, covariance, mean, there) -> float:
-    """Returns the share of the corners' stated variance that appears as differences between exposures.
-
-    A common shift of a tag's edges is removed before.
-    """
+    """Returns the share of stated variance in differences between exposures, beside common shifts of a tag's edges."""
     difference = np.where(there[..., None, None], corners - mean, 0)
     direction = corners_by_edges(mean)
     difference -= (

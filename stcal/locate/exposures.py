@@ -195,10 +195,7 @@ class CaptureFile(ResultFile):
 
 
 def scene_folder(out: Path, scene: str) -> Path:
-    """Returns the path of a new folder for a scene.
-
-    Raises InputError: the name is invalid, or the scene exists.
-    """
+    """Returns a scene's new folder; raises InputError: the name is invalid, or the scene exists."""
     if not re.fullmatch(r"[\w][\w .-]{0,99}", scene):
         raise InputError(
             "E-DEVICE-NAME", f"scene {scene!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"

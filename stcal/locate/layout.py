@@ -170,7 +170,10 @@ def load_layout(path: str | Path) -> TargetLayout:
     corners, stated = plan.corners_mm, data.covariance()
     if stated is None:
         corners = _in_obj(corners, plan.origin)
-    covariance = data.sigma_mm**2 * np.eye(corners.size) if stated is None else _without_rounding(stated)
+        covariance = data.sigma_mm**2 * np.eye(corners.size)
+    else:  # without the negative eigenvalues that rounding makes of zeros
+        value, vector = np.linalg.eigh(stated)
+        covariance = (vector * np.maximum(value, 0)) @ vector.T
     sigmas_px = data.sigma_px, data.tag_sigma_px
     return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, *sigmas_px, data.unusual_size)
 
@@ -182,7 +185,7 @@ def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
     lines += [f"sigma_px = {layout.sigma_px:.6g}", f"tag_sigma_px = {layout.tag_sigma_px:.6g}"]
     lines += stated_unusual(side("", float(np.linalg.norm(c[1] - c[0]))) for c in layout.corners_mm)
     lines.append("# Lower triangle; coordinates tag by tag, corner by corner, x before y.")
-    rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(_finite(layout.covariance_mm2)))
+    rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(layout.covariance_mm2 + 0.0))  # no -0.0
     lines += ["covariance_mm2 = [", *(f"  [{row}]," for row in rows), "]"]
     for (dictionary, tag), corners, sigma in zip(layout.tags, layout.corners_mm, layout.sigma_mm(), strict=True):
         places = ", ".join(f"[{x:.6f}, {y:.6f}]" for x, y in corners.tolist())
@@ -203,10 +206,8 @@ def square(size_mm: float) -> np.ndarray:
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rotation (2, 2) and translation (2,) into the frame in the middle of a tag with ``corners`` (4, 2).
-
-    The fit is a least-squares fit of a square to the corners; the size of the square does not matter.
-    """
+    """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square of any size to its
+    corners."""
     nominal = square(1.0)
     middle = corners.mean(0)
     along = np.sum((corners - middle) * nominal)
@@ -248,13 +249,3 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
 def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
     turn, shift = obj_from_plane(corners[origin])
     return corners @ turn.T + shift
-
-
-def _without_rounding(covariance: np.ndarray) -> np.ndarray:
-    """Returns the covariance without the negative eigenvalues that rounding makes of zeros."""
-    value, vector = np.linalg.eigh(covariance)
-    return (vector * np.maximum(value, 0)) @ vector.T
-
-
-def _finite(matrix: np.ndarray) -> np.ndarray:
-    return matrix + 0.0  # turns -0.0 into 0.0

@@ -183,10 +183,8 @@ def _scene(located: Located, files: SceneFiles, layout: TargetLayout, model: Cam
 
 
 def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposure | None:
-    """Returns the exposure with most tags of the layout, or None if there is no exposure.
-
-    Among several, it is the one with the smallest σ of corners and edges; darkness and saturation increase these σ.
-    """
+    """Returns the exposure with most of the layout's tags, of these the one with least σ of corners and edges, or
+    None."""
     rows = layout.rows()
 
     def rank(exposure: Exposure) -> tuple[int, float]:

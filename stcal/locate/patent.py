@@ -61,18 +61,9 @@ class PatentOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentExposure:
-    """Result of one exposure.
-
-    Parameters
-    ----------
-    exposure : index of the exposure
-    tags : number of the layout's tags in it
-    area_px2 : area that the triangles of the tags span; None if other exposures show more tags
-    candidate : whether its poses were compared with those of other exposures
-    poses : (Rigid, Rigid) T_a and T_b, the one with the smaller error first; None if it is no candidate, or has no pose
-    errors_px : (float, float) RMS errors of both poses
-    det_j : determinant of the homography's derivative at the normalised centre, 1/mm²
-    """
+    """``tags`` : of the layout in exposure number ``exposure``; ``area_px2`` : of their triangles; None if others show
+    more; ``candidate`` : compared with others; ``poses`` : T_a, T_b by ``errors_px``, or None; ``det_j`` : of the
+    homography's derivative at the normalised centre, 1/mm²."""
 
     exposure: int
     tags: int
@@ -169,10 +160,7 @@ def locate_as_patent(
     where: str = "scene",
     solve: Callable[[np.ndarray, np.ndarray], PlanePoses] = poses_of_plane,
 ) -> PatentPose:
-    """Finds the exposure whose IPPE pose has the smallest reprojection error, and applies the gate (S5 to S9).
-
-    Raises DegenerateError: no exposure shows a tag, or no exposure gives a pose.
-    """
+    """Applies the gate (S5 to S9) to the exposure of least IPPE error; raises DegenerateError: no tag, or no pose."""
     options = options or PatentOptions()
     rows = layout.rows()
     listed = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]

@@ -114,9 +114,12 @@ class Verdict(Brief):
 def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose, Verdict]:
     """Judges a pose. Returns the pose, its covariance widened where two solutions count as one, and the verdict."""
     options = options or VerdictOptions()
-    apart_deg = _apart_deg(pose)
-    if pose.second is not None and apart_deg <= options.equal_deg:
-        pose = covering_both(pose)
+    apart_deg = 0.0
+    if pose.second is not None:
+        difference = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
+        apart_deg = float(np.degrees(np.linalg.norm(difference[:3])))
+        if apart_deg <= options.equal_deg:
+            pose = covering_both(pose)
     chi2_limit = options.sigma_margin**2 * float(chi_square.isf(options.max_p, pose.redundancy) / pose.redundancy)
     checks = [
         PoseCheck("tags", len(pose.rows), at_least=options.min_tags),
@@ -138,14 +141,6 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
         return pose, Verdict("accept", tuple(checks), ())
     reason = f"two poses {apart_deg:.1f}° apart: {ambiguity.text()}"
     return pose, Verdict("ambiguous", tuple(checks), (reason,))
-
-
-def _apart_deg(pose: ObjPose) -> float:
-    """Returns the angle between the pose and its second solution, or 0 if there is none."""
-    if pose.second is None:
-        return 0.0
-    difference = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
-    return float(np.degrees(np.linalg.norm(difference[:3])))
 
 
 LEAST_TAGS = 2
@@ -170,16 +165,8 @@ PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs o
 def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
-    """Returns the mistake in a layout whose correction makes all tags fit; None if there is no such mistake.
-
-    Parameters
-    ----------
-    detected : corners of the layout's tags, px
-    layout : the layout as it is
-    camera : the camera at the size of the image
-    prior : covariance of the intrinsics
-    pose : the pose by the layout as it is; None if none was found
-    """
+    """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by the layout as it
+    is."""
     if len(detected) < LEAST_TAGS:
         return None
     side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()

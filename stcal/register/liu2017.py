@@ -94,37 +94,14 @@ class Liu2017Result:
 
 
 def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
-    """Returns b_from_a of twelve parameters as in the paper's eqs. 5–6. Coplanar points are not refused.
-
-    Coplanar points leave it undetermined off their plane, where it may be wrong by metres.
-
-    ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point.
-    """
+    """Returns b_from_a of twelve parameters (eqs. 5–6). Coplanar points leave it open off their plane, by metres."""
     design = np.column_stack([xyz_a, np.ones(len(xyz_a))])
     solution = np.linalg.lstsq(design, np.asarray(xyz_b, float), rcond=None)[0]
     return Affine(solution[:3].T, solution[3])
 
 
 def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> Liu2017Result:
-    """Returns b_from_a by the paper's method.
-
-    Parameters
-    ----------
-    xyz_a, xyz_b : (n, 3) arrays
-        mm; row i of both is the same point.
-    options : Liu2017Options
-    seed : int
-        Seed of the random samples.
-
-    Returns
-    -------
-    Liu2017Result
-
-    Raises
-    ------
-    DegenerateError
-        If there are too few points, or no sample is acceptable.
-    """
+    """Returns b_from_a by the paper's method. Raises DegenerateError: too few points, or no sample is acceptable."""
     count, size = len(xyz_a), options.sample
     if count <= size:
         raise DegenerateError(
@@ -155,9 +132,8 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
 
 
 def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int):
-    """Yields the tries whose 3×3 part is orthogonal enough.
-
-    Each has its number, sample, transform, errors of all points (n,), and mask of the points outside the sample."""
+    """Yields the tries whose 3×3 part is orthogonal enough: number, sample, transform, errors (n,), mask outside the
+    sample."""
     rng, count = np.random.default_rng(seed), len(xyz_a)
     for i in range(options.tries):
         sample = rng.choice(count, options.sample, replace=False)
@@ -170,11 +146,8 @@ def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Op
 
 @dataclass(frozen=True, slots=True)
 class SampleSize:
-    """Results for samples of ``points`` points.
-
-    ``best``, ``median`` : share of the other points within the limit, NaN if no sample is orthogonal; ``orthogonal`` :
-    number of orthogonal samples among the ``tries``; ``acceptable`` : number of acceptable ones among these.
-    """
+    """``points`` of each sample; ``best``, ``median`` : share of the others within the limit, or NaN; ``orthogonal``,
+    ``acceptable`` : number of such among the ``tries``."""
 
     points: int
     best: float
@@ -186,10 +159,7 @@ class SampleSize:
 
 @one_thread()
 def sample_sizes(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> list[SampleSize]:
-    """Returns the data of the paper's figure 6: samples of every even size from 4 to 40, as far as there are points.
-
-    Arguments are those of :func:`liu2017`.
-    """
+    """Returns the data of the paper's figure 6: samples of every even size from 4 to 40."""
     sizes = []
     for points in SIZES:
         if points < len(xyz_a):

@@ -37,11 +37,7 @@ LOOKED_AT = 10_000
 
 
 def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
-    """Refuses frames whose distances differ by the ratio of two units.
-
-    Raises InputError if the median ratio of distances between the same two points in b and a is the ratio of two
-    units.
-    """
+    """Raises InputError if the median ratio of distances between the same points in b and a is that of two units."""
     rng = np.random.default_rng([seed, 3])
     i, j = rng.integers(len(xyz_a), size=(2, PAIRS))
     in_a, in_b = (np.linalg.norm(xyz[i] - xyz[j], axis=1) for xyz in (xyz_a, xyz_b))
@@ -72,11 +68,8 @@ def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[float, np.ndar
 
 
 def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
-    """Refuses points (n, 3) that a reflection explains far better than any rotation.
-
-    Raises InputError if they are. The message names the axis to change, if one change of sign or exchange makes the
-    frames nearly parallel.
-    """
+    """Raises InputError if a reflection explains points (n, 3) far better than any rotation, naming the axis to change
+    if one change of sign or exchange makes the frames nearly parallel."""
     if model.name == "affine" or len(xyz_a) <= model.sample:
         return
     ratio, reflection = mirrored_ratio(xyz_a, xyz_b)
@@ -160,18 +153,7 @@ class Wider:
 
 
 def wider(problem: Problem, transform: Transform) -> Wider | None:
-    """Returns the narrowest wider model that explains the points better than the problem's own, beyond chance.
-
-    Parameters
-    ----------
-    problem : points that agree on one transform
-    transform : fit to these points
-
-    Returns
-    -------
-    Wider or None
-        None if the problem's own model is sufficient.
-    """
+    """Returns the narrowest wider model that explains the points of ``transform`` better beyond chance, or None."""
     narrow, best = (problem, transform), None
     for name in {"rigid": ("similarity", "affine"), "similarity": ("affine",), "affine": ()}[problem.model.name]:
         model = MODELS[name]
@@ -229,12 +211,8 @@ BY_NEIGHBOURS = 1e-4
 
 
 def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
-    """Returns whether residuals (n, 3) at points (n, 3) correlate with those at their nearest neighbours, beyond
-    chance.
-
-    The products r · r' of independent neighbours have mean zero (a little less after a fit), and their sum is normal
-    with the variance Σ (r · r')².
-    """
+    """Returns whether residuals (n, 3) correlate with those of their nearest neighbours beyond chance: the sum of
+    products r · r' has the variance Σ (r · r')²."""
     rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
     xyz, r = xyz_a[rows], residuals[rows]
     if len(xyz) < FEWEST_NEIGHBOURS:
@@ -307,11 +285,8 @@ TOGETHER = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groups:
-    """Two groups of points with a transform each.
-
-    ``transforms`` : transforms of the larger group and of the other one; ``in_space`` : whether the place determines
-    the group, which indicates a bent frame and not two motions.
-    """
+    """``transforms`` : of the larger group and the other; ``in_space`` : whether the place determines the group: a bent
+    frame."""
 
     transforms: tuple[Transform, Transform]
     in_space: bool
@@ -319,10 +294,7 @@ class Groups:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Assignment:
-    """Assignment of points to two groups.
-
-    ``first`` : (n,) mask of the first group; ``total`` : square sum of both fits.
-    """
+    """``first`` : (n,) mask of the first of two groups; ``total`` : square sum of both fits."""
 
     first: np.ndarray
     transforms: tuple[Transform, Transform]
@@ -330,18 +302,7 @@ class _Assignment:
 
 
 def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
-    """Returns the two transforms of points that fall into two groups.
-
-    Parameters
-    ----------
-    problem : Problem
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    Groups or None
-        None if one transform explains the points as well.
-    """
+    """Returns the two transforms of points in two groups; None if one explains them as well."""
     n, model = len(problem), problem.model
     points = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
     n = len(points)
@@ -364,11 +325,8 @@ def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
 
 
 def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
-    """Returns a bound of the log probability that parting into given groups shrinks residuals (n, 3) that much.
-
-    It is 0 if noise along the loudest axis enters the fit and exceeds the noise of the quiet axes there: the ratio of
-    their variances is then above n / 2, and determinants give no information.
-    """
+    """Returns a bound of the log probability that parting into given groups shrinks residuals (n, 3) so. It is 0 if the
+    loudest axis's noise in the fit exceeds the quiet axes' there: determinants then tell nothing."""
     n, per_axis = len(whole), model.parameters / 3
     one, two = whole.T @ whole, parted.T @ parted
     of_error = n - 2 * per_axis
@@ -388,11 +346,8 @@ def sphericity(scatter: np.ndarray, redundancy: float) -> float:
 
 
 def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
-    """Returns Chernoff's bound of log P(Λ ≤ exp(log_ratio)) for Wilks' Λ(3, of_error, of_hypothesis).
-
-    Λ is a product of independent Beta((νₑ − i)/2, νₕ/2), i = 0, 1, 2 (Anderson 2003, th. 8.4.1); the bound is the least
-    of λᵗ E[Λ⁻ᵗ] over t.
-    """
+    """Returns Chernoff's bound of log P(Λ ≤ exp(log_ratio)) for Wilks' Λ(3, of_error, of_hypothesis), a product of
+    Beta((νₑ − i)/2, νₕ/2), i = 0, 1, 2 (Anderson 2003, th. 8.4.1)."""
     a, b = (of_error - np.arange(3)) / 2, of_hypothesis / 2
     t = np.linspace(0, a[2], 400, endpoint=False)[:, None]
     moments = gammaln(a - t) + gammaln(a + b) - gammaln(a) - gammaln(a + b - t)
@@ -446,11 +401,8 @@ NARROWEST = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shifted:
-    """Points of which some are shifted relative to the others.
-
-    ``rows`` : (m,) indices of the smaller group; ``count`` : number of all points; ``by_mm`` : (3,) shift of the
-    smaller group relative to the others, frame b; ``together`` : whether the smaller group lies together in space.
-    """
+    """``rows`` : (m,) of the smaller group of ``count`` points; ``by_mm`` : (3,) its shift, frame b; ``together`` : in
+    space."""
 
     rows: np.ndarray
     count: int
@@ -463,18 +415,7 @@ class Shifted:
 
 
 def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
-    """Returns the rows that are shifted together.
-
-    Parameters
-    ----------
-    problem : points that agree on one transform
-    transform : fit to these points
-
-    Returns
-    -------
-    Shifted or None
-        None if one group or a bent frame explains the residuals, or there are too few points.
-    """
+    """Returns the rows that are shifted together; None if there is no such group, a bent frame, or too few points."""
     count = len(problem)
     residuals = problem.whitened(transform)
     if count < FEWEST_NEIGHBOURS or np.abs(residuals).max() <= problem.rounding_mm():
@@ -500,10 +441,7 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parted:
-    """Division into two groups.
-
-    ``gain`` : of log likelihood; ``axis`` : of the shift; ``border`` : between them along it.
-    """
+    """``gain`` : of log likelihood by two groups; ``axis`` : of the shift; ``border`` : between them along it."""
 
     gain: float
     axis: np.ndarray
@@ -511,10 +449,8 @@ class _Parted:
 
 
 def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
-    """Divides residuals (n, 3) of unit scatter into two groups. Returns None if the division may be due to chance.
-
-    ``axes`` : principal axes before the residuals were scaled, as columns, the longest last.
-    """
+    """Divides residuals (n, 3) of unit scatter into two groups, or None by chance; ``axes`` : principal, longest
+    last."""
     best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found.gain)
     across = unit - (unit @ best.axis)[:, None] * best.axis
     rest = max(_parted(across, axis).gain for axis in _by_kurtosis(across).T[1:])
@@ -527,10 +463,7 @@ def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
 
 
 def _by_kurtosis(unit: np.ndarray) -> np.ndarray:
-    """Returns directions as columns (3, 3), by ascending kurtosis (Cardoso 1989).
-
-    Directions without variance come first.
-    """
+    """Returns directions as columns (3, 3), by ascending kurtosis (Cardoso 1989), those without variance first."""
     return np.linalg.eigh((unit * (unit**2).sum(1)[:, None]).T @ unit)[1]
 
 

@@ -4,7 +4,6 @@ Residuals are b − b_from_a a in frame b. ``precision`` describes their noise: 
 (n,) for weights 1/σ², (n, 3, 3) for inverse covariances.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,11 +31,7 @@ CHUNK = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A model of a transform.
-
-    ``name`` : ``rigid``, ``similarity`` or ``affine``; ``parameters`` : number of parameters; ``sample`` : least number
-    of point pairs that determines them.
-    """
+    """``name`` : ``rigid``, ``similarity`` or ``affine``; ``sample`` : least number of point pairs."""
 
     name: str
     parameters: int
@@ -65,15 +60,10 @@ def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarray | None = None) -> Transform:
-    """Returns the b_from_a that minimises Σ rᵢᵀ Pᵢ rᵢ.
+    """Returns the b_from_a that minimises Σ rᵢᵀ Pᵢ rᵢ: in closed form, then by descent with inverse covariances.
 
-    The solution is in closed form for isotropic noise. With inverse covariances a descent starts from there.
-
-    ``model`` : model; ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point; ``precision`` : (n,) weights,
-    or inverse covariances in frame b.
-
-    Raises DegenerateError if there are too few points, collinear ones, or coplanar ones for the affine model. Raises
-    ConvergenceError: if no minimum is reached.
+    ``precision`` : (n,) weights, or (n, 3, 3) inverse covariances in frame b. Raises DegenerateError: too few points,
+    collinear ones, or coplanar ones for the affine model. Raises ConvergenceError: no minimum is reached.
     """
     weights = precision
     if precision is not None and precision.ndim == 3:
@@ -125,21 +115,10 @@ def unit_covariance(
 def leverages(
     model: Model, transform: Transform, xyz_a: np.ndarray, used: np.ndarray, precision: np.ndarray | None = None
 ) -> np.ndarray:
-    """Returns the uncertainty that the fit adds to every point's residual.
+    """Returns H (n, 3, 3), the uncertainty that the fit of the ``used`` (n,) adds to every point's residual.
 
     H = Lᵀ J N⁻¹ Jᵀ L with P = L Lᵀ: whitened residuals Lᵀ r have covariance 1 − H for points that were used and 1 + H
     for others. An eigenvalue of 1 marks a direction in which no other point checks this one.
-
-    Parameters
-    ----------
-    model, transform, precision : : as in :func:`unit_covariance`
-    xyz_a : (n, 3) all points, mm
-    used : (n,) mask of the points that were fitted
-
-    Returns
-    -------
-    (n, 3, 3) array
-        H of each point.
     """
     p = None if precision is None else precision[used]
     origin, normal = _normal(model, transform, xyz_a[used], p)
@@ -163,19 +142,8 @@ def whitened(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.n
 
 
 def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fits many minimal samples at once. Results for degenerate samples are finite and wrong.
-
-    Parameters
-    ----------
-    model : model
-    xyz_a, xyz_b : (s, m, 3) m points of each of s samples, mm
-
-    Returns
-    -------
-    linear : (s, 3, 3) array
-    translation : (s, 3) array
-        Translation of b_from_a, mm.
-    """
+    """Fits s minimal samples (s, m, 3) at once: linear parts (s, 3, 3), translations (s, 3) of b_from_a. Results for
+    degenerate samples are finite and wrong."""
     mean_a, mean_b = xyz_a.mean(1), xyz_b.mean(1)
     a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
     cross = np.swapaxes(b, 1, 2) @ a
@@ -189,20 +157,8 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
 
 
 def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
-    """Returns the derivative of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
-
-    Parameters
-    ----------
-    model : Model
-    transform : Rigid, Similarity or Affine
-        b_from_a.
-    from_origin : (n, 3) array
-        Points of a minus that point, mm.
-
-    Returns
-    -------
-    (n, 3, p) array
-    """
+    """Returns the derivative (n, 3, p) of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of
+    a, for points (n, 3) minus that point."""
     n = len(from_origin)
     by_step = np.zeros((n, 3, model.parameters))
     if model.name == "affine":
@@ -236,7 +192,8 @@ def _about(
 ) -> NormalEquations:
     """Returns the normal equations of the parameters about a point ``origin`` of a, with inverse covariances."""
     cost, normal, gradient = 0.0, np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
-    for rows in _chunks(len(xyz_a)):
+    for first in range(0, len(xyz_a), CHUNK):
+        rows = slice(first, first + CHUNK)
         by_step = jacobian(model, transform, xyz_a[rows] - origin)
         weighted = np.swapaxes(by_step, 1, 2) @ precision[rows]
         residual = xyz_b[rows] - transform @ xyz_a[rows]
@@ -295,7 +252,3 @@ def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transf
             "E-REGISTER-SCALE", "registration: the scale is not determined; are the covariances true?"
         )
     return Similarity(scale, Rigid(rotation, there - scale * rotation @ origin))
-
-
-def _chunks(n: int) -> Iterator[slice]:
-    return (slice(i, i + CHUNK) for i in range(0, n, CHUNK))

@@ -53,11 +53,8 @@ def by_chance(agreeing: int, n: int, sigma_mm: float) -> DegenerateError:
 
 
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
-    """Refuses points that do not determine the model at their σ.
-
-    Raises DegenerateError: the points lie along a line, or in a plane for the affine model; or σ is as large as their
-    whole extent.
-    """
+    """Raises DegenerateError if points do not determine the model at their σ: along a line, in a plane for the affine
+    model, or with σ as large as their extent."""
     n, spread = len(xyz_a), spreads(xyz_a)
     needed = WIDER_THAN * sigma_mm
     off_line = float(np.hypot(spread[1], spread[2]))
@@ -80,8 +77,7 @@ def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
 
 
 def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:
-    """Returns the indices of points that are indispensable: if one of them is left out, :func:`check_extent` refuses
-    the others."""
+    """Returns the indices of points without which :func:`check_extent` refuses the others."""
     n = len(xyz_a)
     centred = xyz_a - xyz_a.mean(0)
     scatter = centred.T @ centred
@@ -97,11 +93,8 @@ def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndar
 def check_supports(
     model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_mm: float, name: Callable[[int], str]
 ) -> None:
-    """Refuses a set with outliers in which a single point determines a turn, as any wrong point would have fitted
-    there.
-
-    Raises DegenerateError if the others would be refused by :func:`check_extent` without that point.
-    """
+    """Raises DegenerateError for a set with outliers if :func:`check_extent` refuses it without a single point, since
+    any wrong point would have fitted there."""
     rows = np.flatnonzero(inliers)
     alone = single_supports(model, xyz_a[rows], sigma_mm)
     if len(alone):
@@ -119,12 +112,8 @@ def row_name(row: int, lines: Sequence[int] | None) -> str:
 
 
 def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
-    """Returns a turn that maps the points onto themselves but not each onto itself: angle (rad), permutation (n,).
-
-    Candidates map the point farthest from the centroid and one off that line to others at the same distances. Of
-    several turns the one with the smallest misfit is returned. The result is None if there is no turn, or points are
-    too close together for the tolerance.
-    """
+    """Returns a turn that maps the points onto themselves but not each onto itself: angle (rad), permutation (n,), of
+    the smallest misfit. None if there is none, or points are too close together for the tolerance."""
     n = len(xyz)
     if not 3 <= n <= SYMMETRY_UP_TO:
         return None

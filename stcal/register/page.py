@@ -229,7 +229,8 @@ def _where_it_holds(findings: Findings) -> list[Block]:
     blocks: list[Block] = []
     if field is not None:
         blocks.append(field_sentence(findings, field))
-        if has_field_figure(findings, field):
+        width = np.ptp(findings.xyz_a[field.rows], axis=0)
+        if width.min() >= 1e-3 * width.max():  # else planes through the points' middle show nothing
             blocks.append(
                 plot(
                     lambda: field_figure(findings, field),
@@ -318,12 +319,6 @@ def space_figure(findings: Findings):
             axes.words(x, y, f"{length[row]:.2g}", (4, -5), size=SMALL - 1, anchor="start")
     drawing.words((drawing.width - 6, 7), f"{scale:,g} times", SMALL + 1, "end")
     return drawing
-
-
-def has_field_figure(findings: Findings, field: Field) -> bool:
-    """Returns whether the points have a width in all directions, so that planes through their middle show something."""
-    width = np.ptp(findings.xyz_a[field.rows], axis=0)
-    return bool(width.min() >= 1e-3 * width.max())
 
 
 def field_figure(findings: Findings, field: Field) -> Drawing:

@@ -128,10 +128,7 @@ def read_pairs(
 
 
 def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
-    """Refuses a repeated pair.
-
-    Equal rows have equal sums for any weights, so that one sort replaces a table of a million tuples.
-    """
+    """Refuses a repeated pair: equal rows have equal weighted sums, so that one sort replaces a table of tuples."""
     key = rows @ np.random.default_rng(0).uniform(1, 2, rows.shape[1])
     order = np.argsort(key, kind="stable")
     near = np.flatnonzero(np.diff(key[order]) == 0)
@@ -174,14 +171,8 @@ def _covariances(table: Table) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointNoise:
-    """Noise of the residuals, as far as it is stated.
-
-    Inverse covariances are scaled so that a point of mean σ (the RMS of all σ) has σ = 1: whitened residuals are
-    millimetres of such a point.
-
-    ``precision`` : (n,) inverse variances or covariances at mean σ 1, frame b; None if all noise is equal and
-    isotropic; ``sigma_mm`` : mean σ if it was given in mm.
-    """
+    """``precision`` : (n,) inverse variances or covariances, frame b, scaled to mean σ 1 (the RMS of all σ), so that
+    whitened residuals are mm of such a point; None if equal and isotropic; ``sigma_mm`` : mean σ if given."""
 
     precision: np.ndarray | None = None
     sigma_mm: float | None = None
@@ -193,10 +184,7 @@ class PointNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Point pairs and a model. They are neither copied nor checked, as subsets are taken in inner loops.
-
-    ``model`` : model; ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point; ``noise`` : PointNoise.
-    """
+    """Point pairs (n, 3) mm, neither copied nor checked, as subsets are taken in inner loops, and a model."""
 
     model: Model
     xyz_a: np.ndarray
@@ -237,13 +225,8 @@ class Problem:
 
 
 def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> PointNoise:
-    """Returns the noise that weights or covariances state.
-
-    ``n`` : number of point pairs; ``weights`` : (n,) weights, proportional to 1/σ²; ``covariances`` : (n, 3, 3)
-    covariances, or variances per axis, of b − b_from_a a in frame b, mm².
-
-    Raises InputError if both are given, a shape is wrong, or weights or covariances are not positive.
-    """
+    """Returns the noise that (n,) weights, in 1/σ², or (n, 3, 3) covariances, or variances per axis, of b − b_from_a a
+    in frame b, mm², state. Raises InputError: both are given, a wrong shape, or not positive."""
     if weights is not None and covariances is not None:
         raise InputError("E-REGISTER-WEIGHTS", "registration: weights and covariances given; give only one of them")
     if weights is None and covariances is None:

@@ -268,7 +268,8 @@ def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitte
     """Returns the fit, and another fit on which other points agree."""
     try:
         fitted = robust_fit(problem, threshold, seed)
-        _check_chance(problem, fitted)
+        if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
+            raise by_chance(int(fitted.inliers.sum()), len(problem), fitted.sigma)
     except DegenerateError:
         _check_mirrored_with_outliers(problem, None, threshold, seed)
         raise
@@ -296,11 +297,6 @@ def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -
     square = part.squares(transform)
     sigma = sigma_within(float(square.sum()), part.model, len(part), threshold or np.inf)
     return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
-
-
-def _check_chance(problem: Problem, fitted: Fitted) -> None:
-    if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
-        raise by_chance(int(fitted.inliers.sum()), len(problem), fitted.sigma)
 
 
 def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, threshold: float | None, seed: int) -> None:

@@ -12,10 +12,7 @@ from stcal.register.models import Transform
 
 @dataclass(frozen=True, slots=True)
 class ErrorFigures:
-    """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points.
-
-    ``points`` : int; ``mean_mm``, ``rms_mm``, ``max_mm`` : float.
-    """
+    """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points."""
 
     points: int
     mean_mm: float
@@ -171,21 +168,10 @@ def held_out(
     least: int,
     seed: int,
 ) -> HeldOutPoints | None:
-    """Returns the errors of points that are left out of the fit in turn.
+    """Returns the errors of points left out of the fit in turn; None if too few are left, or every fold fails.
 
-    Parameters
-    ----------
-    fit_rows : fit to given rows, b_from_a. A fold whose fit fails is left out of the summary.
-    xyz_a, xyz_b : (n, 3) mm; row i of both is the same point
-    inliers : (n,) inliers of the fit to all points
-    folds : number of parts to leave out, one at a time
-    least : least number of points of a fit
-    seed : seed of the division into parts
-
-    Returns
-    -------
-    HeldOutPoints or None
-        None if there are too few points for a fit to the others, or the fit of every fold fails.
+    ``fit_rows`` : fit to given rows; ``inliers`` : (n,) of the fit to all; ``folds`` : number of parts to leave out;
+    ``least`` : number of points of a fit; ``seed`` : of the division.
     """
     rng = np.random.default_rng([seed, 2])
     sample = np.sort(rng.permutation(len(xyz_a))[:TRIED])

@@ -43,12 +43,8 @@ WIDE = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """Covariance of a transform's parameters.
-
-    ``matrix`` : (p, p) parameters as of :func:`~stcal.register.models.unit_covariance`; ``scaled`` : whether it is
-    derived from the residuals; False if it is derived from the given σ; ``redundancy`` : degrees of freedom of the σ
-    that it is derived from; infinite if this σ was given.
-    """
+    """``matrix`` : (p, p) of :func:`~stcal.register.models.unit_covariance`'s parameters; ``scaled`` : by residuals,
+    not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
 
     matrix: Array
     scaled: bool
@@ -69,22 +65,10 @@ def kept_variance(cut: float) -> float:
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
-    """Estimates σ of points from residuals that were cut off at a threshold.
+    """Returns σ per axis, mm, of ``count`` points whose residuals were cut off at a threshold, which may be infinite.
 
     Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ.
     Below c = 1 the points fill the sphere almost uniformly and give no information on σ.
-
-    Parameters
-    ----------
-    square_sum : square sum of the residuals of the points used, mm²
-    model : model
-    count : number of points used
-    threshold : threshold at which residuals were cut off, mm; infinite if none was
-
-    Returns
-    -------
-    float
-        σ per axis, mm, at most the threshold.
     """
     sigma = float(np.sqrt(square_sum / model.redundancy(count)))
     if sigma == 0 or threshold > WIDE * sigma:
@@ -101,14 +85,8 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
 
 
 def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold: float) -> Covariance:
-    """Returns the covariance of a fit.
-
-    A given σ is kept unless χ² contradicts it. Cutting off at c σ increases the variance of the estimate by the factor
-    χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
-
-    ``inliers`` : points that the transform is fitted to; ``b_from_a`` : transform; ``sigma`` : estimated σ, mm of a
-    point of mean σ; ``threshold`` : threshold at which residuals were cut off, mm; infinite if none was.
-    """
+    """Returns the covariance of a fit. A given σ is kept unless χ² contradicts it. Cutting off at c σ, ``threshold`` in
+    mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection."""
     model, noise = inliers.model, inliers.noise
     redundancy = float(inliers.redundancy)
     used, scaled = sigma, True
@@ -161,11 +139,8 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """A set of points that agree on a transform.
-
-    ``inliers`` : (n,) bool array; ``value`` : score, less is better; ``samples`` : number of samples; 0 if all possible
-    ones were tried.
-    """
+    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all possible ones were
+    tried."""
 
     inliers: np.ndarray
     value: float
@@ -173,10 +148,7 @@ class Consensus:
 
 
 def by_scale(model: Model, count: int, total: float) -> Score:
-    """Returns a score that minimises the logarithm of the number of false alarms.
-
-    ``total`` : sum of squares of the least-squares fit to all points.
-    """
+    """Returns the logarithm of the number of false alarms as score; ``total`` : square sum of the fit to all points."""
     k = np.arange(model.sample, count)
     k = k[3 * k > model.parameters]  # sets too small to be trusted are scored, too; if one wins, the result is refused
     a, b = (3 * k - model.parameters) / 2, 3 * (count - k) / 2
@@ -194,20 +166,14 @@ def by_scale(model: Model, count: int, total: float) -> Score:
 
 
 def chernoff(share: float | np.ndarray, a: float | np.ndarray, b: float | np.ndarray) -> np.ndarray:
-    """Returns Chernoff's bound of log P(Beta(a, b) ≤ share).
-
-    The bound of P is (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1.
-    """
+    """Returns Chernoff's bound of log P(Beta(a, b) ≤ x): (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b)."""
     limit = a / (a + b)
     share = np.clip(share, TINY, limit)
     return a * np.log(share / limit) + b * np.log((1 - share) / (1 - limit))
 
 
 def by_share(model: Model, count: int) -> Score:
-    """Returns the score by least trimmed squares of the larger half.
-
-    Its breakdown point is highest (Rousseeuw 1984).
-    """
+    """Returns least trimmed squares of the larger half as score, of the highest breakdown point (Rousseeuw 1984)."""
     k = max((count + model.parameters // 3 + 1) // 2, model.sample + 1)
 
     def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -227,19 +193,7 @@ def by_threshold(threshold: float) -> Score:
 
 
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
-    """Returns the best set that random samples lead to.
-
-    Parameters
-    ----------
-    problem : problem
-    score : score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    Consensus or None
-        None if no sample leads to a set of enough points.
-    """
+    """Returns the best set by :func:`by_scale`, :func:`by_share` or :func:`by_threshold` of random samples, or None."""
     count, size = len(problem), problem.model.sample
     drawn, needed, best = 0, 1.0, None
     every = None
@@ -353,13 +307,10 @@ class Fitted:
 
 
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
-    """Returns the transform with its inliers and σ.
+    """Returns the transform with its inliers and σ; ``threshold`` : largest distance, mm of a point of mean σ,
+    estimated if None.
 
-    ``problem`` : problem; ``threshold`` : largest distance of inliers, mm of a point of mean σ; estimated if not given;
-    ``seed`` : seed of the random samples.
-
-    Raises DegenerateError if too few points agree, or no more than could agree by chance. Raises ConvergenceError: if
-    a fit with covariances did not converge.
+    Raises DegenerateError: too few points agree, or no more than by chance. Raises ConvergenceError.
     """
     rng = np.random.default_rng(seed)
     count = len(problem)
@@ -422,23 +373,8 @@ def _too_few_agree(model: Model, count: int, threshold: float | None) -> Degener
 
 
 def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
-    """Updates fit, σ and inliers in turn until the set stays the same. Of a cycle of sets the largest is returned.
-
-    Parameters
-    ----------
-    problem : problem
-    inliers : (n,) first set of inliers
-    threshold, samples : : as in :func:`robust_fit` and :class:`Fitted`
-
-    Returns
-    -------
-    Fitted
-
-    Raises
-    ------
-    DegenerateError
-        If too few points agree.
-    """
+    """Updates fit, σ and inliers in turn until the set stays the same; of a cycle, the largest is returned. Raises
+    DegenerateError: too few points agree."""
     model = problem.model
     fit_of_set: dict[bytes, Fitted] = {}
     floor = problem.rounding_mm()
@@ -485,22 +421,9 @@ def _chosen(
 
 
 def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
-    """Returns the squares of each point's residual from a fit without this point.
-
-    r (1 − H)⁻¹ r for points that were used, r (1 + H)⁻¹ r for others, with whitened residuals r and H of
-    :func:`~stcal.register.models.leverages` (Cook & Weisberg 1982, Residuals and Influence in Regression).
-
-    Parameters
-    ----------
-    problem : problem
-    transform : fit to the points used
-    used : (n,) bool array
-
-    Returns
-    -------
-    (n,) array
-        rᵀ C⁻¹ r, C the residual's covariance at unit noise.
-    """
+    """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself, C their covariance at unit noise:
+    r (1 − H)⁻¹ r for points used, r (1 + H)⁻¹ r for others, with whitened residuals and H of
+    :func:`~stcal.register.models.leverages` (Cook & Weisberg 1982)."""
     added = leverages(problem.model, transform, problem.xyz_a, used, problem.noise.precision)
     own = np.where(used, -1.0, 1.0)[:, None, None]
     value, vector = np.linalg.eigh(np.eye(3) + own * added)
@@ -509,23 +432,9 @@ def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -
 
 
 def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -> float:
-    """Returns the logarithm of the number of sets that would agree as well if the points lay anywhere among the others.
-
-    Moisan & Stival's (2004) number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of a
-    box that a cube of half side r takes, at most 1 along each axis.
-
-    Parameters
-    ----------
-    problem : Problem
-    fitted : Fitted
-    extent : (3,) array, optional
-        Sides of this box, mm; by default those of the inliers along their principal axes (thin if they are coplanar).
-
-    Returns
-    -------
-    float
-        Its logarithm.
-    """
+    """Returns the log number of sets that would agree as well if points lay anywhere in a box of sides ``extent`` (3,)
+    mm, by default the inliers' along principal axes: Moisan & Stival's (2004) (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over
+    k; α(r) is the share of a cube of half side r."""
     model, every = problem.model, len(problem)
     rows = np.arange(every)[:: max(1, every // LEVERAGE_UP_TO)]
     share = problem[rows]
@@ -547,19 +456,8 @@ def _along_axes(points: np.ndarray) -> np.ndarray:
 
 
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """Returns the transform on which the outliers agree within the fit's threshold, enlarged for the uncertainty of σ.
-
-    Parameters
-    ----------
-    problem : problem
-    fitted : transform of the inliers
-    seed : seed as in :func:`robust_fit`
-
-    Returns
-    -------
-    Fitted or None
-        None if the outliers agree no better than by chance.
-    """
+    """Returns the transform on which outliers agree within the threshold enlarged for σ's uncertainty, beyond chance,
+    or None."""
     model = problem.model
     outside = np.flatnonzero(~fitted.inliers)
     if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:

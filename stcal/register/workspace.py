@@ -95,10 +95,8 @@ def residual_field(
     weights: np.ndarray | None = None,
     covariances: np.ndarray | None = None,
 ) -> Field | None:
-    """Returns the systematic part of the residuals of inliers and of outliers that follow it; None for too few points.
-
-    Arguments are those of :func:`stcal.register.pipeline`. Of covariances only the mean variance of each point is used.
-    """
+    """Returns the systematic part of the residuals of inliers and outliers that follow it, or None; of covariances only
+    mean variances are used."""
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     model = MODELS[registration.model]
     variance = _relative_variances(len(a), weights, covariances)
@@ -152,11 +150,8 @@ def _matern(distance: np.ndarray) -> np.ndarray:
 
 
 def _tridiagonal(matrix: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decomposes a symmetric ``matrix`` (m, m) into Q T Qᵀ.
-
-    Returns the diagonal of T, its off-diagonal, and Qᵀ ``columns`` (m, k). It takes a quarter of the time of
-    eigenvectors, and 1 + r T is solved for any r in one pass.
-    """
+    """Returns T's diagonal and off-diagonal, and Qᵀ ``columns`` (m, k), of a symmetric matrix Q T Qᵀ: a quarter of the
+    time of eigenvectors."""
     m, k = columns.shape
     work = int(_sytrd_lwork(m, lower=1)[0])
     reflectors, diagonal, beside, scale, _ = _sytrd(matrix, lower=1, lwork=work)
@@ -168,23 +163,17 @@ def _motions(model: Model, transform: Transform, xyz_a: np.ndarray, about: np.nd
     """Returns the residuals due to small motions of the transform, (m, 3, p), for parameters scaled to about 1."""
     origin = about.mean(0)
     extent = float(np.abs(about - origin).max())
-    return jacobian(model, transform, xyz_a - origin) / np.where(_in_mm(model), extent, 1.0)
-
-
-def _in_mm(model: Model) -> np.ndarray:
-    """Returns the mask of the parameters whose motions grow with the distance from the origin."""
     if model.name == "affine":
-        return np.tile([True, True, True, False], 3)
-    return np.array([True] * 3 + [False] * 3 + [True])[: model.parameters]
+        grow = np.tile([True, True, True, False], 3)
+    else:
+        grow = np.array([True] * 3 + [False] * 3 + [True])[: model.parameters]
+    return jacobian(model, transform, xyz_a - origin) / np.where(grow, extent, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Likelihood:
-    """The restricted likelihood of length and variance ratio.
-
-    ``y`` : (m, 3) residuals; ``motions`` : (m, 3, p); both are divided by the root of the points' relative variance
-    ``variance`` : (m,).
-    """
+    """The restricted likelihood of length and variance ratio. ``y`` : (m, 3), ``motions`` : (m, 3, p), both over the
+    root of the relative ``variance`` (m,)."""
 
     model: Model
     transform: Transform
@@ -242,9 +231,7 @@ class _Likelihood:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Kriged:
-    """The generalised least-squares solution with unit covariance C of each component:
-    C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β),
-    and the variance factor."""
+    """Generalised least squares by unit C: C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β), and the variance factor."""
 
     own: np.ndarray
     of_y: np.ndarray
@@ -266,10 +253,8 @@ class _Kriged:
         return cls(np.diag(inverse), of_y, of_motions, spread, beta, left, variance)
 
     def left_out(self) -> tuple[np.ndarray, float]:
-        """Returns the errors (m,) of each point by the model of the others, and the RMS ratio to their σ.
-
-        (Q⁻¹)ᵢᵢ⁻¹ … of Q = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹, in blocks of a point's three components (Dubrule 1983).
-        """
+        """Returns each point's error (m,) by the model of the others, and the RMS ratio to σ (Dubrule 1983, in blocks
+        of 3)."""
         block = self.own[:, None, None] * np.eye(3)
         block = block - self.of_motions @ self.spread @ np.swapaxes(self.of_motions, 1, 2)
         error = np.linalg.solve(block, self.left[:, :, None])[:, :, 0]
@@ -302,18 +287,9 @@ DIGITS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubes:
-    """Errors by the region of the fit and the region of use.
-
-    Parameters
-    ----------
-    middle : (3,) array
-        Centre of the cubes, mm, frame a; cubes are aligned with its axes.
-    sides_mm : (k,) array
-        Sides of the cubes, increasing.
-    errors : k tuples of k ErrorFigures
-        ``errors[i][j]`` : errors of the fit to the points in cube i, at the points in cube j that are not in cube j −
-        1. Points of the fit are held out in turn. None if there are no such points.
-    """
+    """Errors by region of fit and of use. ``middle`` : (3,) of the cubes, mm, axes of frame a; ``sides_mm`` : (k,)
+    increasing; ``errors[i][j]`` : of the fit in cube i at points in cube j that are not in cube j − 1, held out in
+    turn, or None."""
 
     middle: Array
     sides_mm: Array
@@ -333,19 +309,8 @@ def cubes(
     covariances: np.ndarray | None = None,
     folds: int = 6,
 ) -> Cubes | None:
-    """Fits the registration's model in cubes about the middle of its inliers.
-
-    Parameters
-    ----------
-    registration : registration
-    xyz_a, xyz_b, weights, covariances, folds : : as in :func:`stcal.register.register`
-    taken_back : (m,) indices of outliers that are included
-
-    Returns
-    -------
-    Cubes or None
-        None if there are too few points.
-    """
+    """Fits the registration's model in cubes about the middle of its inliers and ``taken_back``, (m,) outliers; None
+    for too few points. Other arguments as in :func:`stcal.register.register`."""
     used = registration.inliers.copy()
     used[np.zeros(0, int) if taken_back is None else taken_back] = True
     every = Problem(
@@ -395,11 +360,8 @@ def _errors(problem: Problem, inside: np.ndarray, folds: int, seed: int) -> np.n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """A registration and its checks.
-
-    ``where`` : the file; ``lines`` : (n,) its lines; ``xyz_a`` : (n, 3) mm; ``field``, ``cubes`` : None if there are
-    too few points.
-    """
+    """A registration of file ``where`` and its checks. ``lines`` : (n,) of the points; ``field``, ``cubes`` : or
+    None."""
 
     where: str
     lines: Sequence[int]

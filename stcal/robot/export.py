@@ -22,12 +22,8 @@ LENGTH_AT, ANGLE_AT = DH.index("d"), DH.index("theta")
 
 
 def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the joint values that the controller should have where it has 0 now, their σ, and a mask of those that
-    the data determine.
-
-    All are (n,), rad or mm. The identified rows have θ + Δ, or d + Δ for prismatic joints, where the nominal ones have
-    θ; with the coupling C the joints turn by C q. Nominal rows do the same with q + C⁻¹ Δ.
-    """
+    """Returns joint values that the controller should have at its present 0, their σ, and a mask of determined ones,
+    (n,). Rows have θ + Δ where nominal ones have θ; with the coupling C, that is q + C⁻¹ Δ."""
     at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
     joints, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
     change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]

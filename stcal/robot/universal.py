@@ -74,15 +74,9 @@ def is_conf(text: str) -> bool:
 
 
 def robot_of_kinematics(content: Mapping, where: str, convention: Convention) -> tuple[Robot, float]:
-    """Returns the arm of the YAML of ur_calibration, and by how far (mm) a URDF with the same numbers is off at joint
-    values of 0.
-
-    The program computes roll, pitch and yaw about moving axes X, Y, Z; URDF takes them about fixed axes. Only in the
-    first reading has the upper arm of every such file a pitch of zero. The base is that of the controller; ROS's
-    base_link is rotated by half a turn about Z.
-
-    Raises InputError: a link is missing, or its values are no numbers.
-    """
+    """Returns the arm of ur_calibration's YAML, and by how far (mm) a URDF with the same numbers is off at joint values
+    of 0. Roll, pitch and yaw are about moving axes X, Y, Z; URDF takes fixed ones. The base is the controller's; ROS's
+    base_link is rotated by half a turn about Z. Raises InputError naming the link."""
     held = content["kinematics"]
     missing = [name for name in LINKS if name not in held] if isinstance(held, Mapping) else []
     if missing:
@@ -112,13 +106,11 @@ def _turning(angles) -> np.ndarray:
 
 
 def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> Robot:
-    """Returns the arm of a calibration.conf: the nominal one, of the [DH] section or ``nominal``, and its deviations.
+    """Returns the arm of a calibration.conf: the one of its [DH] section or ``nominal``, and its deviations.
 
-    The axes of upper arm, forearm and wrist are nearly parallel, so that the controller's rows have lengths of many
-    metres that cancel. The same axes are written as rows with Hayati's angle.
-
-    Raises InputError: there is no nominal arm, it does not have six joints in the standard convention, or a list does
-    not have six numbers.
+    Axes of upper arm, forearm and wrist are nearly parallel: the controller's rows have lengths of many metres that
+    cancel, written here as rows with Hayati's angle. Raises InputError: no nominal arm, not six joints, or lists of
+    other lengths.
     """
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
     deltas = np.column_stack([_six(lists, f"delta_{name}", where) for name in DELTAS])

@@ -192,8 +192,7 @@ def _require_chain(path: list[UrdfJoint], start: str, end: str, where: str) -> N
 
 
 def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
-    """Returns the robot of the paths from one link to each tool, ``""`` among them; they part behind the last moving
-    joint."""
+    """Returns the robot of the paths from one link to each tool, ``""`` among them, that part after the last joint."""
     moving = [joint for joint in paths[""] if joint.kind != "fixed"]
     gaps, passed = [], Rigid()
     for joint in paths[""]:
@@ -505,10 +504,7 @@ def _fixed(root: ElementTree.Element, parent: str, child: str, pose: Rigid) -> N
 
 
 def require_urdf_written(path: str | Path, robot: Robot) -> None:
-    """Read a written URDF again, and require that it leads every tool where the robot does.
-
-    Raises ConvergenceError: the file cannot be read again, or the poses of a tool differ.
-    """
+    """Read a written URDF again, and require that it leads every tool where the robot does; raises ConvergenceError."""
     q = fixed_values(len(robot.rows))
 
     def again() -> np.ndarray:

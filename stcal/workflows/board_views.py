@@ -88,8 +88,7 @@ def symmetries(board: Board) -> list[Rigid]:
 
 
 def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
-    """Returns the view of the board in a grey image, or the reason why there is none. For a set of boards it is the
-    view of all that are seen."""
+    """Returns the view of the board, or of all that are seen of a set, in a grey image, or why there is none."""
     if not isinstance(board, BoardSet):
         return _find_or_why(image, name, camera, board)
     views, reasons = [], []
@@ -207,8 +206,7 @@ def _find_asymmetric(
 
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
-    """Returns the radius from the distance of neighbours, the median over all circles in the image, mm; None where
-    there are none."""
+    """Returns the circles' radius, mm, as a median, by the distance of neighbours; None without circles."""
     candidates = Candidates.of(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
     if len(candidates) < len(board.xy_mm()) * MIN_SHARE:
         return None
@@ -229,11 +227,8 @@ def _find_circles(
     grid: BoardDesign,
     place: np.ndarray,
 ) -> tuple[BoardView | None, str]:
-    """Returns the view of a board of circles, or the reason why there is none.
-
-    ``grid`` : the lattice in which the circles of the board are found; ``place`` : (rows, columns) of the lattice, rows
-    of its circles in the board's ``xy_mm``.
-    """
+    """Returns the view of a board of circles, or why there is none. ``grid`` : lattice in which they are found;
+    ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
     pattern = "board of dots" if grid is board else f"grid of {kind_of(board)}"
     detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
     if detected.repeated:
@@ -272,10 +267,8 @@ def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) 
 def images_of_centres(
     centre_px: np.ndarray, xyz_board: np.ndarray, radius_mm: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Returns the images (n, 2) of the centres of a flat board's circles, px, from their ellipses' centres (n, 2).
-
-    Raises DegenerateError: fewer than four circles, or all on a line.
-    """
+    """Returns images (n, 2) of a flat board's circles' centres, px, from their ellipses' centres; raises
+    DegenerateError: fewer than four, or on a line."""
     corrected_px = centre_px
     for _ in range(CENTRING_ROUNDS):
         normalised = camera.normalised_from_pixel(corrected_px)
@@ -289,8 +282,7 @@ def images_of_centres(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardDetection:
-    """One readable image: ``view`` of the board, or None with the reason ``why``; ``tags`` of the requested
-    dictionaries."""
+    """One readable image: ``view``, or None with the reason ``why``; ``tags`` of the requested dictionaries."""
 
     name: str
     size: tuple[int, int]
@@ -314,8 +306,7 @@ class BoardDetections:
         return {detection.name: detection.view for detection in self.images if detection.view is not None}
 
     def unused(self) -> list[str]:
-        """Returns a line for each reason why views do not use a part of the board, or of the boards, that images
-        show."""
+        """Returns a line for each reason why views lack a part of the board, or of the boards, that images show."""
         images: dict[str, list[str]] = {}
         for name, view in self.views().items():
             for reason in view.unused:
@@ -332,14 +323,8 @@ def detect_boards(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BoardDetections:
-    """Find the board in all images, and the tags of ``dictionaries`` beside it.
-
-    An image that cannot be used is skipped.
-
-    ``progress`` : called with the number of images done, and the number of all images.
-
-    Raises InputError: no image is readable, or the camera is not that of the images; the message names the first.
-    """
+    """Find the board, and the tags of ``dictionaries``, in all images that can be used; ``progress`` : called with
+    images done, and all. Raises InputError: no image is readable, or the camera is not that of the images."""
     if not files:
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")
     size, stated_by = None, MAJORITY

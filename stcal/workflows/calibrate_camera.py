@@ -174,10 +174,7 @@ eccentricity shrinks to less than a tenth with each round. Corners of chessboard
 
 
 def corner_grid(board: FlatBoard) -> CornerBoard:
-    """Returns the points of a board as a board of dots without extent.
-
-    Raises InputError: a board of another kind, whose points are not on a grid.
-    """
+    """Returns a board's points as dots without extent; raises InputError: points that are not on a grid."""
     if isinstance(board, TagLayout):
         raise InputError(
             "E-BOARD-TYPE",

@@ -96,8 +96,7 @@ class FromPhotos:
     notes: tuple[str, ...]
 
     def sigma_mm(self) -> np.ndarray:
-        """Returns predicted σ (t,) of the tool's position at the targets, mm; nan where a target is not reached, or its
-        tool was not measured."""
+        """Predicted σ (t,) of the tool at the targets, mm; nan if not reached, or the tool was not measured."""
         compensated, sigma = self.compensated, self.identified.predicted
         if compensated is None or sigma is None:
             return np.zeros(0)
@@ -105,8 +104,7 @@ class FromPhotos:
         return np.where(compensated.found.usable, at, np.nan)
 
     def moves(self) -> np.ndarray:
-        """Returns joint values to send minus those of the arm as drawn, (t, n), rad or mm; nan where one of them does
-        not exist."""
+        """Joint values to send minus those as drawn, (t, n), rad or mm; nan where one of them does not exist."""
         compensated = self.compensated
         if compensated is None or compensated.nominal is None:
             return np.zeros((0, len(self.nominal.rows)))
@@ -144,8 +142,7 @@ def story(result: FromPhotos) -> list[str]:
 
 
 def _at_targets(result: FromPhotos) -> list[str]:
-    """Returns sentences on the predicted error of the identified arm at the targets, and on the motion of the
-    joints."""
+    """Returns sentences on the predicted error of the identified arm at the targets, and the joints' motion."""
     sentences, sigma, moves = [], result.sigma_mm(), result.moves()
     finite, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
     prediction = result.identified.predicted
@@ -172,8 +169,7 @@ def _shown(result: FromPhotos, values: np.ndarray) -> np.ndarray:
 
 
 def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
-    """Returns the report: the story, errors of each model of the arm, and the links to other files. ``names`` : of the
-    other files."""
+    """Returns the report: the story, errors of each model of the arm, and links to the other files ``names``."""
     compensated, last = result.compensated, list(result.errors.values())[-1]
     before = (
         None
@@ -250,8 +246,7 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
 
 
 def _target_rows(result: FromPhotos) -> list[list[str]]:
-    """Returns, for each target, the error of its nominal joint values, the predicted σ, and the motion of the
-    joints."""
+    """Returns each target's error by nominal joint values, predicted σ, and motion of the joints."""
     compensated = result.compensated
     if compensated is None:
         return []
@@ -321,8 +316,7 @@ def files_of(result: FromPhotos) -> dict[str, str]:
 
 
 def require_files_written(out: Path, result: FromPhotos) -> None:
-    """Read the results, tables and robots of :func:`files_of` in folder ``out`` again, and require what was
-    reported."""
+    """Read the files of :func:`files_of` in ``out`` again, and require what was reported."""
     for name, content in _results(result).items():
         require_result_written(out / name, content)
     require_table_written(out / POSES, result.measured)
@@ -397,11 +391,8 @@ def robot_from_photos(
 
 
 def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: Robot) -> Table:
-    """Returns joint values with the name of each row's photograph in the column ``image``, which replaces ``key``.
-
-    Raises InputError: no such column, no row of the photographs, one twice, poses beside the joint values, or other
-    joints than the robot's.
-    """
+    """Returns joint values with each row's photograph as ``image``, which replaces ``key``. Raises InputError: no such
+    column, rows of no photograph or of one twice, poses beside them, or other joints than the robot's."""
     values, nowhere = read_table(path, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
     join_tables(files, values, key)
@@ -418,10 +409,8 @@ def from_measured(
     wanted: Targets | None = None,
     options: IdentifyOptions | None = None,
 ) -> FromPhotos:
-    """Perform the steps after the photographs are measured; arguments and errors as in :func:`robot_from_photos`.
-
-    ``values`` : table from :func:`read_joints`; ``wanted`` : targets to compensate.
-    """
+    """Perform the steps after measuring, for the table of :func:`read_joints`; otherwise as
+    :func:`robot_from_photos`."""
     with tempfile.TemporaryDirectory(prefix="stcal-photos-") as folder:
         poses_file = Path(folder) / POSES
         save(poses_file, poses_csv(measured)[0])

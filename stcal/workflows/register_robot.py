@@ -205,10 +205,8 @@ def _measurements(pairs: Pairs, joints: Measurements | Table | str | Path, robot
 
 
 def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
-    """Returns the identification from the good rows and from the rows that it then explains, and which rows were used.
-
-    Rows that the transform cannot explain because the arm bends its points are not outliers of the kinematics.
-    """
+    """Returns the identification from good rows and those that it then explains, and which were used. Rows that only
+    the bending arm puts off the transform are no outliers of the kinematics."""
     identified = identify(robot, data[good], settings)
     for _ in range(ROUNDS):
         error = np.linalg.norm(data.positions - positions(identified.robot, data), axis=1)

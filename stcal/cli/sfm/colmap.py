@@ -12,10 +12,6 @@ from stcal.errors import InputError, MappingError
 app = typer.Typer()
 
 
-Chained = Literal["chain", "paper"]
-"""Way in which the faces of single groups are combined."""
-
-
 @app.command(name="export-database")
 def export_database(
     run: Run,
@@ -112,7 +108,7 @@ def faces(
     run: Annotated[Path, "Read the run in this folder, from whose database the model was mapped."],
     out: Annotated[Path | None, "Also write the faces to this file, in the form of faces.json.", WRITES] = None,
     solve: Annotated[
-        Chained,
+        Literal["chain", "paper"],
         "Solve by chain, a weighted mean over all chains to a face; or as in the paper, λ by rows, three-point "
         "frames and single transforms.",
     ] = "chain",

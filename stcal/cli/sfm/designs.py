@@ -335,9 +335,6 @@ def demo(
     say(comparison_table(comparison))
 
 
-TagBody = Literal["cube", "dodecahedron"]
-
-
 CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
 """Defaults of `design`."""
 
@@ -375,7 +372,9 @@ def design(
         "Make it for a box of this width, height and depth, W,H,D in mm; with --tags, give the width between "
         "opposite faces.",
     ],
-    tags: Annotated[TagBody | None, "Make a cube or dodecahedron with a tag on each face and no board."] = None,
+    tags: Annotated[
+        Literal["cube", "dodecahedron"] | None, "Make a cube or dodecahedron with a tag on each face and no board."
+    ] = None,
     dictionary: Annotated[str, "Take the tags of --tags from this dictionary."] = DICTIONARY,
     first_id: Annotated[int, "Number the tags of --tags from this id.", Opt(min=0, max=100_000)] = 0,
     faces: Annotated[

@@ -14,10 +14,6 @@ from stcal.io.files import keep_apart
 app = typer.Typer()
 
 
-ComparedWith = Literal["paper"]
-"""Method with which a run's result is compared."""
-
-
 Solve = Literal["joint", "chain", "paper"]
 """Way in which the groups are solved."""
 
@@ -60,7 +56,7 @@ def run(
     ] = False,
     board_only: Annotated[bool, "Use only the board, even if other circles are in view: λ and residuals."] = False,
     compare: Annotated[
-        ComparedWith | None,
+        Literal["paper"] | None,
         "Solve the same photographs as published too (paper), and show what each later step improves.",
     ] = None,
     exclude: shared.Exclude = None,
@@ -204,12 +200,15 @@ def budget(
     strict: shared.StrictByDefault = True,
 ) -> None:
     """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
-    from stcal.report.document import pdf_of
+    from stcal.report.document import pdf_of, require_pdf
     from stcal.sfm.budget.of_run import uncertainty_budget
     from stcal.sfm.budget.sources import fields_of
 
-    if pdf:
-        _require_pdf(page, run)
+    if pdf and page is None:
+        raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")
+    if pdf and page is not None:
+        keep_apart([("--pdf", page.with_suffix(".pdf"))], [("RUN", run)])
+        require_pdf()
     fields = fields_of(field or ())
     result = uncertainty_budget(run, statement, fields, check_lengths, lengths, lengths_statement)
     document = result.document()
@@ -221,16 +220,3 @@ def budget(
         if pdf:
             write(page.with_suffix(".pdf"), pdf_of(html), "PDF")
     shared.require_usable(strict, result.refusals, page)
-
-
-def _require_pdf(page: Path | None, run: Path) -> None:
-    """Refuses, before the work, a PDF without a page or a place.
-
-    Raises InputError if there is no page, or the extra ``pdf`` is not installed.
-    """
-    from stcal.report.document import require_pdf
-
-    if page is None:
-        raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")
-    keep_apart([("--pdf", page.with_suffix(".pdf"))], [("RUN", run)])
-    require_pdf()

@@ -227,8 +227,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
 
 def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
-    """Returns poses ``wanted``, their covariances and what their errors have in common, from the columns of ``wanted``
-    or of its inverse."""
+    """Returns poses ``wanted``, their covariances and common errors, from columns of ``wanted`` or of its inverse."""
     names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
@@ -340,11 +339,8 @@ class Loop:
         return chain.difference(Poses.of([stand_from_board] * len(self)))
 
     def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
-        """Returns the derivative (m, 6, 13) of :meth:`residuals` by left perturbations of X and Z, and by the scale.
-
-        The dependence of the rotation's derivative on the size of the residual is neglected. Its contribution to the
-        gradient of a squared rotation residual is zero, since φ × φ = 0.
-        """
+        """Returns the derivative (m, 6, 13) of :meth:`residuals` by left perturbations of X and Z, and by the scale;
+        that of the rotation is for small residuals, which leaves the gradient exact as φ × φ = 0."""
         to_stand = self.stand_from_mount.rotation
         arm = self.camera_from_board.translation @ mount_from_camera.rotation.T
         derivative = np.zeros((len(self), 6, 13))
@@ -375,11 +371,8 @@ LARGEST_RAD = np.radians(170)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motions:
-    """k motions between two poses each.
-
-    ``first``, ``second`` : (k,) poses i, j; ``mount`` : mount_j_from_mount_i, A; ``camera`` : camera_j_from_camera_i,
-    B; ``alpha``, ``beta`` : (k, 3) their rotation vectors, rad.
-    """
+    """k motions from ``first`` to ``second``, (k,) poses i, j: ``mount`` : mount_j_from_mount_i, A; ``camera`` :
+    camera_j_from_camera_i, B; ``alpha``, ``beta`` : (k, 3) their rotation vectors, rad."""
 
     first: np.ndarray
     second: np.ndarray
@@ -420,10 +413,7 @@ class Motions:
         return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
 
     def with_log(self, method: str) -> "Motions":
-        """Returns the motions that satisfy :meth:`has_log`.
-
-        Raises DegenerateError: fewer than two motions do.
-        """
+        """Returns the motions that satisfy :meth:`has_log`; raises DegenerateError: fewer than two do."""
         good = self.has_log()
         if good.sum() < 2:
             raise DegenerateError(
@@ -435,8 +425,7 @@ class Motions:
 
 
 def poses_with_log(loop: Loop) -> np.ndarray:
-    """Returns which poses (m,) to use so that the logarithm between any two of them is well-conditioned. Poses with
-    most ill-conditioned motions are left out first."""
+    """Returns which poses (m,) to use so that the logarithm between any two of them is well-conditioned."""
     motions, used = Motions.all(loop), np.ones(len(loop), bool)
     bad = ~motions.has_log()
     while bad.any():

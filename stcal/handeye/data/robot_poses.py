@@ -38,10 +38,8 @@ class RobotPoses:
         return Path(self.where.removeprefix("robot poses ")).name
 
     def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
-        """Returns the row by image, the images of rows without a partner, and how they were matched.
-
-        The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
-        the ends of names; poses without names, by order. The last result is empty where images are matched by name.
+        """Returns the row by image, the images of rows without a partner, and how they were matched if not by name.
+        Where no name fits, times or numbers at the ends of names match; poses without names, the order.
 
         Raises InputError: a name fits two images, or poses without names are not as many as the images.
         """
@@ -70,11 +68,8 @@ class RobotPoses:
         )
 
     def rows(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...]]:
-        """Returns the row of each of ``names`` that has one, and the images of rows that are not in ``names``.
-
-        A row may give the name without its folder, or without its ending too, as long as no other image has the same
-        name.
-        """
+        """Returns the row of each of ``names`` that has one, and the images of rows that are not among them. Names may
+        lack folder and ending where that leaves one image."""
         short: dict[str, list[str]] = {}
         for name in names:
             file_name = name.rsplit("/", 1)[-1]
@@ -101,15 +96,11 @@ class RobotPoses:
 
 
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: Said | None = None) -> RobotPoses:
-    """Read the robot's poses in any format of :mod:`stcal.handeye.data.formats`.
+    """Read the robot's poses in any format of :mod:`stcal.handeye.data.formats`, or CSV with columns ``image`` or
+    ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
-    A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
-
-    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
-    ``statements`` : the user's statements about what a file of another program does not state itself.
-
-    Raises InputError: missing columns, values that are not finite or quaternions that are not of unit length, named by
-    line, or an image that has two rows.
+    Raises InputError: missing columns, values that are not finite, quaternions not of unit length, or an image that has
+    two rows.
     """
     path, statements = Path(path), statements or Said()
     poses = read_robot(path, statements, "image", quaternions)

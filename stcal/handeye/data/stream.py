@@ -52,10 +52,7 @@ class Stream:
 
     @classmethod
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
-        """Returns the stream of samples that may be in any order.
-
-        Raises InputError: fewer than two samples, or two samples of one time.
-        """
+        """Returns the stream of samples in any order; raises InputError: fewer than two samples, or two of one time."""
         if len(times) < 2:
             raise InputError(
                 "E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream"
@@ -74,11 +71,8 @@ class Stream:
         return np.array([float(time - self.origin) for time in times])
 
     def at(self, seconds: np.ndarray) -> Poses:
-        """Returns poses (k,) at times after the origin, each from a cubic through the four samples about it (Lagrange).
-
-        Rotations are interpolated as rotation vectors from the sample before. Outside the samples the cubic is
-        extrapolated and should not be used.
-        """
+        """Returns poses (k,) at times after the origin, each from the cubic through four samples about it (Lagrange),
+        in rotation vectors from the sample before. Do not use it outside the samples."""
         n, width = len(self), min(WINDOW, len(self))
         before = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, n - 2)
         nodes = np.clip(before - 1, 0, n - width)[:, None] + np.arange(width)
@@ -95,11 +89,8 @@ class Stream:
         return float(np.median(np.diff(self.seconds)))
 
     def rest(self) -> tuple[float, float]:
-        """Returns σ of one sample (rad, mm).
-
-        It is computed from the RMS deviation of samples from the cubic through their four neighbours. It holds where
-        the deviation is noise; the error of interpolation is smaller. Fewer than five samples give NaN.
-        """
+        """Returns σ of one sample (rad, mm), by samples' deviations from the cubic through their four neighbours; NaN
+        if fewer than five. It holds where these are noise."""
         n = len(self)
         if n < WINDOW + 1:
             return float("nan"), float("nan")
@@ -144,8 +135,7 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timed:
-    """``stream`` of the robot's poses; ``seconds`` : (m,) times of the pairs after the stream's origin, by the camera's
-    clock."""
+    """``seconds`` : (m,) times of the pairs after the stream's origin, by the camera's clock."""
 
     stream: Stream
     seconds: np.ndarray

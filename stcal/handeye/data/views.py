@@ -103,8 +103,7 @@ class Views(Brief):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resection:
-    """``camera_from_board`` : m poses; ``covariance`` : (m, 6, 6); ``sigma_px`` : factor of the corners' σ (σ itself
-    where views state no covariance), from all residuals."""
+    """``covariance`` : (m, 6, 6) of the poses; ``sigma_px`` : σ of the corners, or factor on their stated one."""
 
     camera_from_board: Poses
     covariance: np.ndarray
@@ -112,11 +111,8 @@ class Resection:
 
 
 def resect(views: Views, names: tuple[str, ...]) -> Resection:
-    """Returns the pose of the board in each view by itself, of least reprojection error.
-
-    Raises DegenerateError: fewer than four corners in a view, or in all its planes, or all on a line; the message names
-    the view.
-    """
+    """Returns the pose of the board in each view, of least reprojection error. Raises DegenerateError naming the view:
+    fewer than four corners in it, or in all its planes, or all on a line."""
     poses, normals, cost = [], [], 0.0
     for view, name in zip(views.views, names, strict=True):
         minimum = _pose_of(view, views.camera, name)
@@ -179,8 +175,7 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
 
 
 def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Returns residuals (2k,) of a view's corners in units of their σ, and their derivative (2k, 6) by the board's
-    pose."""
+    """Returns residuals (2k,) of a view's corners over σ, and their derivative (2k, 6) by the board's pose."""
     weight = view.whitening()
     rotated = view.xyz_board @ camera_from_board.rotation.T
     px, by_point = project_jacobian(camera, rotated + camera_from_board.translation)
@@ -226,10 +221,8 @@ def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
 
 
 def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
-    """Returns the rows of the corners of each plane that has enough of them, and board_from_plane, with Z the normal.
-
-    Adjusted corners leave their plane by a little. A plane therefore ends only where the next corner is far above it.
-    """
+    """Returns the rows of each plane with enough corners, and board_from_plane, with Z the normal. A plane ends where
+    the next corner is far above it, as adjusted corners leave theirs by a little."""
     normals, planes = view.normals(), []
     extent = np.linalg.norm(np.ptp(view.xyz_board, axis=0))
     open_rows = np.ones(len(view), bool)

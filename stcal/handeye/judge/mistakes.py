@@ -50,16 +50,11 @@ Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 def check_conventions(
     pairs: HandEyePoses, loop: Loop, setup: Setup, guess: Guess, with_scale: bool, by_images: bool
 ) -> tuple[str, ...]:
-    """Refuse poses that fit far better in another convention, or in none.
+    """Refuse poses that fit far better in another convention, or in none; return notes on what the fit cannot decide.
+    With both sides inverted, X and Z change places, and only a board behind the camera shows it.
 
-    Otherwise return notes on what the fit cannot decide. With both sides inverted, X and Z change places and the
-    residuals stay the same. Only a board behind the camera shows this error.
-
-    ``loop`` : the loop of ``pairs``; ``guess`` : function of a loop and of whether the board's scale is free; it
-    returns X, Z and the scale; ``with_scale`` : whether the board's scale is free; ``by_images`` : whether the board's
-    poses come from images, so that only the robot's poses can be named wrongly.
-
-    Raises InputError: the message says what is mixed up, and the remedy.
+    ``guess`` : returns X, Z and scale of a loop; ``by_images`` : the board's poses come from images, so that only the
+    robot's can be named wrongly. Raises InputError: the message says what is mixed up, and the remedy.
     """
     as_read, notes = _typical(loop, guess, with_scale), ()
     if as_read[0] > WELL[0] or as_read[1] > WELL[1]:
@@ -151,8 +146,7 @@ def _best(as_read: tuple[float, float], typical: dict[str, tuple[float, float]])
 
 
 def _with_its_like(convention: str, typical: dict[str, tuple[float, float]]) -> str:
-    """Returns the convention, and the readings of angles that leave the same residuals: how they were read tells which
-    one it is."""
+    """Returns the convention, and readings of angles with the same residuals: how they were read tells which it is."""
     start, angles, first = convention.partition(OTHER_ANGLES)
     if not angles:
         return convention
@@ -274,18 +268,15 @@ def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
 
 
 def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop with either side's lengths in the other unit; the key says what to do.
-
-    Residuals show only the ratio of the two units: metres taken for mm on one side look like mm taken for metres on
-    the other. Lengths beyond :data:`HALL_MM` show which it is.
-    """
+    """Returns the loop with either side's lengths in the other unit, by what to do. Residuals show only the ratio of
+    the units; lengths beyond :data:`HALL_MM` tell which side it is."""
     variants = {}
     for side, other in (("robot", "board"), ("board", "robot")):
         factor, which = 1000.0, side
         remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
             remedy = "if the size in its file is in metres, correct that"
-        if _typical_length(_of_side(loop, other)) > HALL_MM:
+        if np.median(np.linalg.norm(_of_side(loop, other).translation, axis=1)) > HALL_MM:
             factor, which = 1e-3, other
             role = "robot" if other == "robot" else "camera"
             remedy = (
@@ -316,20 +307,14 @@ def _of_side(loop: Loop, side: str) -> Poses:
     return loop.stand_from_mount if side == "robot" else loop.camera_from_board
 
 
-def _typical_length(poses: Poses) -> float:
-    return float(np.median(np.linalg.norm(poses.translation, axis=1)))
-
-
 def _read_as(reading: Reading, poses: Poses, inverted: bool = False) -> Poses:
-    """Returns the poses read with quaternions in another convention. ``inverted`` : the inverses of ``poses`` were
-    read."""
+    """Returns the poses read with quaternions in another convention; ``inverted`` : their inverses were read."""
     right = reading.poses(poses.inverse() if inverted else poses)
     return right.inverse() if inverted else right
 
 
 def _differ(loop: Loop) -> tuple[float, float]:
-    """Returns the RMS deviation of the poses from their mean: angle (rad), and place (mm) of flange or board, whichever
-    moved more."""
+    """Returns the RMS deviation of poses from their mean: rad, and mm of flange or board, whichever moved more."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     turn = hand.rotation @ mean_pose(hand).rotation.T
     angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
@@ -373,14 +358,10 @@ class Repair:
 
 
 def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:
-    """Give all views the same numbering of a symmetric board.
+    """Give all views the most common numbering of a symmetric board. Angle and advance of robot and camera between two
+    poses agree whatever X is.
 
-    Between two poses, robot and camera turn by the same angle and advance by the same length along the axis, whatever X
-    is. This tells which numberings belong together. The most common numbering is kept.
-
-    ``symmetries`` : all board_from_board except the identity that map the board onto itself.
-
-    Raises DegenerateError: fewer than three poses.
+    ``symmetries`` : all board_from_board except the identity. Raises DegenerateError: fewer than three poses.
     """
     loop, every = Loop.of(pairs, setup), (Rigid(), *symmetries)
     as_numbered = loop.camera_from_board
@@ -390,7 +371,9 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         labels, cost = _settled(loop, variants, labels)
         if cost < least:
             best, least = labels, cost
-    best = _most_as_they_are(best, every)
+    # Label k of a view means C S_k. All views are turned by S_common⁻¹ from the right, so that most stay as they are.
+    common_inverse = every[int(np.bincount(best).argmax())].inverse()
+    best = np.array([_nearest(every[k] @ common_inverse, every) for k in best])
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
     covariance, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
     carried = _carried(as_numbered, poses)
@@ -407,8 +390,7 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
 
 
 def _guesses(loop: Loop, variants: list[Poses]) -> np.ndarray:
-    """Returns labels (m, m). Each row holds, with one pose as the reference, the numbering of every pose that agrees
-    best with the robot's motion."""
+    """Returns labels (m, m): with each pose as reference, the numberings that agree best with the robot's motion."""
     hand, m = loop.stand_from_mount, len(loop)
     labels = np.zeros((m, m), int)
     for reference in range(m):
@@ -425,8 +407,7 @@ def _guesses(loop: Loop, variants: list[Poses]) -> np.ndarray:
 
 
 def _invariants(motions: Poses) -> np.ndarray:
-    """Returns the angle (rad) and the advance along the axis (mm) of motions, (m, 2). They are the same for A and B
-    where AX = XB."""
+    """Returns angle (rad) and advance along the axis (mm) of motions, (m, 2), equal for A and B where AX = XB."""
     log = Rotation.from_matrix(np.array(motions.rotation)).as_rotvec()
     angle = np.linalg.norm(log, axis=1)
     axis = log / np.maximum(angle, 1e-12)[:, None]
@@ -451,22 +432,13 @@ def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.
     return labels, float(np.min(costs, axis=0).sum())
 
 
-def _most_as_they_are(labels: np.ndarray, every: tuple[Rigid, ...]) -> np.ndarray:
-    """Returns the same numbering after one turn of all views, chosen so that most views stay as they are."""
-    common = int(np.bincount(labels).argmax())
-    common_inverse = every[common].inverse()
-    # Label k of a view means C S_k. All are turned by S_common⁻¹ from the right; S_k S_common⁻¹ is again in the group.
-    return np.array([_nearest(every[k] @ common_inverse, every) for k in labels])
-
-
 def _nearest(turn: Rigid, every: tuple[Rigid, ...]) -> int:
     angles = [Rigid(symmetry.rotation.T @ turn.rotation).angle_rad() for symmetry in every]
     return int(np.argmin(angles))
 
 
 def _carried(seen: Poses, poses: Poses) -> np.ndarray:
-    """Returns the derivative (m, 6, 6) of errors of camera_from_board when its origin moves on the board: the error of
-    the rotation moves the origin too."""
+    """Returns the derivative (m, 6, 6) of errors of camera_from_board when its origin moves on the board."""
     jacobian = np.tile(np.eye(6), (len(poses), 1, 1))
     jacobian[:, 3:, :3] = -skew(poses.translation - seen.translation)
     return jacobian

@@ -88,11 +88,8 @@ class Observability:
 
 
 def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
-    """Refuse a loop that cannot be solved, and return its observability.
-
-    Raises DegenerateError: fewer than three poses, rotations about one axis only (unless ``four_dof``), or no
-    rotations.
-    """
+    """Returns the observability of a loop. Raises DegenerateError: fewer than three poses, rotations about one axis
+    only (unless ``four_dof``), or none."""
     if len(loop) < LEAST_POSES:
         raise DegenerateError(
             "E-HANDEYE-FEW-POSES",
@@ -131,10 +128,7 @@ def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
 
 
 def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
-    """Refuse a scale that the motions do not determine, or that is implausible.
-
-    Raises DegenerateError: the message says how far the flange moves, and that it should move farther.
-    """
+    """Refuse a scale that is implausible or that the motions leave open; the DegenerateError says how far to move."""
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
             raise DegenerateError(
@@ -164,8 +158,7 @@ def unit_of(scale: float) -> str:
 
 
 def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the RMS angles (3,) about the principal axes (3, 3), in rows, of R_j R_iᵀ between all pairs of rotations
-    (m, 3, 3)."""
+    """Returns RMS angles (3,) about principal axes (3, 3), in rows, of R_j R_iᵀ of all pairs of rotations (m, 3, 3)."""
     i, j = np.triu_indices(len(rotations), 1)
     if len(i) > MOST_PAIRS:
         some = np.random.default_rng(0).choice(len(i), MOST_PAIRS, replace=False)
@@ -178,11 +171,8 @@ def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _worst(loop: Loop) -> tuple[float, float]:
-    """Returns the largest σ of X's rotation (rad) and translation (mm) from poses of a common camera.
-
-    X is found in two steps: the rotation from rotations alone, then the translation with the rotation known. Both σ
-    depend on how the robot turned, not on X.
-    """
+    """Returns the largest σ of X's rotation (rad), from rotations alone, and of its translation (mm) with the rotation
+    known, from poses of a common camera. Both depend on how the robot turned, not on X."""
     turn = loop.stand_from_mount.rotation
     m, mean = len(turn), turn.mean(0)
     # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations.

@@ -133,10 +133,8 @@ def spoken(name: str) -> str:
 def of_outliers(
     names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray
 ) -> tuple[str, ...]:
-    """Returns notes on the poses that were left out, (m,), with their residuals (m, 6).
-
-    ``flips`` : (m,) those that agree with the others when they are tilted the other way.
-    """
+    """Returns notes on the poses left out, (m,), by residuals (m, 6); those of ``flips`` agree if tilted the other
+    way."""
     notes = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
@@ -175,8 +173,7 @@ def of_still(pairs: HandEyePoses) -> tuple[str, ...]:
 
 
 def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
-    """Returns a note if poses with these residuals (m, 6) fall into two groups, as they do when a board is moved in
-    between."""
+    """Returns a note if poses with residuals (m, 6) fall into two groups, as when a board is moved in between."""
     if len(names) < LEAST_IN_GROUPS:
         return ()
     for columns, unit, word in ((slice(0, 3), np.degrees(1.0), "°"), (slice(3, 6), 1.0, " mm")):
@@ -199,11 +196,8 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
 
 
 def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray) -> tuple[str, ...]:
-    """Returns a note if camera or board moved between two poses, or drifts along them.
-
-    ``residuals`` : (m, 6) in the order of the poses, outliers too; ``jacobian`` : (m, 6, 12) by X and Z. A move is
-    named only if it explains most of the residuals, as errors of robot and camera may vary with the order, too.
-    """
+    """Returns a note if camera or board moved or drifted, by residuals (m, 6) in order, outliers too, and their
+    jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals."""
     parts = residuals.reshape(-1, 2, 3)
     sigma = np.repeat(np.median(np.linalg.norm(parts, axis=2), axis=0), 3)
     if not (sigma > 0).all():
@@ -263,16 +257,14 @@ def of_distance(loop: Loop) -> tuple[str, ...]:
 
 
 def of_rounds(settled: bool) -> tuple[str, ...]:
-    """Returns a note if the σ that are estimated from the residuals, or the set of poses taken to be good, still change
-    at the end."""
+    """Returns a note if the estimated σ, or the set of good poses, still change at the end."""
     if settled:
         return ()
     return ("the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses",)
 
 
 def of_variance(factor: float, redundancy: int) -> tuple[str, ...]:
-    """Returns a note if the residuals are not as large as the stated σ make expect. ``factor`` is the mean square of
-    the residuals in units of σ, over this ``redundancy``."""
+    """Returns a note if the mean square of residuals over σ, ``factor``, is not 1 within chance."""
     low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
     if low <= factor <= high:
         return ()
@@ -286,8 +278,7 @@ MOST = 2000
 
 
 def spread_text(base_from_flange: Poses, setup: Setup) -> list[str]:
-    """Returns the axes about which the flange turns, its largest rotation between two poses, the box of its places, and
-    the motions that are missing."""
+    """Returns the flange's axes, its largest rotation, the box of its places, and the motions that are missing."""
     m = len(base_from_flange)
     if m < LEAST_POSES:
         return [f"motions: {m} poses, {LEAST_POSES} needed and 10 wanted"]

@@ -25,8 +25,7 @@ PARTS = ("arm_rad", "arm_mm")
 
 @runtime_checkable
 class ArmModel(Protocol):
-    """An arm with k parameters and m joint vectors. The parameters are small motions of the axes, 0 where the arm is as
-    its file says."""
+    """An arm with k parameters, small motions of the axes about the arm's file, and m joint vectors."""
 
     @property
     def angles(self) -> np.ndarray:
@@ -72,8 +71,7 @@ class LinearArm:
         return Poses(turn @ base_from_flange.rotation, base_from_flange.translation + motion[:, 3:])
 
     def slope_after(self, step: np.ndarray) -> np.ndarray:
-        """Returns the derivative (m, 6, k) of :meth:`moved`, left perturbation. It depends on the step, since rotation
-        vectors do not add."""
+        """Returns the derivative (m, 6, k) of :meth:`moved`, left, at a step: rotation vectors do not add."""
         turn = np.einsum("mak,k->ma", self.slope[:, :3], step)
         cross = skew(turn)
         to_left = np.eye(3) + cross / 2 + cross @ cross / 6  # series for rotations of some mrad
@@ -95,8 +93,7 @@ CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """The unknowns: X, Z, the true base_from_flange (m), the board's corners (K, 3), camera, scale, and a step of the
-    arm's parameters (k,)."""
+    """The unknowns: X, Z, true base_from_flange (m), corners (K, 3), camera, scale, and a step (k,) of the arm."""
 
     mount_from_camera: Rigid
     stand_from_board: Rigid
@@ -233,8 +230,7 @@ class Corners:
         )
 
     def with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> "Corners":
-        """Returns the same problem with intrinsics among the unknowns, about ``camera``. The factors of their prior σ
-        start at 1."""
+        """Returns the problem with intrinsics about ``camera`` among the unknowns, factors of their prior σ at 1."""
         wider = replace(self, basis=basis, information=information)
         return replace(wider, sigma=wider.sigma | wider.factors())
 
@@ -301,8 +297,7 @@ class Corners:
         return Group(cost, {name: Part(len(white), replace(own, cost=cost))})
 
     def _robot_group(self, state: Bundle) -> "Group":
-        """Returns the observations of the robot's poses. Rotation and translation have a σ each, unless covariances are
-        stated."""
+        """Returns the robot's poses as observations; rotation and translation have a σ each, or stated covariances."""
         first, weight = self.places()["robot"].start, self.robot_weight()
         white = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.by_arm(state.arm)))
         length = np.linalg.norm(white, axis=1)
@@ -361,11 +356,8 @@ class Corners:
 
 
 def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Returns the groups of intrinsics whose prior σ may be wrong by a factor of their own, and their rows.
-
-    These are kinds of intrinsics, or all intrinsics where they are correlated.
-    ``basis`` : (16, q) of the intrinsics; ``information`` : (q, q) about them.
-    """
+    """Returns names and rows of the intrinsics with a factor on their prior σ: by kind, or all if they are correlated.
+    ``basis`` : (16, q) of the intrinsics; ``information`` : (q, q)."""
     first = basis.argmax(0)
     if np.count_nonzero(information - np.diag(np.diag(information))):
         return [("camera_all", np.arange(len(first)))]

@@ -67,11 +67,8 @@ def _in_board_units(shift: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
-    """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along the axis.
-
-    The rotations give the direction of the axis in the camera. The angle about it comes from the translations, linear
-    in its cosine and sine; their length is the scale.
-    """
+    """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along it.
+    Translations give the angle about it, and the scale."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     motions = Motions.all(loop)
     motions = motions[motions.has_log()]
@@ -96,7 +93,9 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
     x = (about * turn).as_matrix()
     z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
-    t_x, t_z, _ = _translations(_scaled(loop, scale), np.arange(len(loop))[None], x[None], False)
+    eye = loop.camera_from_board
+    scaled = replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
+    t_x, t_z, _ = _translations(scaled, np.arange(len(loop))[None], x[None], False)
     return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
 
 
@@ -108,8 +107,7 @@ def slid(x: Rigid, z: Rigid, mount_axis: np.ndarray, loop: Loop) -> tuple[Rigid,
 
 
 def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
-    """Returns X, Z and scale of subsets (s, k) of the poses: rotations (s, 3, 3) and translations (s, 3) of each, and
-    scales (s,)."""
+    """Returns X, Z and scale of subsets (s, k): rotations (s, 3, 3) and translations (s, 3) of each, scales (s,)."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     # R_G R_X R_C = R_Z: Σ R_C ⊗ R_G maps vec R_X to k vec R_Z, both of one length. They are the first singular vectors.
     k = np.einsum("mab,mcd->madbc", hand.rotation, eye.rotation).reshape(len(loop), 9, 9)
@@ -122,8 +120,7 @@ def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarr
 
 
 def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
-    """Returns t_X and t_Z, (s, 3), and scales (s,) for rotations of X (s, 3, 3), from R_G t_X + s R_G R_X t_C − t_Z =
-    −t_G. Where they are not unique, the shortest is returned."""
+    """Returns the shortest t_X and t_Z (s, 3), and scales (s,), for R_X: R_G t_X + s R_G R_X t_C − t_Z = −t_G."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     rows = np.concatenate([hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2)[subsets]
     moved = np.einsum("skab,sbc,skc->ska", hand.rotation[subsets], x, eye.translation[subsets])
@@ -135,11 +132,6 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
     s = len(subsets)
     solved = (np.linalg.pinv(rows.reshape(s, -1, rows.shape[3]), rcond=1e-9) @ right.reshape(s, -1, 1))[:, :, 0]
     return solved[:, :3], solved[:, 3:6], solved[:, 6] if with_scale else np.ones(s)
-
-
-def _scaled(loop: Loop, scale: float) -> Loop:
-    eye = loop.camera_from_board
-    return replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
@@ -170,12 +162,8 @@ AX_ZB = {"shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": cv2.CALIB_ROBOT_WORL
 
 
 def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid, Rigid]:
-    """Returns X and Z by one of :data:`AX_XB` or :data:`AX_ZB`; ``unit_mm`` is the length that weighs like one radian.
-
-    AX = XB does not contain Z: Z is then the mean of the chains.
-
-    Raises ConvergenceError: OpenCV fails, or its result is not a rigid transform.
-    """
+    """Returns X and Z by one of :data:`AX_XB`, whose Z is the mean of the chains, or :data:`AX_ZB`; ``unit_mm`` weighs
+    like one radian. Raises ConvergenceError: OpenCV fails, or its result is not a rigid transform."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     try:
         with quiet_opencv():  # of few poses it prints lines of its own
@@ -235,8 +223,7 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
 
 
 def equations(motions: Motions, unit_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns C (k, 12, 12) and d (k, 12) of the residuals R_A R_X − R_X R_B and (R_A − I) b_X − R_X b_B + b_A; x holds
-    R_X by columns."""
+    """Returns C (k, 12, 12), d (k, 12) of R_A R_X − R_X R_B and (R_A − I) b_X − R_X b_B + b_A; x has R_X by columns."""
     a, b, k = motions.mount, motions.camera, len(motions)
     eye = np.eye(3)
     c, d = np.zeros((k, 12, 12)), np.zeros((k, 12))
@@ -250,10 +237,8 @@ def equations(motions: Motions, unit_mm: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Returns the x that minimises the largest ‖C_i x − d_i‖, from a start.
-
-    Raises ConvergenceError: the result is not proven to be within :data:`GAP` of the minimum.
-    """
+    """Returns the x of least largest ‖C_i x − d_i‖, from a start; raises ConvergenceError if not proven within
+    :data:`GAP`."""
     scale = np.linalg.norm(np.einsum("kij,j->ki", c, x) - d, axis=1).max()
     if scale < 1e-12:  # the start has no residuals
         return x

@@ -85,8 +85,7 @@ class Equations:
         )
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the damped step of the kept unknowns and then of the corners, and the predicted decrease of the
-        cost."""
+        """Returns the damped step of kept unknowns, then corners, and the predicted decrease of the cost."""
         kept, corners = self.eliminated(float(damping)).step()
         step = np.concatenate([kept, corners.ravel()])
         gain = -2 * float(kept @ self.gradient + (corners * self.slope).sum())

@@ -147,13 +147,8 @@ class Objective:
 
 
 def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, closed_form: Rigid | None = None) -> Rigid:
-    """Returns the best candidate of the last generation.
-
-    The bounds limit the first population only; mutants may leave them.
-
-    ``reach_mm`` : half width of the translation's bounds
-    where the options have none; ``closed_form`` : centre of bounds that have no centre.
-    """
+    """Returns the best candidate of the last generation; bounds limit the first one only. ``reach_mm``, ``closed_form``
+    : half width and centre of bounds that have none."""
     rng, size = np.random.default_rng(options.seed), options.population
     about = np.zeros(6) if closed_form is None else closed_form.log()
     parts = options.bounds_rad, options.bounds_mm or Bounds(reach_mm)
@@ -183,9 +178,6 @@ def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
 
 
 def polish(objective: Objective, x: Rigid) -> Rigid:
-    """Returns the minimum of the objective next to X.
-
-    Raises ConvergenceError: no minimum is reached.
-    """
+    """Returns the minimum of the objective next to X; raises ConvergenceError."""
     minimum = minimise(x, objective.linear, perturbed, least_gain=EXACT)
     return minimum.required("differential evolution", "check the poses that fit worst").state

@@ -53,13 +53,9 @@ class CameraError:
 
 
 def considered(wider: Corners, state: Bundle, free: tuple[str, ...]) -> CameraError:
-    """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``.
-
-    Parameters that are not solved for, but are not exact either, are *considered* (Schmidt 1966; Bierman,
-    "Factorization Methods for Discrete Sequential Estimation", 1977, ch. VIII): their prior covariance is carried
-    through the solution. Corners that are off by the camera's error make all ``free`` σ too large. These σ are
-    therefore estimated again with the intrinsics among the unknowns, linear about the state.
-    """
+    """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``: they are
+    *considered* (Schmidt 1966; Bierman 1977, ch. VIII), that is, their prior covariance is carried through. ``free`` σ,
+    too large by the camera's error, are estimated again with them, linear about the state."""
     factors, poses = wider.factors(), wider.places()["z"].stop
     sigma = wider.sigma | estimated(wider, state, (*free, *factors))
     camera = np.arange(wider.places()["camera"].start, wider.places()["camera"].stop)
@@ -92,24 +88,19 @@ def considered(wider: Corners, state: Bundle, free: tuple[str, ...]) -> CameraEr
 
 
 def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior) -> CameraError:
-    """Returns the camera error of an adjustment of the board's poses, each of which was found from its view with the
-    camera as filed."""
+    """Returns the camera error of board poses adjusted with the camera as filed."""
     basis = intrinsic_basis(prior.colmap_model)
     by_camera, second_moment = poses_by_camera(views, loop.camera_from_board, basis, prior)
     return CameraError(_slope(loop, solution, by_camera), second_moment)
 
 
 def in_common(loop: Loop, solution: PoseSolution, common: np.ndarray) -> CameraError:
-    """Returns the effect of errors (m, 6, k) that the board's poses have in common, which their residuals hardly show.
-
-    The poses were weighed by their other errors alone.
-    """
+    """Returns the effect of errors (m, 6, k) that the board's poses have in common; they were weighed by the others."""
     return CameraError(_slope(loop, solution, common), np.eye(common.shape[2]))
 
 
 def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
-    """Returns the derivative (12, q) of the gradient of X and Z, from that of the board's poses (m, 6, q); (13, q) with
-    the scale, which takes up errors that all distances have in common, if it was solved for."""
+    """Returns the derivative (12, q), or (13, q) with the scale, of the gradient, from the board's poses (m, 6, q)."""
     used = np.flatnonzero(~solution.outliers)
     state: LoopState = solution.state
     jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, : len(solution.normal)]
@@ -121,8 +112,7 @@ def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.nda
 def poses_by_camera(
     views: Views, camera_from_board: Poses, basis: np.ndarray, prior: CameraPrior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the derivative (m, 6, q) of the board's pose in each view by the intrinsics, and the :func:`moment` (q,
-    q) of the intrinsics."""
+    """Returns the derivative (m, 6, q) of the board's poses by the intrinsics, and the intrinsics' :func:`moment`."""
     q = basis.shape[1]
     information, gradient, cost, slopes = np.zeros((q, q)), np.zeros(q), 0.0, []
     for view, pose in zip(views.views, camera_from_board, strict=True):
@@ -142,11 +132,8 @@ def poses_by_camera(
 
 
 def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, prior: CameraPrior) -> np.ndarray:
-    """Returns the second moment (q, q) of the intrinsics' error: squared estimate plus covariance.
-
-    Where the corners contradict the prior, the prior σ are widened by kind, as an adjustment of the intrinsics would
-    do. The factors maximise the likelihood by expectation and maximisation (Dempster, Laird & Rubin 1977).
-    """
+    """Returns the second moment (q, q) of the intrinsics' error: squared estimate plus covariance. Where corners
+    contradict the prior, its σ are widened by kind, by maximum likelihood (EM: Dempster, Laird & Rubin 1977)."""
     known = np.linalg.inv(prior.covariance)
     parts = [rows for _, rows in camera_parts(basis, known)]
     squared = np.ones(len(parts))
@@ -267,8 +254,7 @@ def _adjusted(
     arm: LinearArm | None = None,
     sigma: Mapping[str, float] = FIRST,
 ) -> Adjusted:
-    """Returns the adjustment with the arm, if there is one, linearised. ``sigma`` : first guesses of the σ that are
-    estimated."""
+    """Returns the adjustment with the arm, if any, linearised; ``sigma`` : first guesses of estimated σ."""
     used, good = _near(loop, *first), len(loop)
     while True:
         rows = np.flatnonzero(used)
@@ -316,8 +302,7 @@ def _adjusted(
 
 
 def contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.ndarray:
-    """Returns which poses (m,) have an error of the robot that is not by chance: its estimate is tested against the
-    variance that it should have."""
+    """Returns which poses (m,) have a robot error that is not by chance, by the variance of its estimate."""
     m = len(corners.base_from_flange)
     at = corners.places()["robot"]
     if at.stop == at.start:
@@ -335,8 +320,7 @@ def contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.nd
 
 
 def _scale_hint(corners: Corners, state: Bundle) -> tuple[float, float]:
-    """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
-    unknowns."""
+    """Returns the scale, one step from the solution, if it were solved for, and its σ."""
     wider = replace(corners, with_scale=True)
     left, at = wider.linear(state).eliminated(), wider.places()["scale"].start
     inverse = generalised_inverse(left.normal)

@@ -83,10 +83,8 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopComponents:
-    """Covariances (m, 6, 6) of a loop's residuals: ``known``, plus each of ``free``, (f, m, 6, 6), times its variance.
-
-    ``names`` : (f,) the σ of :class:`Noise` that each free component stands for.
-    """
+    """Covariances (m, 6, 6) of residuals: ``known``, plus each of ``free``, (f, m, 6, 6), σ ``names`` of
+    :class:`Noise`, times its variance."""
 
     known: np.ndarray
     free: np.ndarray
@@ -119,12 +117,8 @@ def _kind(name: str) -> str:
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> LoopComponents:
-    """Returns the components at an estimate of X, on which the lever arms depend.
-
-    Covariances that come with the camera's poses hold the noise of the images. Errors of the intrinsics have the same
-    weak directions. These covariances therefore hold up to a factor, which is estimated where σ of the robot are
-    estimated too.
-    """
+    """Returns the components at an estimate of X. Covariances of the camera's poses hold the images' noise up to a
+    factor, as the intrinsics' errors have the same weak directions; it is estimated where the robot's σ are too."""
     jacobians = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
     stated = {
         "robot": _stated(len(loop), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
@@ -163,14 +157,9 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
 def variance_components(
     parts: LoopComponents, residuals: np.ndarray, jacobian: np.ndarray, first: np.ndarray
 ) -> np.ndarray:
-    """Returns restricted maximum-likelihood variances (f,) of the free components.
-
-    They are computed from residuals (m, 6) near a solution. Redundancy that the parameters take up does not count
-    (Patterson & Thompson 1971), nor does :data:`CAUTION`.
-
-    ``jacobian`` : (m, 6, k) derivative of the residuals by the parameters solved for; dependent columns do no harm;
-    ``first`` : (f,) the first guess, from :meth:`LoopComponents.first`.
-    """
+    """Returns restricted maximum-likelihood variances (f,) of the free components from residuals (m, 6) and their
+    jacobian (m, 6, k) near a solution (Patterson & Thompson 1971), from a ``first`` guess; :data:`CAUTION` is
+    subtracted."""
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)
     return component_variances(residuals, jacobian, parts.known, parts.free, first, (least, most), CAUTION)
@@ -197,8 +186,7 @@ WORST = "check the poses that fit worst"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """``corners`` : problem with the estimated σ; ``state``, and the normal equations about it, ``linear``; ``settled``
-    : whether the σ settled within :data:`ROUNDS`."""
+    """``linear`` : normal equations about ``state``; ``settled`` : whether σ settled within :data:`ROUNDS`."""
 
     corners: Corners
     state: Bundle
@@ -207,10 +195,7 @@ class BundleSolution:
 
 
 def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolution:
-    """Solve the problem, and estimate the σ of the ``free`` groups in rounds.
-
-    Raises ConvergenceError: no minimum is reached.
-    """
+    """Solve, and estimate the σ of the ``free`` groups, in rounds; raises ConvergenceError: no minimum is reached."""
     state, settled = start, not free
     for _ in range(ROUNDS if free else 0):
         state = minimise(state, corners.linear, corners.moved, settled=ROUGHLY).required("hand-eye", WORST).state
@@ -225,8 +210,7 @@ def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolu
 
 
 def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
-    """Returns restricted maximum-likelihood σ of the ``free`` groups, with all else linear about a state (like
-    :func:`~stcal.handeye.methods.noise.variance_components`)."""
+    """Returns restricted maximum-likelihood σ of ``free`` groups, all else linear (as :func:`variance_components`)."""
     parts = corners.parts(state)
     names = tuple(name for name in parts if name in free)
     fixed = [part.equations for name, part in parts.items() if name not in free]

@@ -70,13 +70,9 @@ class PoseSolution:
 def adjust_poses(
     loop: Loop, start: LoopState, noise: Noise, with_scale: bool = False, robust: bool = True
 ) -> PoseSolution:
-    """Returns the least-squares solution of the loop's residuals, each in units of its σ, from a start.
-
-    This is the maximum-likelihood solution for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without
-    their metric's free parameter). Errors of both are carried to the board's origin, to first order.
-
-    Raises ConvergenceError: no minimum is reached.
-    """
+    """Returns the least-squares solution of the loop's residuals over their σ at the board's origin, from a start:
+    maximum likelihood for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without the metric's free
+    parameter). Raises ConvergenceError: no minimum is reached."""
     count = 13 if with_scale else 12
     state = start
     residuals = _residuals(loop, state)
@@ -118,8 +114,7 @@ def adjust_poses(
 
 
 def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
-    unknowns."""
+    """Returns the scale, one step from the solution, if it were solved for, and its σ."""
     jacobian = _jacobian(loop, state, 13)
     weighted = np.linalg.solve(covariance, jacobian)
     inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
@@ -155,8 +150,7 @@ def _squared(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Returns which poses to start with, by σ from their medians. At least the better two thirds are kept, so that they
-    are not chosen by chance."""
+    """Returns poses to start with, by σ from medians: at least the better two thirds, so as not to select by chance."""
     squared = np.sort(_squared(residuals, covariance))
     enough = max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES)
     return _squared(residuals, covariance) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
@@ -177,11 +171,8 @@ def _agreeing(
 
 
 def against_others(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Returns squared residuals (m,), each in units of its own σ: χ² of 6 degrees of freedom for good poses.
-
-    The residual of a pose that took part scatters less than the pose, since the pose pulled the solution towards
-    itself. The residual of a pose that did not take part has the error of the solution as well.
-    """
+    """Returns squared residuals (m,) over their own variance, χ² of 6 degrees of freedom: less than the pose's for
+    poses that took part, plus the solution's for the others."""
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
     white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ jacobian
     solved = by @ generalised_inverse(np.einsum("mai,maj->ij", by[used], by[used])) @ np.swapaxes(by, 1, 2)

@@ -71,8 +71,7 @@ class Reprojection:
         return float(np.sqrt((residuals**2).sum(1).mean())) if len(residuals) else float("nan")
 
     def board(self, xyz_board: np.ndarray) -> np.ndarray:
-        """Returns the true places (k, 3) of corners of the design (k, 3), mm. Corners that were not seen keep their
-        place, scaled."""
+        """Returns the true places (k, 3) of designed corners (k, 3), mm; those not seen keep their place, scaled."""
         distance, nearest = KDTree(self.designed).query(xyz_board)
         scale = np.linalg.norm(self.corners) / np.linalg.norm(self.designed)
         return np.where((distance < 10.0**-SAME_DIGITS)[:, None], self.corners[nearest], scale * np.asarray(xyz_board))

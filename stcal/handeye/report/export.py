@@ -47,11 +47,9 @@ CameraFrame = Literal["optical", "link"]
 
 
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
-    """Returns the transforms that add the camera to a tree of frames, in which each frame has one parent.
-
-    ``parent``, ``child`` : names of the frames. If empty: flange or base, and :data:`CAMERA_FRAME` or
-    :data:`CAMERA_LINK`. ``camera_frame`` : ``optical``: the camera's own frame; ``link``: the link, and the optical
-    frame in it.
+    """Returns the transforms that add the camera to a tree of frames. Empty names: flange or base, and
+    :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`. ``camera_frame`` : ``optical``, or ``link`` with the optical frame in
+    it.
 
     Raises InputError: a name is invalid, or the names are not all different.
     """
@@ -74,10 +72,7 @@ def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame
 
 
 def require_frame_names(*names: str) -> None:
-    """Checks that names of frames are printable and all different; empty names stand for the defaults.
-
-    Raises InputError: a name has a control character, or occurs twice.
-    """
+    """Raises InputError if a frame's name has a control character, or occurs twice; empty ones are defaults."""
     given = [name for name in names if name]
     for name in given:
         if not name.isprintable():
@@ -114,19 +109,13 @@ IN_HAND = "eye-in-hand"
 
 
 def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """Returns ``geometry_msgs/TransformStamped`` as YAML, for a static transform; lengths in metres.
-
-    ``parent``, ``child``, ``camera_frame`` : see :func:`~stcal.handeye.report.export.tree`. Each of its
-    transforms becomes one document.
-    """
+    """Returns ``geometry_msgs/TransformStamped`` as YAML, in metres: a document for each transform of :func:`tree`."""
     return messages(tree(result, parent, child, camera_frame))
 
 
 def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """Returns a fixed joint of URDF: ``origin`` in metres, and roll, pitch, yaw about the parent's axes in rad.
-
-    For ``camera_frame`` ``link`` these are two joints with their child links, in a ``robot`` that xacro can include.
-    """
+    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); for ``link`` two, in a ``robot`` for
+    xacro."""
     transforms = tree(result, parent, child, camera_frame)
     joints = [fixed_joint(each) for each in transforms]
     if len(joints) == 1:
@@ -227,11 +216,7 @@ SAME_MM, SAME_RAD = 1e-6, 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A file format.
-
-    ``write`` : returns the text for a result, its named transforms, and the file's name without its ending; ``read`` :
-    returns the transforms of the text.
-    """
+    """``write`` : text of a result, its named transforms and the file's stem; ``read`` : the transforms of a text."""
 
     write: Callable[[HandEye, list[Static], str], str]
     read: Callable[[str], list[Static]]
@@ -255,13 +240,8 @@ def exported(
     child: str = "",
     camera_frame: CameraFrame = "optical",
 ) -> str:
-    """Returns the file's text, after reading it back and comparing the transform.
-
-    ``form`` : one of :data:`FORMS`; ``name`` : name of the file without its ending, which files of easy_handeye hold
-    too; ``parent``, ``child``, ``camera_frame`` : see :func:`~stcal.handeye.report.export.tree`.
-
-    Raises InputError: the format is unknown, or cannot hold the name of a frame.
-    """
+    """Returns the text in one of :data:`FORMS`, read back and compared; ``name`` : the file's stem, which easy_handeye
+    holds. Raises InputError: the format is unknown, or cannot hold the name of a frame."""
     require_form(form, FORMS)
     transforms = tree(result, parent, child, camera_frame)
     text = FORMS[form].write(result, transforms, name)
@@ -283,11 +263,8 @@ def require_export_written(
     child: str = "",
     camera_frame: CameraFrame = "optical",
 ) -> None:
-    """Read a written file again, and require the transforms of ``result``.
-
-    ``kind`` : ``json``, the result file, or ``opencv``, ``ros``, ``urdf`` of :func:`opencv_yaml`, :func:`ros_yaml` and
-    :func:`urdf_joint`.
-    """
+    """Read a written file again, and require the transforms of ``result``; ``kind`` : ``json``, ``opencv``, ``ros`` or
+    ``urdf``."""
 
     def again() -> Poses:
         text = path.read_text(encoding="utf-8")

@@ -43,11 +43,7 @@ LEAST_TURN = np.radians(2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCoverage:
-    """Coverage of the image by the board.
-
-    ``counts`` : (rows, columns) number of photographs in which the board covers a cell; ``share`` : share of the cells
-    that the board covers at least once.
-    """
+    """``counts`` : (rows, columns) photographs whose board covers a cell; ``share`` : of the cells that any covers."""
 
     counts: np.ndarray
     share: float
@@ -76,10 +72,7 @@ def image_coverage(views: Views) -> ImageCoverage:
 
 
 def turns_between(pairs: HandEyePoses) -> np.ndarray:
-    """Returns rotation vectors (n, 3) of the flange between poses, in its axes, rad.
-
-    A turn and its inverse count as one, with Z ≥ 0.
-    """
+    """Returns rotation vectors (n, 3) of the flange between poses, in its axes, rad, with Z ≥ 0."""
     rotation = pairs.base_from_flange.rotation
     i, j = np.triu_indices(len(rotation), 1)
     if len(i) > MOST_TURNS:
@@ -95,10 +88,7 @@ def equal_area(directions: np.ndarray) -> np.ndarray:
 
 
 def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
-    """Predicts the corners of each view from the robot's reported pose and the transforms, (k, 2) px.
-
-    Corners behind the camera are NaN.
-    """
+    """Returns the corners (k, 2) px of each view by the robot's reported pose, NaN behind the camera."""
     loop, board = Loop.of(pairs, result.setup), result.reprojection
     camera = views.camera if board is None else board.camera
     predicted = []
@@ -144,10 +134,8 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class PoseBars:
-    """The chart of poses: ``panels`` one below the other, and ``names`` (x, text, full name) below them.
-
-    ``slope`` : whether the names are slanted; ``cut`` : whether they are shortened.
-    """
+    """``panels`` one below the other, with ``names`` (x, text, full name), slanted if ``slope``, shortened if
+    ``cut``."""
 
     width: float
     height: float
@@ -277,11 +265,8 @@ WIDTH_PX = 800
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """One image with its corners.
-
-    ``corners`` : (x, y, x and y of the end of the enlarged residual, title); ``factor`` : enlargement of the residuals;
-    ``dot`` : radius of the dots in px of the image.
-    """
+    """One image. ``corners`` : (x, y, x and y of the enlarged residual's end, title); ``factor`` : enlargement; ``dot``
+    : radius of the dots, px of the image."""
 
     title: str
     says: str
@@ -294,10 +279,8 @@ class Overlay:
 
 
 def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
-    """Returns the overlays of the worst, the median and the best image, and a message for each unreadable image.
-
-    Both lists are empty if the poses did not come from images.
-    """
+    """Returns the overlays of the worst, median and best image, and a message for each unreadable one; none without
+    images."""
     result, pairs, views = outcome.result, outcome.pairs, outcome.views
     if pairs is None or views is None or outcome.folder is None:
         return [], []

@@ -165,10 +165,7 @@ def _of_residuals(outcome: Outcome) -> Finding | None:
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:
-    """Tests the errors on held-out poses against those expected from the residuals.
-
-    A fit to few poses, or to poses that contradict each other, predicts worse than it fits.
-    """
+    """Tests held-out errors against the residuals: few or contradicting poses predict worse than they fit."""
     title, result, held = "Poses held out", outcome.result, outcome.held_out
     if held is None:
         remedy = "take ten poses or more, or keep the default of --splits"
@@ -201,10 +198,8 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
 
 
 def _of_share(outcome: Outcome) -> Finding | None:
-    """Judges the share of the transform's σ in a prediction.
-
-    The share is unknown if the arm was solved for, as correlated errors of the arm cancel errors of the transform.
-    """
+    """Judges the share of the transform's σ in a prediction; unknown with an arm, whose errors cancel the
+    transform's."""
     share = share_of_variance(outcome)
     if share is None or outcome.arm is not None:
         return None
@@ -241,10 +236,8 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
 
 
 def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
-    """Returns the board's distance, σ there due to the transform, and the RMS error of one pose, all in mm and 3-D.
-
-    ``covariance`` : of the transform, (6, 6); that of the result, without common errors of the poses, if None
-    """
+    """Returns the board's distance, σ there due to the transform (of ``covariance``, by default without common errors),
+    and the RMS error of one pose, all in mm and 3-D."""
     result, pairs = outcome.result, outcome.pairs
     if covariance is None and result.covariance is not None:
         common = result.common_covariance

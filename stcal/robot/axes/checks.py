@@ -56,8 +56,7 @@ def chain_through(frames: list[Rigid], nominal: Robot) -> Chain:
 
 
 def jacobian_by_axes(function, frames: list[Rigid], robot: Robot) -> np.ndarray:
-    """Returns the derivative (v, p) of a function of the axes by their parameters, each in its own frame, by central
-    differences."""
+    """Returns the derivative (v, p) of a function of the axes by their parameters, each in its own frame."""
     columns = []
     for i, sliding in enumerate(robot.prismatic):
         for component in (0, 1) if sliding else (0, 1, 3, 4):
@@ -96,8 +95,7 @@ def pair_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
 
 
 def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple[Pair, ...]:
-    """Returns the pairs of consecutive axes with their σ; ``robot`` gives what axes leave open (planes of near-parallel
-    pairs)."""
+    """Returns the pairs of consecutive axes with their σ; ``robot`` gives planes of near-parallel pairs."""
     if len(frames) < 2:
         return ()
     values = pair_values(frames, robot).reshape(-1, 6)
@@ -122,8 +120,7 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
 
 
 def _angle_sigma(angle: np.ndarray, covariance: np.ndarray) -> float:
-    """Returns σ along the angle's vector; for exactly parallel axes, whose angle has no direction yet, the largest
-    σ."""
+    """Returns σ along the angle's vector; for exactly parallel axes the largest σ."""
     length = float(np.linalg.norm(angle))
     if length <= EXACTLY:
         return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0)))
@@ -161,11 +158,8 @@ MOVED_SHARE = 0.5
 
 
 def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns values of directed axes that no motion changes, and the sign of each value after a mirror.
-
-    The values are cosines and moments of pairs, and triple products of three axes. The direction of a revolute axis
-    comes from its sense of rotation, which a mirror reverses; that of a prismatic axis does not.
-    """
+    """Returns cosines, moments and triple products of directed axes, which no motion changes, and their signs after a
+    mirror."""
     size = max(float(np.linalg.norm(origin - origin[0], axis=1).max()), 1.0)
     values, mirrored = [], []
     for i, k in combinations(range(len(z)), 2):
@@ -297,11 +291,8 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
 
 
 def of_order(data: Measurements, robot: Robot) -> list[str]:
-    """Returns a note if the instrument, the base or a reflector moved between two rows, or a joint lost its zero.
-
-    Gear errors vary along a sweep, and so with the order of its rows. A move is therefore named only if it explains
-    most of the residuals.
-    """
+    """Returns a note if instrument, base or reflector moved between two rows, or a joint lost its zero. Gear errors
+    vary with the order of rows too: a move is named only if it explains most of the residuals."""
     moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(data, "position"), MOVED_SHARE)
     return [] if moved is None else [moved.sentence()]
 
@@ -328,11 +319,8 @@ influence. For 600 rows the spread is 1 to 4 % less so."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeaveOneOut:
-    """The values of each pair without one row of the sweeps (all its reflectors).
-
-    ``lines`` : first line of each row that was left out; ``distance``, ``normal`` : (r, n − 1) mm, as in :class:`Pair`;
-    nan where there is no value, or where the remaining rows do not determine an axis.
-    """
+    """The values of each pair without one row of the sweeps. ``lines`` : first line of each row left out; ``distance``,
+    ``normal`` : (r, n − 1) mm, as in :class:`Pair`, or nan."""
 
     lines: tuple[int, ...]
     distance: np.ndarray
@@ -392,11 +380,7 @@ def _by_influence(
     passed: list[list[np.ndarray]],
     nominal: Robot,
 ) -> np.ndarray:
-    """Returns the values (r, n − 1, 6) of the pairs without each instant's rows, linear in the changes.
-
-    Leaving a row out is giving it the residual by the fit of the others (Cook & Weisberg 1982, "Residuals and Influence
-    in Regression").
-    """
+    """Returns the pairs' values (r, n − 1, 6) without each instant's rows, to first order (Cook & Weisberg 1982)."""
     number = np.zeros(len(start[0]), int)
     for i, rows in enumerate(instants):
         number[rows] = i

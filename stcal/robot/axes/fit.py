@@ -79,8 +79,7 @@ class AxisFit:
         return np.unique(self.rows[self.weights == 0])
 
     def influence(self, points: np.ndarray) -> np.ndarray:
-        """Returns the change (k, p) of the axis, linear, without each of the ``points`` (k, 3), mm, to which it was
-        fitted."""
+        """Returns the change (k, p) of the axis, linear, without each of the fitted ``points`` (k, 3), mm."""
         axes, prismatic = self.world_from_axis.rotation, len(self.gain) == 2
         across = np.broadcast_to(axes.T[:2], (len(points), 2, 3)).copy()
         if not prismatic:
@@ -103,26 +102,14 @@ class AxisFit:
 
 
 def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
-    """Returns the axis of a joint by least squares of the distances of its arcs' points to their circles or lines.
+    """Returns the axis of a joint by robust least squares of the distances of its arcs' points to their circles or
+    lines.
 
-    The fit is robust: Huber weights (Huber 1964) on the points' residuals with a median σ; points off by more than
-    :data:`GROSS` σ are left out. The first axis is the one with the least median residual among those that leave one
-    point out.
+    ``points`` : (m, 3) of all rows, mm, with the joints before this one unwound; ``moved`` : (m,) kinematic values of
+    this joint; ``where`` : the joint, for messages.
 
-    Parameters
-    ----------
-    points : (m, 3) positions of all rows, mm, with the joints before this one unwound
-    moved : (m,) kinematic values of this joint, rad or mm
-    arcs : the arcs of this joint
-    prismatic : whether the joint slides
-    where : the joint, for messages
-
-    Raises
-    ------
-    DegenerateError
-        No redundancy, reflectors on the axis, or arcs too short to give a direction.
-    InputError
-        The motion observed about the axis is not that of the joint's values.
+    Raises DegenerateError: no redundancy, reflectors on the axis, or arcs too short to give a direction. Raises
+    InputError: the motion observed about the axis is not that of the joint's values.
     """
     size = np.array([_spread(points[arc.rows]) for arc in arcs])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
@@ -201,11 +188,8 @@ class _AxisFitting:
         self.require_known()
 
     def start(self, moved: np.ndarray) -> None:
-        """Sets the axis from all points; if some points stand out, from the subset with the least median residual.
-
-        A subset leaves out one point (of many points a few), or all points taken at one value of the joint; ``moved``
-        (k,) has each point's value. The weights say which points were used.
-        """
+        """Sets the axis from all points; if some stand out, from the subset with the least median residual. A subset
+        leaves out one point, or all points at one value of the joint ``moved`` (k,)."""
         count = len(self.rows)
         value = np.unique(moved, return_inverse=True)[1]
         points, values = (np.arange(n) % min(n, STARTS) for n in (count, value.max() + 1))
@@ -230,8 +214,7 @@ class _AxisFitting:
         self.frame, self.weights = best
 
     def linear_start(self) -> Rigid:
-        """Returns the axis: its direction from the arcs' common scatter, its place from the circles' common centre
-        (Kåsa 1976)."""
+        """Returns the axis by the arcs' common scatter and the circles' common centre (Kåsa 1976)."""
         centred = self.demean(self.points)
         _, axes = np.linalg.eigh((self.weights[:, None] * centred).T @ centred)
         middle = self.points.mean(axis=0)
@@ -262,8 +245,7 @@ class _AxisFitting:
         return (self.values().T @ weighted) / np.maximum(weighted.sum(axis=0), TINY)
 
     def demean(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (k, c) minus each arc's weighted mean, which eliminates its radius and height (variable
-        projection)."""
+        """Returns values (k, c) minus each arc's weighted mean: variable projection of its radius and height."""
         weighted = self.member * self.weights[:, None]
         means = (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
         return values - self.member @ means
@@ -473,10 +455,7 @@ def unwound_by(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool
 
 
 def _unwinding_jacobian(axis: Rigid, before: np.ndarray, after: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
-    """Returns the derivative (m, 3, p) of the unwound points by rx, ry, tx, ty of the axis in its frame.
-
-    A small motion D of the axis turns its unwinding U into D U D⁻¹: δ = D(U x) − U(D x).
-    """
+    """Returns the derivative (m, 3, p) of the unwound points by rx, ry, tx, ty of the axis: δ = D(U x) − U(D x)."""
     columns = []
     for component in (0, 1, 3, 4)[:count]:
         direction = axis.rotation[:, component % 3]

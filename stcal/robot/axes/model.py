@@ -155,8 +155,7 @@ def robot_from_sweeps(
 
 
 def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
-    """Returns the places of the reflectors in the last joint's frame, from all rows, and their spread; it starts at
-    medians, as some rows may be gross errors."""
+    """Returns the places of the reflectors in the last joint's frame, from all rows, and their spread."""
     names, tools, spread = np.array(data.targets), {}, {}
     for name in dict.fromkeys(data.targets):
         points = last.inverse() @ unwound[names == name]

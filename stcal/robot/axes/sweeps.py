@@ -34,11 +34,8 @@ class Arc:
 
 
 def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) -> tuple[list[Arc], list[str]]:
-    """Returns the arcs of all joints, and notes on arcs that are not used, with the reason.
-
-    Rows of one reflector that differ in exactly one *kinematic* joint value (the controller's after coupling) form an
-    arc; a row may belong to several. Positions a full turn apart are one position of the joint that turns. A joint that
-    should stand still must not be a full turn away, where gears and backlash need not repeat.
+    """Returns the arcs of all joints, and notes on arcs that are not used. Rows of one reflector that differ in exactly
+    one *kinematic* joint value form an arc. Positions a full turn apart are one only for the joint that turns.
 
     Raises InputError: no positions, a joint that is never swept, or a reflector that does not move.
     """
@@ -139,20 +136,15 @@ class VirtualReflectors:
         freeze(self, "lever", (len(self.data), 3), "levers")
 
     def by_pose(self, response: np.ndarray) -> np.ndarray:
-        """Returns the response (p, 6 m) to the noise of poses, given the ``response`` (p, km, 3) to the noise of
-        independent rows.
-
-        A pose errs by a translation of the reflectors' mean, and by a rotation that moves the reflectors as much (RMS);
-        both together are √(1 + ⅔) of it.
-        """
+        """Returns the response (p, 6 m) to the noise of poses, given that (p, km, 3) to the noise of independent rows.
+        A pose errs by a translation, and by a rotation that moves the reflectors as much (RMS)."""
         by_row = np.concatenate([np.broadcast_to(np.eye(3), (len(self.lever), 3, 3)), -skew(self.lever)], axis=2)
         shared = np.zeros((len(response), int(self.pose.max()) + 1, 6))
         np.add.at(shared.swapaxes(0, 1), self.pose, np.einsum("pmc,mcd->mpd", response, by_row))
         return np.sqrt(3 / 5) * shared.reshape(len(response), -1)
 
     def tools(self, places: dict[str, Rigid], spread_mm: dict[str, float]) -> tuple[dict[str, Rigid], dict[str, float]]:
-        """Returns the poses of the targets from the places of their reflectors, and the RMS of the reflectors about
-        these places."""
+        """Returns the poses of the targets from their reflectors' places, and the RMS about these places."""
         tools, spread = {}, {}
         for name in dict.fromkeys(self.data.targets):
             target, _, number = name.rpartition(SEPARATOR)
@@ -168,8 +160,7 @@ SEPARATOR = " point "
 
 
 def length_of(data: Measurements) -> float | None:
-    """Returns the distance, mm, at which the stated σ of rotations moves a point by the stated σ of positions; None if
-    no σ are stated."""
+    """Returns the distance, mm, at which σ of rotations moves a point by σ of positions; None if no σ are stated."""
     if data.rotations is None or data.covariance is None:
         return None
     variance = np.einsum("mii->mi", np.asarray(data.covariance))
@@ -180,11 +171,7 @@ def length_of(data: Measurements) -> float | None:
 
 
 def ring(length_mm: float) -> np.ndarray:
-    """Returns places (3, 3) at ``length_mm`` from the target's origin, where errors of rotation and position weigh
-    alike.
-
-    Raises InputError: a length out of range.
-    """
+    """Returns places (3, 3) at ``length_mm`` from the target's origin; raises InputError: a length out of range."""
     if not SHORTEST_MM <= length_mm <= LONGEST_MM:
         raise InputError(
             "E-OPTION-RANGE", f"--orientations {length_mm:g}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm needed, auto or off"
@@ -193,10 +180,8 @@ def ring(length_mm: float) -> np.ndarray:
 
 
 def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
-    """Returns reflectors that each pose carries at ``places`` (k, 3) of its target, mm; k ≥ 3, not in line.
-
-    Raises InputError: the measurements have no orientations.
-    """
+    """Returns reflectors carried at ``places`` (k, 3) of a target, mm; raises InputError if there are no
+    orientations."""
     if data.rotations is None or data.positions is None:
         raise InputError(
             "E-MEASURED-NO-ORIENTATION",

@@ -33,9 +33,8 @@ WIDTH = {"pose": 6, "position": 3, "distance": 1}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """The unknowns of an identification. ``chain``; ``tools`` : flange_from_tool by target; ``elastic`` : whether the
-    chain's elasticity is among them, as the last parameters; ``stations`` : station_from_world by station, the first of
-    which is the world; ``hysteresis`` : whether elasticity includes hysteresis."""
+    """The unknowns. ``tools`` : flange_from_tool by target; ``elastic`` : whether the chain's elasticity is among them,
+    last; ``stations`` : station_from_world, the first is the world; ``hysteresis`` : whether elasticity includes it."""
 
     chain: Chain
     tools: dict[str, Rigid]
@@ -51,13 +50,9 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Measurements as one kind of observation.
-
-    ``first``, ``second`` : (r,) rows of the measurements that each observation is about; they differ for distances
-    only. ``values`` : (r,) distances, mm, else empty. ``frameless`` : positions of which only the distances are used.
-    All distances of m points determine the points but for a motion of all of them. So such points are positions in a
-    frame of their own, whose pose is identified with the other parameters but not counted.
-    """
+    """Measurements as one kind of observation. ``first``, ``second`` : (r,) rows of each observation, different for
+    distances only; ``values`` : (r,) distances, mm, else empty. ``frameless`` : positions that count by their distances
+    alone, and are therefore in a frame of their own, whose pose is identified but not counted."""
 
     kind: Kind
     data: Measurements
@@ -81,10 +76,7 @@ def tool_width(kind: Kind) -> int:
 
 
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
-    """Returns the measurements as ``kind``, or as the richest kind that they hold.
-
-    Raises InputError: the measurements do not hold ``kind``.
-    """
+    """Returns the measurements as ``kind``, or the richest that they hold; raises InputError if they do not hold it."""
     richest = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
     kind = kind or richest
     if WIDTH[kind] > WIDTH[richest]:
@@ -127,8 +119,7 @@ def residuals(state: State, measured: Observed) -> np.ndarray:
 
 
 def jacobian(state: State, measured: Observed) -> np.ndarray:
-    """Returns the derivative of the modelled values by :func:`parameter_names` and the elasticity, (r, 6 or 3 or 1,
-    k)."""
+    """Returns the derivative (r, 6 or 3 or 1, k) of the modelled values by :func:`parameter_names` and elasticity."""
     return linear(state, measured)[1]
 
 
@@ -141,8 +132,7 @@ def linear(state: State, measured: Observed) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
-    """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` (r, 6 or 3) times
-    the modelled values."""
+    """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` times the model."""
     tip, data = tips_of(state, measured.data), measured.data
     moves = as_seen(state, measured, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
     pulls = np.einsum("rw,rwk->rk", pull, moves)
@@ -150,10 +140,7 @@ def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
 
 
 def as_seen(state: State, measured: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
-    """Returns the effect on observations, (r, 6 or 3 or 1, k), of motions ``moves`` (m, 6, k) of the tools at ``tip``.
-
-    Motions are rad over mm in the world's axes; their effects are in the axes of the row's station.
-    """
+    """Returns the effect (r, 6 or 3 or 1, k), in the station's axes, of motions (m, 6, k) of the tools, rad over mm."""
     if len(state.stations) > 1:
         turn = _stations(state, measured.data.stations).rotation[:, None]
         moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
@@ -199,8 +186,7 @@ def _beside(state: State, tip: Poses, measured: Observed) -> np.ndarray:
 def tip_jacobian(
     state: State, q: np.ndarray, targets: Sequence[str], kind: Kind, conditions: Conditions = USUAL
 ) -> tuple[Poses, np.ndarray]:
-    """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names` and the
-    elasticity: rotation (rad) over translation (mm), in the world's axes; stations move nothing."""
+    """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by all parameters, rad over mm."""
     tip = tips(state, q, targets, conditions)
     width = tool_width(kind)
     axes_part = chain_jacobian(state.chain, q, tip, conditions)
@@ -285,9 +271,8 @@ curved valleys of products of compliance and moment."""
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """Weights of the observations: ``sigma_mm``, ``sigma_rad`` : σ of one coordinate; ``given`` : the covariances that
-    came with the measurements replace both; ``factor`` : multiplies either; ``estimated`` : which of ``"mm"``,
-    ``"rad"``, ``"factor"`` are estimated from the residuals."""
+    """Weights of the observations. ``given`` : the measurements' covariances replace both σ; ``factor`` : multiplies
+    either; ``estimated`` : which of ``"mm"``, ``"rad"``, ``"factor"`` come from the residuals."""
 
     sigma_mm: float
     sigma_rad: float
@@ -308,8 +293,7 @@ class Weighting:
         return values[..., 0] if flat else values
 
     def pull(self, white: np.ndarray, measured: Observed) -> np.ndarray:
-        """Returns half the derivative (r, w) by the residuals of the sum of squares of ``white`` (r, w), the output of
-        :meth:`whiten`."""
+        """Returns half the derivative (r, w) by the residuals of the square sum of ``white``, from :meth:`whiten`."""
         width = white.shape[1]
         if not (self.given and width > 1):
             return white / self._sigma(width)
@@ -342,12 +326,7 @@ class Weighting:
 
 
 def _decorrelated(values: np.ndarray, root: np.ndarray, measured: Observed) -> np.ndarray:
-    """Whitens values (r, w, k) for the errors that the observations have in common.
-
-    All values have σ 1 apart from these errors. They are multiplied by the inverse root of their covariance 1 + F Fᵀ,
-    where F is the common errors over ``root`` (r, w, w), rows stacked. What all observations may have in common counts
-    less.
-    """
+    """Returns values (r, w, k) of σ 1 times the inverse root of 1 + F Fᵀ, F being the common errors over ``root``."""
     if measured.data.common is None:
         return values
     common = np.linalg.solve(root, measured.data.common[:, -root.shape[1] :])
@@ -361,8 +340,7 @@ def _decorrelated(values: np.ndarray, root: np.ndarray, measured: Observed) -> n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Held:
-    """Prior knowledge, linear about a state: ``value + jacobian @ step``, (p,), is 0 with σ ``sigma``. ``fixed`` : (p,)
-    mask of those that are conditions, with a negligible σ."""
+    """Prior knowledge: ``value + jacobian @ step``, (p,), is 0 with ``sigma``; ``fixed`` : (p,) mask of conditions."""
 
     value: np.ndarray
     jacobian: np.ndarray
@@ -401,11 +379,8 @@ class Solution:
     count: int = 0
 
     def spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the spectrum of the normal matrix with conditions, over the j parameters of axes and tools.
-
-        These are eigenvalues (j,), directions (j, j) in columns, and a mask (j,) of the directions that the data or
-        conditions determine. Elasticity is left out, as there is prior knowledge of it.
-        """
+        """Returns eigenvalues (j,) and directions (j, j), in columns, of the normal matrix with conditions, over axes
+        and tools, and a mask (j,) of determined ones. Elasticity is left out, as there is prior knowledge of it."""
         rigid = slice(len(self.units) - self.state.elastic_count)
         known = self.normal[rigid, rigid] + self.conditions[rigid, rigid]
         values, directions = np.linalg.eigh(known * self.units[rigid, None] * self.units[rigid])
@@ -424,15 +399,8 @@ class Solution:
 def solve(
     state: State, measured: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
 ) -> Solution:
-    """Minimises the whitened residuals of the observations, from ``state``; ``held`` is linear about it.
-
-    Parameters are small motions about the present state, so that no representation is ever singular.
-
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
-    """
+    """Minimises the whitened residuals from ``state``, about which ``held`` is linear. Parameters are small motions
+    about the present state, so that none is singular. Raises ConvergenceError."""
     limit = huber_limit(measured.kind) if robust else np.inf
     first = _linearised(state, measured, weighting, limit)[0]
     held_normal, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
@@ -480,11 +448,8 @@ def solve(
 
 
 def curvature_of(solution: Solution, measured: Observed, weighting: Weighting) -> np.ndarray | None:
-    """Returns the part (k, k) of the normal matrix that the second derivatives by compliance and moment subtract.
-
-    Without it, descents along the curved valleys of products of compliance and moment take hundreds of steps. It is
-    None for rigid arms, and for distances, which are nonlinear themselves.
-    """
+    """Returns the part (k, k) of the normal matrix that second derivatives by compliance and moment subtract: without
+    it descents take hundreds of steps. None for rigid arms and distances."""
     if not solution.state.elastic or measured.kind == "distance":
         return None
     white = solution.weights[:, None] * weighting.whiten(solution.residuals, measured)
@@ -498,12 +463,8 @@ def curvature_of(solution: Solution, measured: Observed, weighting: Weighting) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bent:
-    """Shares of a normal matrix (k, k) that second derivatives take away, along directions that are independent in its
-    metric.
-
-    A share is at most :data:`MOST_BENT`: a saddle is no minimum, but what is left of a flat valley is. ``root`` : (k,
-    k) root of the normal matrix; ``directions`` : (k, k) in columns; ``share`` : (k,) of each direction.
-    """
+    """Shares, at most :data:`MOST_BENT`, of a normal matrix (k, k) with this ``root`` that second derivatives take
+    away: ``share`` : (k,) of each of ``directions`` (k, k), columns that are independent in the matrix's metric."""
 
     root: np.ndarray
     directions: np.ndarray
@@ -576,8 +537,7 @@ def _linearised(state: State, measured: Observed, weighting: Weighting, limit: f
 
 
 def parameter_units(derivative: np.ndarray) -> np.ndarray:
-    """Returns the step (k,) of each parameter that moves the tool by 1 mm RMS, or by 1 rad if it moves no point; 1 if
-    it moves nothing."""
+    """Returns steps (k,) that move the tool by 1 mm RMS, or by 1 rad if they move no point; 1 if they move nothing."""
     lengths = derivative[:, -3:] if derivative.shape[1] > 1 else derivative
     moves = np.sqrt((lengths**2).sum(1).mean(0))
     turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))

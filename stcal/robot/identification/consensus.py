@@ -37,8 +37,7 @@ of positions and orientations from the residuals of the first solution."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """A linear problem. ``white`` : (r, w) residuals in units of σ; ``slope`` : (r, w, k) derivatives of the model by
-    the parameters, of about 1 mm each."""
+    """``white`` : (r, w) residuals over σ; ``slope`` : (r, w, k) derivatives by parameters of about 1 mm."""
 
     white: np.ndarray
     slope: np.ndarray
@@ -73,19 +72,16 @@ class _Problem:
 
 
 def agreeing(state: State, measured: Observed, weighting: Weighting) -> np.ndarray:
-    """Returns a mask (r,) of the observations that agree with a solution near ``state``.
-
-    All agree if there are too few observations beyond those needed.
-
-    ``state`` : start of the search; steps from it are linear; ``measured`` : r observations; ``weighting`` : σ of the
-    observations, up to a common factor.
-    """
+    """Returns a mask (r,) of the observations that agree with a solution near ``state``, linear about it; all agree if
+    too few are redundant. σ of ``weighting`` need only be known up to a common factor."""
     good = every = np.ones(len(measured), bool)
     for step in range(ROUNDS):
         errors, derivative = linear(state, measured)
         units = parameter_units(derivative)
         if step:
-            weighting = _reweighed(weighting, errors, measured)
+            white = weighting.whiten(errors, measured)
+            medians = {n: float(np.median(np.abs(white[:, at]))) for n, at in weighting.columns(white.shape[1]).items()}
+            weighting = weighting.with_values({n: weighting.value(n) * (value or 1.0) for n, value in medians.items()})
         problem = _Problem(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
         r, w, k = problem.slope.shape
         half = (r + k // w + 1) // 2 + 1
@@ -99,14 +95,6 @@ def agreeing(state: State, measured: Observed, weighting: Weighting) -> np.ndarr
         if not searched and (good == before).all():
             break
     return good
-
-
-def _reweighed(weighting: Weighting, left: np.ndarray, measured: Observed) -> Weighting:
-    """Returns the weighting with σ from the medians of the residuals ``left`` (r, w), of positions and of
-    orientations."""
-    white = weighting.whiten(left, measured)
-    medians = {name: float(np.median(np.abs(white[:, at]))) for name, at in weighting.columns(white.shape[1]).items()}
-    return weighting.with_values({name: weighting.value(name) * (value or 1.0) for name, value in medians.items()})
 
 
 def _trimmed(problem: _Problem, half: int) -> np.ndarray:
@@ -141,12 +129,8 @@ def _smallest(squares: np.ndarray, wanted: int) -> np.ndarray:
 
 
 def _tested(problem: _Problem, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
-    """Returns the rows that fit the solution of the good rows within chance, repeated until they stay the same.
-
-    ``half`` : number of good rows if they are good because they are the smallest; ``kinds`` : columns with one σ each,
-    estimated from the good rows. With one σ for all, positions of a small σ would pass within the limit that
-    orientations of a large σ allow.
-    """
+    """Returns the rows that fit the solution of the good rows within chance, repeated. ``half`` : number of good rows
+    if they are the smallest; ``kinds`` : columns with one σ each, estimated from the good rows."""
     r, w, _ = problem.slope.shape
     for _ in range(STEPS):
         squares = problem.left(problem.solved(good[None]))[0] ** 2

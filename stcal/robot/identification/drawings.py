@@ -40,8 +40,7 @@ class Drawn:
 
 
 def joints_figure(shown: Drawn, findings: Iterable[Finding]):
-    """Returns a figure of the residual along each joint's own motion against its value, for good rows that the joint
-    moves; with a fitted curve for joints named by a finding."""
+    """Returns a figure of good rows' residuals along each joint's motion by its value, with the findings' curves."""
     observations, chain, tip = shown.seen, shown.state.chain, shown.tips()
     data = observations.data
     turned, origins = joint_frames(chain, data.q, data.conditions)

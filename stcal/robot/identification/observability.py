@@ -62,11 +62,8 @@ class ObservabilityIndices:
 
     @classmethod
     def of(cls, singular_values: np.ndarray, count: int) -> "ObservabilityIndices":
-        """Returns the indices by the singular values (L,) of the Jacobian of ``count`` poses; all are 0 if one value is
-        0.
-
-        Raises InputError: no singular values, negative ones, or no poses.
-        """
+        """Returns the indices by singular values (L,) of ``count`` poses, all 0 if one value is 0; raises
+        InputError."""
         sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
         if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
             raise InputError(
@@ -101,13 +98,8 @@ def identification_jacobian(
     sigma_rad: float = 1.0,
     tool: str = "",
 ) -> np.ndarray:
-    """Returns the derivatives (m, r, k) of the measured values at joint vectors by all identified parameters, over σ.
-
-    r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
-    are those of :func:`~stcal.robot.identification.adjustment.parameter_names`, rad and mm.
-
-    ``q`` : (m, n) joint values of the controller, rad or mm.
-    """
+    """Returns the derivatives (m, r, k) of the measured values, over σ, at joint vectors (m, n) by all identified
+    parameters, in the world's axes. r is 6 (rotation over translation) or 3 (position)."""
     state = State(robot.chain(), {tool: robot.tool(tool)})
     derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
     sigma = np.repeat([sigma_rad, sigma_mm], 3)
@@ -115,11 +107,7 @@ def identification_jacobian(
 
 
 def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
-    """Returns factors (k,) of the columns of an identification Jacobian that bring all parameters to mm.
-
-    An angle counts by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.kinematics.inverse.reach_mm`,
-    with the longest tool).
-    """
+    """Returns factors (k,) that bring all parameters to mm, angles as arcs at the reach with the longest tool."""
     tools = list(tools)
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
     turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
@@ -127,10 +115,8 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
 
 
 def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
-    """Returns names of directions (k, d) of k parameters, such as ``J2 y (with tool z)``.
-
-    A direction is led by a parameter that is in no other direction, followed by the parameters that move with it.
-    """
+    """Returns names of directions (k, d), such as ``J2 y (with tool z)``, led by a parameter that is in no other
+    one."""
     lead, reduced = [], directions.copy()
     for column in range(reduced.shape[1]):
         free = np.abs(reduced)
@@ -164,12 +150,9 @@ two gave a tenth of the true σ."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """σ of the tool's position, mm (root of the summed variances of x, y, z), by the covariance of the parameters.
-
-    ``here_mm`` : (m,) at the measured joint values; ``ranges_mm`` : (s,) at random ones over the joints' ranges (± half
-    a turn, or the reach, where unlimited), including ``left_mm``, the RMS of the effects found in the residuals;
-    ``covariance`` : (k, k) of all parameters, including elasticity, rad and mm.
-    """
+    """σ of the tool's position, mm (root of the summed variances of x, y, z). ``here_mm`` : (m,) at the measured joint
+    values; ``ranges_mm`` : (s,) at random ones over the joints' ranges, including ``left_mm``, the RMS of effects in
+    the residuals; ``covariance`` : (k, k) of all parameters, rad and mm."""
 
     here_mm: np.ndarray
     ranges_mm: np.ndarray
@@ -182,11 +165,8 @@ class Predicted:
 
 
 def predicted(state: State, robot: Robot, measured: Observed, covariance: np.ndarray) -> Predicted | None:
-    """Returns σ for the target of most rows; None for distances, which do not show where the whole arm is.
-
-    ``state`` : the identified state; ``robot`` : the robot with the joints' ranges; ``measured`` : the observations;
-    ``covariance`` : (k, k) covariance of the parameters, rad and mm.
-    """
+    """Returns σ for the target of most rows, over the ranges of ``robot``; None for distances, which do not place the
+    arm."""
     if measured.kind == "distance":
         return None
     names = list(dict.fromkeys(measured.data.targets))
@@ -218,14 +198,8 @@ def _sigma(
 
 
 def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
-    """Returns σ (r,) of the tool's position at joint values (r, n) that were not measured, mm.
-
-    It includes the effects found in the residuals, and is nan for tools that were not measured.
-
-    ``found`` : prediction of the identification; ``state``, ``kind`` : the identified state, and the kind of
-    observation that it was identified from; ``q`` : (r, n) joint values, rad and mm; ``targets`` : (r,) the tool of
-    each.
-    """
+    """Returns σ (r,) of the position, mm, at joint values (r, n) that were not measured, with the effects found in the
+    residuals; nan for tools that were not measured."""
     sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
     if known.any():
         known_targets = [name for name in targets if name in state.tools]
@@ -242,11 +216,8 @@ def _over_ranges(robot: Robot, count: int) -> np.ndarray:
 
 
 def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
-    """Returns the prediction, its σ over the ranges enlarged by the effects found in the residuals, and notes on it.
-
-    These effects show how much the model is wrong. The covariance takes the model as true and does not include them,
-    so that values identified from other rows differ by more than it says.
-    """
+    """Returns the prediction, enlarged over the ranges by the effects found in the residuals, and notes on it: the
+    covariance takes the model as true."""
     if found is None or not left:
         return found, ()
     effects = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
@@ -267,11 +238,8 @@ def doubts(
     names: list[str],
     tested: bool,
 ) -> tuple[str, ...]:
-    """Returns notes on rows that are few, or that cover a small part of the ranges.
-
-    ``units`` : (k,) factors that make each parameter a movement of the tool of about 1 mm; ``tested`` : rows were held
-    out.
-    """
+    """Returns notes on rows that are few, or that cover a small part of the ranges. ``units`` : (k,) of about 1 mm of
+    the tool; ``tested`` : rows were held out."""
     notes = []
     numbers = WIDTH[measured.kind] * len(measured)
     count = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters"

@@ -34,9 +34,8 @@ SOME = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualElasticity:
-    """The prior of :func:`elasticity_values`, (9 n,), or (10 n,) with hysteresis. ``expected`` : expected values;
-    ``scale`` : factors that make a value rad at the joint's usual torque, or a share of the usual moment; ``group`` :
-    group of σ of each value; ``factor_sigma`` : σ of a factor that all moments have in common."""
+    """Prior of :func:`elasticity_values`. ``scale`` : factors to rad at the usual torque, or shares of the usual
+    moment; ``group`` : of σ of each value; ``factor_sigma`` : σ of a factor that all moments have in common."""
 
     expected: np.ndarray
     scale: np.ndarray
@@ -54,11 +53,7 @@ class UsualElasticity:
         return self._apart(np.diag(self.scale))
 
     def _apart(self, shares: np.ndarray) -> np.ndarray:
-        """Returns the shares made independent, with σ 1.
-
-        Moments err by these shares and, all together, by the factor. The inverse root of their covariance 1 + σ² m mᵀ
-        shortens the component along m, the usual moments, and leaves the others.
-        """
+        """Returns the shares made independent, with σ 1: 1 + σ² m mᵀ is their covariance, m being the usual moments."""
         if not self.factor_sigma:
             return shares
         along = np.where(self.group == MOMENT, self.expected * self.scale, 0.0)
@@ -69,10 +64,8 @@ class UsualElasticity:
 
 
 def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> UsualElasticity:
-    """Returns the usual elasticity of an arm with these dimensions.
-
-    ``carried`` : known loads were carried, which show how heavy the arm itself is; ``hysteresis`` : values are (10 n,).
-    """
+    """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show how heavy the arm
+    is."""
     n = len(chain)
     moment, beside = _moments(chain)
     torque = chain.gathered(np.linalg.norm(moment, axis=1) + beside)
@@ -93,11 +86,9 @@ def carries(chain: Chain, conditions: Conditions) -> bool:
 
 
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
-    """Returns the state with elasticity to be adjusted.
-
-    It starts as the robot file has it, or nearly rigid with gravity down from the base. The payload is the mass that
-    all rows carried, if it was one. Hysteresis is included if rows say from which side joints came.
-    """
+    """Returns the state with elasticity to be adjusted, from the robot file or nearly rigid with gravity down. The
+    payload is the mass that all rows carried, if it was one; hysteresis is included if rows have approach
+    directions."""
     elasticity = state.chain.elasticity
     if elasticity is None or not elasticity.compliance.any():
         n, prior = len(state.chain), usual(state.chain)
@@ -115,8 +106,7 @@ def bending(state: State, robot: Robot, deflection_rad: float, conditions: Condi
 
 
 def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the usual moments (n, 3) of each link in N m, with what follows placed at the next joint, and their σ
-    (n,)."""
+    """Returns each link's usual moment (n, 3) N m, with what follows at the next joint, and its σ (n,)."""
     n = len(chain)
     carrier = [chain.after(i) for i in range(n)]
     last = sorted(set(range(n)) - set(carrier))
@@ -172,10 +162,8 @@ DIMENSIONS = ("a", "alpha", "d", "theta", "beta")
 
 
 def adjusted(text: str) -> Adjusted:
-    """Returns the option for ``text``, names with commas between them; base and tool are always included.
-
-    Raises InputError: an unknown name.
-    """
+    """Returns the option for ``text``, names with commas, with base and tool added; raises InputError: an unknown
+    name."""
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:
         raise InputError("E-OPTION-VALUE", f"--adjust {text}: base,tool, zeros, geometry or all needed")
@@ -186,12 +174,8 @@ def adjusted(text: str) -> Adjusted:
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """σ of a robot's dimensions about nominal: lengths (mm), twists (rad), and zero positions of joints (rad, mm).
-
-    Also σ of the deflection of links at the usual torque, about the joints' axes and across them, of gears, and of
-    hysteresis of joints (rad). The defaults are the values expected before the data are seen: some tenths of a
-    millimetre and of a degree.
-    """
+    """σ of a robot about nominal, before the data are seen: lengths (mm), twists (rad), zeros of joints (rad, mm), and
+    links' deflection at the usual torque about the joints' axes and across them, gears, hysteresis (rad)."""
 
     length_mm: float = 0.5
     twist_rad: float = 1e-3
@@ -240,11 +224,8 @@ class NominalRows:
     def about(
         cls, state: State, units: np.ndarray, nominal: Robot, adjust: Adjusted = "all", carried: bool = False
     ) -> "NominalRows":
-        """Returns the rows with their derivatives at ``state``.
-
-        ``units`` : (k,) steps of the parameters that move the tool by 1 mm; ``adjust`` : dimensions that this or the
-        robot file keeps are conditions; ``carried`` : known loads were carried.
-        """
+        """Returns the rows with their derivatives at ``state``. ``units`` : (k,) steps that move the tool by 1 mm;
+        ``adjust`` : other dimensions are conditions; ``carried`` : known loads were carried."""
         coaxial = _coaxial(nominal)
 
         def values(step: np.ndarray) -> np.ndarray:
@@ -267,8 +248,7 @@ class NominalRows:
         return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
     def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
-        """Returns the nominal dimensions as prior knowledge, linear about ``state``, with the σ of ``deviations``, by
-        all parameters of this kind of observation."""
+        """Returns the nominal dimensions as prior knowledge, linear about ``state``, with the σ of ``deviations``."""
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
         jacobian = self.jacobian[self.free]
@@ -300,8 +280,7 @@ class NominalRows:
         )
 
     def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
-        """Returns σ (n, 5) of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k,
-        k)."""
+        """Returns σ (n, 5) of the rows of ``robot`` from the parameters' covariance (k, k)."""
         jacobian = self.by_parameters(robot)
         covariance = covariance[: jacobian.shape[2], : jacobian.shape[2]]
         sigma = np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
@@ -367,17 +346,8 @@ def tool_name(name: str) -> str:
 
 
 def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
-    """Returns base and tools of the robot file that ``state`` makes, stations, and the starts of branches of a tree.
-
-    Parameters
-    ----------
-    state : the identified state
-    kind : {"pose", "position", "distance"}: kind of the observations: positions tell no orientation of a tool,
-        distances no base
-    covariance : (k, k) covariance of the parameters without elasticity
-    units : (k,) factors that make each parameter a movement of the tool of about 1 mm
-    nominal : the robot whose file form is used
-    """
+    """Returns base and tools as ``nominal``'s file form has them, stations, and starts of branches, with σ from the
+    ``covariance`` without elasticity. Positions tell no orientation of a tool, distances no base."""
 
     def poses(at: State) -> Poses:
         robot = robot_from_chain(at.chain, at.tools, nominal)

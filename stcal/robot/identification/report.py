@@ -332,8 +332,7 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
 
 
 def _price(result: Identified) -> list[str]:
-    """Returns what was adjusted, and the held-out errors with and without the kept dimensions; empty if none are
-    kept."""
+    """Returns what was adjusted, and the held-out errors with and without the kept dimensions, if any."""
     rows = result.adjustment.rows
     if not rows.fixed.any():
         return []
@@ -358,11 +357,7 @@ def _model(result: Identified) -> list[str]:
 
 
 def _elastic_blocks(result: Identified) -> list[Block]:
-    """Returns a table with a row of each joint, with σ.
-
-    The columns are the deflection of its link at the torques of the measured rows (RMS), the amplitudes of its gear
-    error, and its hysteresis if it was adjusted.
-    """
+    """Returns a table of each joint's deflection at the measured torques (RMS), gear error and hysteresis, with σ."""
     elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
     if elasticity is None or sigma is None:
         return []
@@ -410,8 +405,7 @@ def _elasticity(result: Identified) -> dict | None:
 
 
 def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
-    """Returns translation, mm, and rotation vector, deg, (6,); and σ (6,) of shifts along, and turns about, the
-    axes."""
+    """Returns translation, mm, and rotation vector, deg, (6,); and their σ (6,)."""
     values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
     return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
 

@@ -267,11 +267,8 @@ class Identified(Brief):
 
 
 def misgivings(result: Identified, nominal: Robot) -> tuple[str, ...]:
-    """Returns notes on a result whose own figures speak against it: stated σ that residuals contradict, no gain over
-    the nominal robot, or lengths that all differ by one factor.
-
-    ``nominal`` : the robot as its file has it.
-    """
+    """Returns notes on stated σ that residuals contradict, no gain over ``nominal``, or lengths that differ by one
+    factor."""
     notes = [] if (stated := _stated_otherwise(result)) is None else [stated]
     if result.held_out is not None:
         after, before = (float(np.sqrt(np.nanmean(e**2))) for e in (result.held_out.position_mm, result.nominal_mm))
@@ -332,11 +329,7 @@ def position_errors(found: np.ndarray) -> np.ndarray:
 
 
 def require_identified_written(path: Path | str, result: Identified) -> None:
-    """Read a written robot file again, and require that it predicts the residuals that were reported.
-
-    Raises ConvergenceError: the file cannot be read again, or residuals of the measurements by it differ from those of
-    the result.
-    """
+    """Read a written robot file again, and require that it predicts the reported residuals; raises ConvergenceError."""
 
     def again() -> np.ndarray:
         robot = load_robot(path)

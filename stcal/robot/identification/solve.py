@@ -244,11 +244,8 @@ def _enough(measured: Observed, state: State, rows: NominalRows) -> None:
 
 
 def _weighting(state: State, measured: Observed, options: IdentifyOptions) -> Weighting:
-    """Returns the weighting at the start, and which σ are estimated from the residuals.
-
-    If the σ of all coordinates are given, they are weights, and σ₀ multiplies them. If one of two σ is given, it is
-    taken as exact. σ that are not given start at the misfit, so that no observation is an outlier at first.
-    """
+    """Returns the weighting at the start. If all σ are given, they are weights that σ₀ multiplies; one of two σ is
+    exact. σ that are not given start at the misfit, so that no observation is an outlier at first."""
     sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
     needed = ("rad", "mm") if measured.kind == "pose" else ("mm",)
     missing = tuple(name for name in needed if sigma[name] is None)
@@ -292,11 +289,8 @@ def _without_errors(
     known: Known,
     rounds: int = VARIANCE_ROUNDS,
 ) -> Adjustment:
-    """Solves, removes gross errors, and solves again until the set of gross errors stays the same.
-
-    ``good`` : (r,) mask of the observations that are no gross errors at the start. Huber weights bound an outlier's
-    pull, but each outlier pulls as hard as the worst observation without a gross error, and no covariance shows it.
-    """
+    """Solves, removes gross errors, and solves again until their set (``good`` is the first) stays the same. Huber
+    weights bound an outlier's pull, but no covariance shows it."""
     for _ in range(OUTLIER_ROUNDS + 1):
         adjustment = _settled(state, measured if good.all() else only_of(measured, good), options, known, rounds)
         if not good.all():
@@ -304,19 +298,13 @@ def _without_errors(
             length = np.linalg.norm(adjustment.weighting.whiten(errors, measured), axis=1)
             weights = huber_weights(length, huber_limit(measured.kind))
             adjustment = replace(adjustment, solution=replace(adjustment.solution, residuals=errors, weights=weights))
-        if not _errors_change(adjustment, good):
+        now_good = adjustment.solution.weights >= GROSS
+        if (now_good == good).all() or now_good.mean() < MOSTLY_GOOD:
             return adjustment
-        good, state = adjustment.solution.weights >= GROSS, adjustment.solution.state
+        good, state = now_good, adjustment.solution.state
         known = (adjustment.rows, adjustment.weighting, adjustment.deviations)
     note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
     return replace(adjustment, notes=(*adjustment.notes, note))
-
-
-def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
-    """Returns True if the set of gross errors is not that of ``good`` (r,); False if most observations would be
-    errors."""
-    now = found.solution.weights >= GROSS
-    return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
 
 
 def _by_medians(
@@ -350,8 +338,7 @@ def _settled(state: State, measured: Observed, options: IdentifyOptions, known: 
 
 
 def _undetermined(solution: Solution, names: list[str], measured: Observed, partial: bool) -> tuple[str, ...]:
-    """Returns the directions that the data leave open, named by their parameters, beyond those that distances never
-    show."""
+    """Returns names of the directions that the data leave open, beyond those that distances never show."""
     _, directions, determined = solution.spectrum()
     expected = unseen(measured.kind)
     if (~determined).sum() <= expected:
@@ -376,8 +363,7 @@ def _undetermined(solution: Solution, names: list[str], measured: Observed, part
 
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
-    """Returns how many parameters poses, positions and distances at these joint values determine, whichever were
-    measured."""
+    """Returns how many parameters each kind of measurement at these joint values would determine."""
     tip = tips_of(state, data)
     exact = Measurements(
         data.where,
@@ -416,8 +402,7 @@ def _observability(robot: Robot, adjusted: Adjustment, measured: Observed, rank:
 
 
 def _place(measured: Observed) -> int:
-    """Returns the number of directions in which positions that count by their distances can be moved together: 6 per
-    station (5 for points on a line)."""
+    """Returns in how many directions positions that count by distances move together: 6 a station, 5 if on a line."""
     if not measured.frameless:
         return 0
     directions = 0
@@ -428,8 +413,7 @@ def _place(measured: Observed) -> int:
 
 
 def _covariance(adjusted: Adjustment, measured: Observed) -> np.ndarray:
-    """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show, which stay as
-    they were."""
+    """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show."""
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
     if measured.kind != "distance":
         return covariance
@@ -443,11 +427,8 @@ def _covariance(adjusted: Adjustment, measured: Observed) -> np.ndarray:
 def _cross_validated(
     robot: Robot, measured: Observed, whole: Adjustment, options: IdentifyOptions
 ) -> HeldOutRows | None:
-    """Returns errors of rows that took no part in the parameters; None if the rows are too few.
-
-    If there are few rows, held-out rows are not used for the σ and for the search for gross errors either. Each
-    iteration starts at the solution of all rows, which is near; the minimum does not depend on the start.
-    """
+    """Returns errors of rows that took no part in the parameters; None if too few. If few, they do not count for σ and
+    gross errors either. Iterations start at the solution of all rows."""
     rows = len(measured)
     if min(options.folds, rows) < LEAST_FOLDS:
         return None

@@ -56,14 +56,10 @@ reach."""
 
 
 def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
-    """Returns the nominal chain with its base in the instrument's frame, and the tools that fit the measurements best.
+    """Returns the nominal chain, with base and tools that fit the measurements best, or as given if not in ``fit``.
 
-    ``robot`` : the robot. Its axes are taken as they are, and so are base and tools unless they are fitted. ``data`` :
-    the measurements of the instrument; ``fit`` : frozenset of {"base", "tool"}: what is fitted to the measurements;
-    both if not given.
-
-    Raises InputError: the nominal robot does not fit the data; the message names a cause if its correction makes the
-    robot fit. Raises DegenerateError: a target never moved, or only along a line.
+    Raises InputError: the robot does not fit the data; the message names a cause if its correction makes it fit. Raises
+    DegenerateError: a target never moved, or only along a line.
     """
     if data.positions is not None and len(set(data.stations)) > 1:
         return _with_stations(robot, data, fit)
@@ -108,8 +104,7 @@ def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
 
 
 def _with_stations(robot: Robot, data: Measurements, fit: Fit) -> State:
-    """Returns the state by the rows of the station with most rows; the other stations stand where its positions put
-    them."""
+    """Returns the state by the rows of the largest station; its positions place the others."""
     (first, most), *others = data.by_station().items()
     state = start(robot, data[most], fit)
     default = robot.tools.get("", Rigid())
@@ -166,8 +161,7 @@ def _moves(data: Measurements) -> None:
 
 
 def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
-    """Returns base and tool points by least squares and tool orientations after them, as a state; and the RMS misfit,
-    mm."""
+    """Returns the state by least squares of base and tool points, then tool orientations; and the RMS misfit, mm."""
     chain = replace(robot, world_from_base=Rigid()).chain()
     flange = carried_poses(chain, data.q, data.targets, data.conditions)
     names = list(tools)
@@ -210,8 +204,7 @@ def _base_and_points(
     given: Rigid | None = None,
     fit_points: bool = True,
 ):
-    """Returns base (unless ``given``) and tool points by least squares, starting from the alignment with the points
-    given; and the RMS misfit, mm."""
+    """Returns base (unless ``given``) and tool points by least squares, and the RMS misfit, mm."""
     free = np.array([given is None] * 6 + [fit_points] * points.size)
     try:
         base = given or align_rigid(positions, flange @ points[rows])
@@ -402,8 +395,7 @@ def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
 
 
 def _pairs_of_mistakes(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields the data with two mistakes undone: of different kinds among convention, zero, sign and coupling, or wrong
-    zeros of two joints, or reversed signs of several."""
+    """Yields the data with two mistakes undone: of different kinds, two wrong zeros, or several reversed signs."""
     n, inner = len(robot.rows), _inner(robot)
     if n > MOST_JOINTS:
         return

@@ -79,29 +79,15 @@ def left(
     explained: np.ndarray,
     weights: np.ndarray | None = None,
 ) -> tuple[Finding, ...] | None:
-    """Returns the effects found in the residuals of ``state``.
+    """Returns the effects found in the residuals of ``state``, at most three, the strongest first; None for too few
+    rows.
 
-    Candidates of a revolute joint are its zero; its angle, once and twice a turn, as a motion of that joint (an error
-    of its gear or encoder) and as one of the tool along the base's axes; the direction from which it came; and the
-    torque about it of a load at the tool, where z of the base is up. A prismatic joint has its value. Every joint has
-    the values of the others, as a motion of that joint (a coupling). Candidates of place are scale, linear terms, and
-    the distance from the base's axis. Along the order of the rows, which is that of the measurements, the instrument or
-    the base may have moved, a target slipped, or a joint lost its zero: a jump at any row, or a drift. These are tried
-    with all rows, since half of them may seem to be errors.
+    Candidates of a revolute joint are its zero, its angle once and twice a turn (its gear, or a motion along the base's
+    axes), its approach, the torque of a load; of each joint the values of the others (a coupling). Candidates of place
+    are scale, linear terms, and the distance from the base's axis. Along the order of the rows, a jump or drift of
+    instrument, base, target or a joint's zero is tried with all rows, since half of them may seem to be errors.
 
-    Parameters
-    ----------
-    state : chain and tools, as fitted or given
-    world_from_base : pose of the base, for up, the axes and the place
-    measured : r observations
-    weighting : σ of the observations, up to a common factor
-    explained : (r, w, k) derivatives by the parameters that were fitted to these observations
-    weights : (r,) weights of the observations; those below 0.5 are errors and left out
-
-    Returns
-    -------
-    tuple of Finding, or None
-        The strongest first, at most three; None if the observations are too few to tell.
+    ``explained`` : (r, w, k) derivatives by the fitted parameters; ``weights`` : (r,), those below 0.5 are left out.
     """
     errors = residuals(state, measured)
     candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
@@ -136,12 +122,9 @@ class _Found:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rest:
-    """The part of whitened residuals (N,) that the fitted parameters do not explain.
-
-    ``errors`` : (r, w), not whitened; ``before`` : (N,) whitened; ``fitted`` : (N, k) basis; ``remaining`` : (N,);
-    ``square`` : squared length of the remaining residuals at first; ``freedom`` : degrees of freedom; ``rows`` : number
-    of rows used; ``effects`` : candidates with their whitened motions (N, c).
-    """
+    """The part of whitened residuals (N,) that ``fitted`` (N, k) does not explain. ``errors`` : (r, w), ``before`` :
+    (N,) whitened; ``square`` : of what remained at first; ``effects`` : candidates with their whitened motions (N,
+    c)."""
 
     errors: np.ndarray
     before: np.ndarray
@@ -162,10 +145,8 @@ class _Rest:
         measured: Observed,
         root: np.ndarray,
     ) -> "_Rest":
-        """Returns the unexplained part of ``errors`` (r, w).
-
-        ``root`` : (r,) roots of the weights, 0 for rows left out.
-        """
+        """Returns the unexplained part of ``errors`` (r, w); ``root`` : (r,) roots of the weights, 0 for rows left
+        out."""
 
         def white(values: np.ndarray) -> np.ndarray:
             return (root[:, None, None] * weighting.whiten(values, measured)).reshape(errors.size, -1)
@@ -240,8 +221,7 @@ class _Test:
 
 
 def _tested(rest: np.ndarray, known: np.ndarray, values: np.ndarray, freedom: int) -> _Test | None:
-    """Returns the F test of what ``values`` (N, c) add to ``known``; None if they add nothing, or leave no degrees of
-    freedom."""
+    """Returns the F test of what ``values`` (N, c) add to ``known``; None if nothing, or without degrees of freedom."""
     values = _unit(values)
     new = _basis(values - known @ (known.T @ values), NEW)
     c = new.shape[1]
@@ -260,8 +240,7 @@ def _unit(values: np.ndarray) -> np.ndarray:
 
 
 def _basis(values: np.ndarray, least: float) -> np.ndarray:
-    """Returns an orthonormal basis (N, c) of the directions in which columns of length 1 differ by more than
-    ``least``."""
+    """Returns an orthonormal basis (N, c) of directions in which unit columns differ by more than ``least``."""
     u, s, _ = np.linalg.svd(values, full_matrices=False)
     return u[:, s > least]
 
@@ -324,8 +303,7 @@ def _order(state: State, measured: Observed) -> list[_Order]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Moved(_Found):
-    """A finding along the order of the rows, with its effects (r, w, c) for each motion, and a mask (r,) of rows that
-    are no errors."""
+    """A finding along the order of rows, with its effects (r, w, c), and a mask (r,) of rows that are no errors."""
 
     motions: np.ndarray
     good: np.ndarray

@@ -81,8 +81,7 @@ class Components:
         return mean * self.units[:, None] * self.units
 
     def _root(self, best: np.ndarray) -> np.ndarray:
-        """Returns a square root (p, f) of the covariance of log σ, for the f components that are not at their lower
-        limit."""
+        """Returns a square root (p, f) of the covariance of log σ, for the f components above their lower limit."""
         free = np.flatnonzero(best > self.least + STEP)
         moves = STEP * np.eye(len(best))[free]
         gradient = self.parts.at(np.concatenate([best + moves, best - moves]))[1]
@@ -97,11 +96,8 @@ class Components:
 
 
 def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (m, width) and weights (m,) for a standard normal distribution.
-
-    In many dimensions they are those of the cubature of degree three (Arasaratnam & Haykin, IEEE Trans. Automatic
-    Control 54, 2009), else of the product rule.
-    """
+    """Returns points (m, width) and weights (m,) for a standard normal distribution: the product rule, or in many
+    dimensions the cubature of degree three (Arasaratnam & Haykin 2009)."""
     if width > MOST_PRODUCT:
         away = np.sqrt(width) * np.eye(width)
         return np.vstack([away, -away]), np.full(2 * width, 0.5 / width)
@@ -117,8 +113,7 @@ def components(
     rows: NominalRows,
     deviations: Deviations,
 ) -> Components:
-    """Returns the parts of an adjustment: those of the data whose σ is estimated, then the groups of the robot's
-    dimensions."""
+    """Returns the parts of an adjustment: those of the data whose σ is estimated, then groups of dimensions."""
     units = solution.units
     white = weighting.whiten(solution.residuals, measured)
     derivative = weighting.whiten(jacobian(solution.state, measured), measured) * units
@@ -151,22 +146,12 @@ def components(
     count, expected, doubt, least, most = (np.array(values, float) for values in numbers)
     together, curved = NormalEquations.stacked(equations_of_parts), curvature_of(solution, measured, weighting)
     if curved is not None:
-        together, fixed = _bent(together, fixed, np.isfinite(doubt), curved * units[:, None] * units)
+        # At the minimum the data pull as much as held and fixed parts hold; this changes with the σ of these parts.
+        held = np.isfinite(doubt)
+        bends = Bent.of(fixed.normal + together.normal[held].sum(0), curved * units[:, None] * units).bends()
+        bent = np.where(held[:, None, None], bends.T @ together.normal @ bends, together.normal)
+        together, fixed = replace(together, normal=bent), replace(fixed, normal=bends.T @ fixed.normal @ bends)
     return Components(Parts(together, count, fixed, expected, doubt), least, most, units)
-
-
-def _bent(
-    each: NormalEquations, fixed: NormalEquations, held: np.ndarray, curved: np.ndarray
-) -> tuple[NormalEquations, NormalEquations]:
-    """Returns the parts after second derivatives have taken ``curved`` (k, k) from the ``held`` (p,) and fixed ones.
-
-    At the minimum the data pull as much as these parts hold. This pull changes with the σ of these parts, not of the
-    data.
-    """
-    normal = fixed.normal + each.normal[held].sum(0)
-    bends = Bent.of(normal, curved).bends()
-    bent = np.where(held[:, None, None], bends.T @ each.normal @ bends, each.normal)
-    return replace(each, normal=bent), replace(fixed, normal=bends.T @ fixed.normal @ bends)
 
 
 def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
@@ -208,9 +193,6 @@ def estimated(
 
 
 def _kept(kind: Kind) -> float:
-    """Returns the share of the square of normal residuals that is left when they are cut off at Huber's limit.
-
-    With this share (Huber's Proposal 2) outliers hardly move σ, and without outliers σ is not too small.
-    """
+    """Returns the share of the square of normal residuals below Huber's limit (Huber's Proposal 2)."""
     width, limit = WIDTH[kind], huber_limit(kind) ** 2
     return float(chdtr(width + 2, limit) + limit / width * chdtrc(width, limit))

@@ -21,13 +21,8 @@ MOST_KG = 1e4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conditions:
-    """Payload and approach directions of m joint vectors.
-
-    ``payload_kg`` : (m,) mass at the flange; that of the robot file if not given; ``approach`` : (m, n) direction in
-    which each joint moved last: 1 upwards, −1 downwards, 0 unknown.
-
-    Raises InputError: a mass that is not finite, below 0 or above ``MOST_KG``; a direction other than 1, −1 and 0.
-    """
+    """Payload and approach directions of m joint vectors. ``payload_kg`` : (m,) mass at the flange; ``approach`` : (m,
+    n) direction in which each joint moved last: 1 upwards, −1 downwards, 0 unknown."""
 
     payload_kg: np.ndarray | None = None
     approach: np.ndarray | None = None
@@ -70,10 +65,7 @@ USUAL = Conditions()
 
 
 def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
-    """Returns conditions with one mass for all ``count`` joint vectors, or one mass for each.
-
-    Raises InputError: as :class:`Conditions`; or the number of masses is neither 1 nor ``count``.
-    """
+    """Returns conditions with one mass for all ``count`` joint vectors, or one for each; raises InputError."""
     if payload_kg is None:
         return USUAL
     values = np.asarray(payload_kg, float)
@@ -83,13 +75,8 @@ def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
 
 
 def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
-    """Reads the conditions of a table's rows: payload, and columns ``approach1`` … of ``joints`` joints.
-
-    The payload is column ``payload_kg``, or ``payload_kg`` for all rows.
-
-    Raises InputError: both a column and an argument ``payload_kg``, or an invalid mass or direction; the message names
-    the line.
-    """
+    """Reads payload and columns ``approach1`` … of a table; the payload is column ``payload_kg``, or the argument.
+    Raises InputError naming the line."""
     return replace(_carried(table, payload_kg), approach=_approach(table, joints))
 
 

@@ -98,12 +98,9 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
 
 
 def _elasticity(robot: Robot, chain: Chain, elasticity: Elasticity, flange_from_loaded: Rigid) -> Elasticity:
-    """Returns the elasticity of ``chain`` in the joint frames of the rigid ``robot``.
-
-    Those frames are rotated about the joints' axes and shifted along them. Moments rotate with them. Pivots keep the
-    points about which links bend, since a frame may be far from its point: the next axis may cross the joint's axis
-    elsewhere than in the nominal row. ``flange_from_loaded``: frame of the joint of ``chain`` that carries the load.
-    """
+    """Returns the elasticity of ``chain`` in the joint frames of the rigid ``robot``, which are turned about the
+    joints' axes and shifted along them: pivots keep their points. ``flange_from_loaded`` : frame of the loaded
+    joint."""
     zero = np.zeros((1, len(chain)))
     of_rows, rows_at = joint_frames(robot.chain(), zero)
     of_chain, chain_at = joint_frames(replace(chain, elasticity=None), zero)
@@ -122,9 +119,7 @@ def _elasticity(robot: Robot, chain: Chain, elasticity: Elasticity, flange_from_
 
 
 def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
-    """Returns the row with θ, d of the previous joint and a, α, β to the next axis.
-
-    ``gap`` is determined up to the free motion of the next joint."""
+    """Returns the row with θ, d of the previous joint and a, α, β to the next axis, up to that joint's motion."""
     z, place = gap.rotation[:, 2], gap.translation
     sine = float(np.hypot(z[0], z[1]))
     parallel = sine < np.sin(PARALLEL_RAD)
@@ -160,11 +155,8 @@ def _near(angle: float, nominal: float) -> float:
 def robot_between(
     chain: Chain, tools: Mapping[str, Rigid], name: str, convention: Convention, joints: tuple[Joint, ...]
 ) -> Robot:
-    """Returns a robot with these axes and tools (flange_from_tool), without a nominal robot.
-
-    Its first row begins at the chain's base, and its last row ends at the chain's flange, where a row without β can;
-    otherwise the base and the tools absorb the remaining transform.
-    """
+    """Returns a robot with these axes and tools (flange_from_tool), without a nominal robot. Base and tools absorb what
+    a row without β cannot take."""
     bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling, unusual_size=True)
     hints = list(bare.rows)
     robot = _with_ends(chain, tools, bare)
@@ -194,9 +186,7 @@ def _with_ends(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robo
 
 
 def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
-    """Returns the row without β that gives this pose, or None.
-
-    Without ``across_too`` only d and θ of the row are used."""
+    """Returns the row without β that gives this pose, or None; only its d and θ unless ``across_too``."""
     r, p = pose.rotation, pose.translation
     if not across_too:
         row = DHRow(0.0, 0.0, float(p[2]), float(np.arctan2(r[1, 0], r[0, 0])))
@@ -238,11 +228,8 @@ MOST_TOOLS = 200
 def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
     """Refuse orientations that fit the robot only in another quaternion convention.
 
-    Orientations that do not fit in any convention are accepted.
-
-    ``where`` : name of the file, for messages; ``targets`` : (m,) names of the targets seen or commanded; ``flange`` :
-    (m, 3, 3) rotations of the flange according to the robot model; ``seen`` : (m, 3, 3) rotations of the targets as
-    read from the file.
+    ``where`` : name of the file; ``targets`` : (m,) of the rows; ``flange``, ``seen`` : (m, 3, 3) rotations by the
+    model, and of the targets as read.
 
     Raises InputError: only another convention fits; the message names it.
     """
@@ -260,8 +247,7 @@ def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, s
 
 
 def turned_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
-    """Returns the RMS angle between orientations ``seen`` (m, 3, 3) and those of the flange with the best-fitting tool
-    of each target, rad."""
+    """Returns the RMS angle, rad, of ``seen`` (m, 3, 3) to the flange's with the best-fitting tool of each target."""
     between = np.swapaxes(flange, 1, 2) @ seen
     square = 0.0
     for name in set(targets):
@@ -274,10 +260,8 @@ def turned_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> 
 def require_orientations(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
     """Refuse orientations of which most are not those of the robot, whatever its tools; arguments as above.
 
-    Few rows may be wrong: the typical angle from the best tool is tested, not the RMS. One orientation in all rows, as
-    of instruments that see none, is no misreading: the adjustment finds that it tells nothing.
-
-    Raises InputError: the message names the misreading that explains it, if one does.
+    The typical angle is tested, as few rows may be wrong. One orientation in all rows is no misreading: the adjustment
+    finds that it tells nothing. Raises InputError: the message names the misreading that explains it.
     """
     own = _typical_rad(targets, flange, seen)
     if own < TURNED_RAD or np.ptp(seen, axis=0).max() < NOTHING_RAD:

@@ -316,10 +316,8 @@ def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> 
 
 
 def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = None) -> None:
-    """Read a written robot file again, and require that it turns about the axes of ``chain``, and leads its tools where
-    ``robot`` does.
-
-    ``chain`` : axes as identified; those of ``robot`` if None.
+    """Read a written robot file again, and require that it has the axes of ``chain`` (of ``robot`` if None) and its
+    tools.
 
     Raises ConvergenceError: the file cannot be read again, or an axis or a pose of a tool differs.
     """

@@ -79,10 +79,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
 
 def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> Poses:
-    """Returns world_from_flange of joint vectors (m, n).
-
-    Raises InputError: the joints are a tree, which has no one flange.
-    """
+    """Returns world_from_flange of joint vectors (m, n); raises InputError for a tree, which has no one flange."""
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     path = chain.path()
     for start in range(0, len(q), CHUNK):
@@ -136,10 +133,7 @@ def links(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[
 def torques(
     chain: Chain, q: np.ndarray, rotation: np.ndarray, origin: np.ndarray, conditions: Conditions = USUAL
 ) -> np.ndarray:
-    """Returns the torque of gravity about each joint, (n, m, 3) N m, in the world's axes.
-
-    ``rotation`` : (n, m, 3, 3), ``origin`` : (n, m, 3), from :func:`links` at joint vectors (m, n).
-    """
+    """Returns the torque of gravity about each joint, (n, m, 3) N m, in the world's axes; frames from :func:`links`."""
     elasticity = _elasticity(chain)
     carried = chain.gathered((rotation @ elasticity.moment[:, None, :, None])[:, :, :, 0])
     mass = conditions.payload_kg
@@ -178,8 +172,7 @@ def _turning(chain: Chain) -> np.ndarray:
 
 
 def deflections(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> np.ndarray:
-    """Returns the deflection of each link, (n, m, 3) rad, in the link's frame. Torques are those on the rigid arm; they
-    differ from the torques on the deflected arm only as little as it deflects."""
+    """Returns the deflection of each link, (n, m, 3) rad, in its frame, by the torques on the rigid arm."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque = np.einsum("imkc,imk->imc", rotation, torques(chain, q, rotation, origin, conditions))
@@ -200,10 +193,8 @@ def _elasticity(chain: Chain) -> Elasticity:
 def _walk(
     chain: Chain, joints: Sequence[int], q: np.ndarray, conditions: Conditions = USUAL, visit=None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the axes (3 axes, 3 components, m) and origin (3, m) after the last of ``joints``.
-
-    Each joint follows those that carry it. ``visit`` is called with each frame before the joint's motion.
-    """
+    """Returns axes (3 axes, 3 components, m) and origin (3, m) after ``joints``; ``visit`` gets frames before each
+    motion."""
     m = len(q)
     give = None
     if chain.elasticity is not None:
@@ -246,10 +237,8 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
 
 
 def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
-    """Returns the derivative (m, 6, k) of poses ``tip`` by :func:`chain_parameters`, in the world's axes.
-
-    ``tip`` : world_from_tool.
-    """
+    """Returns the derivative (m, 6, k) of ``tip``, world_from_tool, by :func:`chain_parameters`, in the world's
+    axes."""
     rotation, origin = joint_frames(chain, q, conditions)
     joint, component = np.array(chain_parameters(chain)).T
     direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
@@ -267,10 +256,7 @@ def elasticity_jacobian(
     conditions: Conditions = USUAL,
     hysteresis: bool = False,
 ) -> np.ndarray:
-    """Returns the derivative of poses ``tip`` by :func:`elasticity_values`, (m, 6, 9 n or 10 n), in the world's axes.
-
-    ``tip`` : world_from_tool of ``targets``.
-    """
+    """Returns the derivative (m, 6, 9 n or 10 n) of ``tip`` by :func:`elasticity_values`, in the world's axes."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque, z = torques(chain, q, rotation, origin, conditions), rotation[..., 2]
@@ -299,10 +285,7 @@ def elasticity_curvature(
     chain: Chain, q: np.ndarray, tip: Poses, targets: Sequence[str], pull: np.ndarray, conditions: Conditions = USUAL
 ) -> np.ndarray:
     """Returns the second derivative (9 n, 9 n) of the sum of ``pull`` (m, 6) times :func:`elasticity_jacobian`'s
-    motions.
-
-    Only products of compliance and moment have one.
-    """
+    motions; only products of compliance and moment have one."""
     elasticity, n = _elasticity(chain), len(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     z = rotation[..., 2]
@@ -348,12 +331,10 @@ def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
         twist[i, c] = value
     turn = Rotation.from_rotvec(twist[:, :3]).as_matrix()
     translation = chain.translation + np.einsum("nij,nj->ni", chain.rotation, twist[:, 3:])
-    return replace(chain, rotation=_orthogonal(chain.rotation @ turn), translation=translation)
-
-
-def _orthogonal(rotation: np.ndarray) -> np.ndarray:
-    """Removes rounding errors from rotations (n, 3, 3), by one step of Newton's iteration for the polar factor."""
-    return 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
+    rotation = chain.rotation @ turn
+    # One step of Newton's iteration for the polar factor removes rounding errors.
+    rotation = 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
+    return replace(chain, rotation=rotation, translation=translation)
 
 
 def _from_base_to_tool(robot: Robot, tool: str) -> Chain:

@@ -28,11 +28,9 @@ remains is removed by :func:`_position_exact`."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InverseProblem:
-    """An arm with a tool, in unitless joint values.
-
-    ``unit`` : (n,) rad or mm that a unitless value of 1 stands for; ``reach`` : mm; ``bounds`` : (n, 2) joint limits;
-    ``middle`` : (n,) centre of the bounds, 0 if unlimited; ``turns`` : (n,) true if adding 2π gives the same position.
-    """
+    """An arm with a tool, in unitless joint values. ``unit`` : (n,) rad or mm of a unitless 1; ``reach`` : mm;
+    ``bounds`` : (n, 2); ``middle`` : (n,) of the bounds, 0 if unlimited; ``turns`` : (n,) whether 2π more is the same
+    position."""
 
     robot: Robot
     tool: str
@@ -85,10 +83,8 @@ def reach_mm(robot: Robot, tool: str = "") -> float:
 
 
 def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-    """Returns unitless joint vectors (m, n) of least error, found from starts q; within ``bounds`` (n, 2) if given.
-
-    A pose that cannot be reached raises no error: the result is then a local minimum of the error.
-    """
+    """Returns unitless joint vectors (m, n) of least error from starts q, a local minimum where a pose is out of
+    reach."""
     q = q.copy()
     if not len(q):
         return q
@@ -100,7 +96,7 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
     error = problem.errors(goal, q)
     damping = np.full(len(q), 1e-2)
     for _ in range(ROUNDS):
-        going = ~_done(error)
+        going = ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
         rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
         if not len(rows):
             break
@@ -117,10 +113,6 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
         keep = ~stuck
         rows, goal, error, damping = rows[keep], goal[keep], error[keep], damping[keep]
     return _position_exact(problem, poses, q, bounds) if problem.under_actuated else q
-
-
-def _done(off: np.ndarray) -> np.ndarray:
-    return (np.abs(off[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(off[:, 3:]).max(axis=1) <= DONE_MM)
 
 
 def _step(
@@ -366,10 +358,8 @@ def _refuse_redundant(problem: InverseProblem) -> None:
 
 
 def _every_solution(problem: InverseProblem, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
-    """Returns for each pose joint vectors (k, n) from many starts, ignoring limits, converged or not.
-
-    ``more`` : (m, n) one additional joint vector for each pose.
-    """
+    """Returns for each pose joint vectors (k, n) from many starts and ``more`` (m, n), converged or not, ignoring
+    limits."""
     n, m = len(problem.unit), len(poses)
     low, high = problem.bounds.T
     whole = np.minimum(np.pi, (high - low) / 2)  # of more than a turn one turn is enough
@@ -393,9 +383,8 @@ def _embedded(poses: Poses, reach: float) -> np.ndarray:
 def _nearest(
     problem: InverseProblem, pose: Poses, solutions: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray | None, bool]:
-    """Returns the solution of one pose nearest to ``near`` within the limits, or None.
-
-    The second value is true if the pose is reached only by solutions beyond the limits."""
+    """Returns the solution nearest to ``near`` within the limits or None, and whether only solutions beyond them
+    reach."""
     turned, inside = _turned(problem, solutions, near)
     count = len(turned)
     many = Poses(np.repeat(pose.rotation, count, 0), np.repeat(pose.translation, count, 0))

@@ -394,8 +394,7 @@ def longest_link(rows: Sequence[DHRow]) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grown:
-    """A tree of joints: ``tree``; ``ends`` : (n,) end of each joint's row in the frame of the joint; and
-    ``flange_joint`` : the joint whose row ends at the flange, if one is chosen."""
+    """A tree of joints; ``ends`` : (n,) end of each joint's row in its frame; ``flange_joint`` : ends at the flange."""
 
     tree: Tree
     ends: tuple[Rigid, ...]
@@ -471,19 +470,14 @@ class Chain:
         return total
 
     def branch(self, carrier: int) -> "Chain":
-        """Returns the chain with the end of the row of ``carrier`` as flange.
-
-        Other branches stay, as their weight bends this one.
-        """
+        """Returns the chain with the row of ``carrier`` ending at the flange; other branches stay, as they bend this
+        one."""
         if self.grown is None:
             return self
         return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, flange_joint=carrier))
 
     def path(self) -> tuple[int, ...]:
-        """The joints from the world to the flange.
-
-        Raises InputError: a tree, which has no one flange.
-        """
+        """The joints from the world to the flange; raises InputError for a tree, which has no one flange."""
         if self.grown is None:
             return tuple(range(len(self)))
         if self.grown.flange_joint is None:

@@ -82,11 +82,8 @@ class CompensationFile(ResultFile):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stayed:
-    """Solutions without changes of configuration.
-
-    ``found`` : solutions, each in the configuration of the joint values that it is near to; ``beyond`` : by row the
-    limits that prevent this, such as ``"J4 at 190.2°, limit 190°"``.
-    """
+    """``found`` : solutions in the configuration of their joint values; ``beyond`` : by row the limits that prevent
+    it."""
 
     found: Inverse
     beyond: dict[int, str]
@@ -95,11 +92,8 @@ class Stayed:
 def stayed(
     robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, inverse: Inverse, rows: np.ndarray
 ) -> Stayed:
-    """Checks solutions ``inverse`` near to ``near`` (m, n) for changes of configuration, by solving ``rows`` without
-    limits.
-
-    A row whose nearest solution of all is beyond the limits gets the status ``limit`` and joint values at the limit.
-    """
+    """Checks solutions near ``near`` (m, n) for changes of configuration, solving ``rows`` without limits. A row whose
+    nearest solution is beyond the limits gets status ``limit`` and joint values there."""
     if not len(rows) or len(robot.rows) > ISOLATED:
         return Stayed(inverse, {})
     some = targets[rows]
@@ -236,11 +230,7 @@ class Compensated(Brief):
 
 
 def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple[Robot, Robot, tuple[str, ...]]:
-    """Returns both robots with the same tools, and notes on tools that differ.
-
-    The identified robot's tool replaces a tool that differs too much. The nominal one is taken instead if joint values
-    beside the poses show that the poses are of this tool.
-    """
+    """Returns both robots with the same tools, the identified unless joint values show the nominal's, and notes."""
     apart = {}
     for name in dict.fromkeys(targets.tools):
         own, other = identified.tool(name), nominal.tools.get(name)
@@ -481,10 +471,7 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
 
 
 def require_compensated_written(path: str | Path, result: Compensated, robot: Robot) -> None:
-    """Read a written table of compensated joint values again, and require that ``robot`` reaches the poses with them.
-
-    Compared are the errors at the commanded poses, of rows that are reached.
-    """
+    """Read a written table again, and require that ``robot`` reaches the commanded poses with errors as reported."""
     usable = result.found.usable
     targets = result.targets[np.flatnonzero(usable)]
 

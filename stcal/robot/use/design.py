@@ -271,12 +271,8 @@ def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
-    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ. Returns them and the number of
-    exchanges.
-
-    The greedy choice starts with almost no information (a millionth of the candidates' mean). Then each pose is
-    exchanged for the best other one until nothing helps. No pose is taken twice.
-    """
+    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ; returns them and the number of
+    exchanges. The greedy choice starts with almost no information; then poses are exchanged until nothing helps."""
     k = rows.shape[2]
     mean = np.einsum("mri,mrj->ij", rows, rows) / len(rows)
     start = 1e-6 * np.trace(mean) / k * np.eye(k)

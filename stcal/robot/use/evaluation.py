@@ -155,10 +155,7 @@ class Evaluated:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Difference of the mean errors of ``worse`` and ``better`` on the same rows.
-
-    ``sigma_mm`` : its σ; ``p`` : probability of as much by chance, times the number of comparisons.
-    """
+    """Mean error of ``worse`` minus ``better`` on the same rows; ``p`` : by chance, times the number of comparisons."""
 
     better: str
     worse: str
@@ -258,10 +255,7 @@ def _enough(measured: Observed, fit: Fit) -> None:
 
 
 def _fitted(robots: list[Robot], data: Measurements, measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
-    """Returns the states of all robots, and the mask (r,) of rows that no robot explains.
-
-    Such rows are left out of the fit. Distances are all used, as they refer to one another.
-    """
+    """Returns the states of all robots, and a mask (r,) of rows (never of distances) that none explains: not fitted."""
     wrong = np.zeros(len(measured), bool)
     freedom = WIDTH[measured.kind] * len(measured) - _parameters(measured, fit)
     for _ in range(ROUNDS):

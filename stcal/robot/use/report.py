@@ -31,10 +31,7 @@ from stcal.robot.use.verification import Verification
 
 
 def verification_figure(result: Verification) -> Drawing:
-    """Returns a plot of the absolute distance error of each pose, with its mean, a line for each set.
-
-    It is figure 8 of Zhang & Wei (2017).
-    """
+    """Returns the absolute distance error of each pose, with its mean, by set (figure 8 of Zhang & Wei 2017)."""
     drawing = Drawing(7.5, 3.4)
     at = np.arange(2, len(result.poses) + 1)
     sizes = [np.abs(each.error_mm) for each in result.sets]

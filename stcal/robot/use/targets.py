@@ -232,13 +232,8 @@ INVERSE = "poses were inverse (base seen from the tool); give the tool in the ba
 
 
 def robots_apart(identified: Robot, nominal: Robot) -> str:
-    """Returns a note if two files may be of different robots; an empty text otherwise.
-
-    Their flanges are compared over the joints' ranges. Arms are made to a thousandth of their reach, and all files of
-    one arm state the same base and flange, whatever the tool.
-
-    Raises InputError: the files cannot be of one robot.
-    """
+    """Returns a note if two files may be of different robots, by their flanges over the joints' ranges. Arms are made
+    to a thousandth of their reach. Raises InputError: they cannot be of one robot."""
     ends = [""] if identified.tree is None else list(identified.tree.carriers)
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
     rng = np.random.default_rng(0)
@@ -269,11 +264,9 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
 
 
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
-    """Returns whether joint values beside the poses confirm them, and doubts about the poses.
+    """Returns whether joint values beside the poses confirm them, and doubts about the poses of ``robot``.
 
-    ``robot`` : that commands them; ``targets`` : m poses base_from_tool, with or without joint values.
-
-    Raises InputError: joint values lead to the poses in another unit or convention, or order of rows; the message says
+    Raises InputError: joint values lead to the poses in another unit, convention or order of rows; the message says
     which.
     """
     if targets.poses is None:
@@ -303,10 +296,8 @@ def _rms(shift: np.ndarray) -> float:
 
 
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
-    """Refuses poses that the joint values would reach except for a frequent mistake.
-
-    The probability that one row is near the right place by chance, within 5 % of the reach and 11°, is 10⁻⁶.
-    """
+    """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row within 5 % of the reach
+    and 11°."""
     for reason, meant, of in _guesses(robot, targets, poses, q):
         off = meant.difference(of)
         left, turn = _rms(off[:, 3:]), _rms(off[:, :3])
@@ -340,8 +331,7 @@ def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Ite
 
 
 def _paired(targets: Targets, poses: Poses, reached: Poses, reach: float) -> Poses | None:
-    """Returns for each pose the nearest pose ``reached`` with its tool, of any row. Returns None if the assignment is
-    not one to one and very near: rough joint values that choose a branch are often nearer to another row's pose."""
+    """Returns the nearest pose ``reached`` with each pose's tool; None unless one to one and very near."""
     rows = np.arange(len(poses))
     for _, own in rows_by_tool(targets):
         tree, asked = (
@@ -355,10 +345,8 @@ def _paired(targets: Targets, poses: Poses, reached: Poses, reach: float) -> Pos
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
-    """Returns a note on joint values that lead to other poses by (m, 6).
-
-    There is none for the same joint values in all rows, which only choose a branch.
-    """
+    """Returns a note on joint values that miss poses by (m, 6), unless all rows have the same, as to choose a
+    branch."""
     mm, rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
     away = (mm > FITS * reach) | (rad > TURNED_RAD)
     if not away.any() or targets.q is None or (len(off) > 1 and not np.ptp(targets.q, axis=0).any()):
@@ -372,12 +360,10 @@ def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ..
 
 
 def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
-    """Returns a note if all poses are so near to the base's origin that metres or inches would also be within reach.
-
-    The foot of an arm is there. 3 m in metres are 3 mm, in inches 118.
-    """
+    """Returns a note if all poses are so near the base's origin that metres or inches would also be within reach."""
     far = float(np.linalg.norm(poses.translation, axis=1).max())
-    reach = max(reach_mm(robot, name) for name in set(targets.tools)) + _base_mm(robot)
+    first_joint = replace(robot, world_from_base=Rigid()).chain().translation[0]
+    reach = max(reach_mm(robot, name) for name in set(targets.tools)) + float(np.linalg.norm(first_joint))
     fitting = [unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach]
     if not fitting:
         return ()
@@ -386,11 +372,6 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
         f"all targets lie within {far:.3g} mm of the base's origin, where no arm works that reaches {reach:.4g} mm: if "
         f"the unit of x, y, z is {UNIT_WORDS[unit]}, call the columns x_{unit} …",
     )
-
-
-def _base_mm(robot: Robot) -> float:
-    """Returns the distance from the base's origin to the first joint, mm."""
-    return float(np.linalg.norm(replace(robot, world_from_base=Rigid()).chain().translation[0]))
 
 
 def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str, ...]:

@@ -345,8 +345,7 @@ def verify(data: MeasuredPoses) -> Verification:
 
 
 def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]) -> str:
-    """Returns which few of the poses (n, 3) miss most of the others by more than is allowed, while these fit one
-    another; empty if there are none."""
+    """Returns which few poses (n, 3) miss most others by more than allowed, while these fit one another; else ""."""
 
     def off(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         distances, own = (np.linalg.norm(xyz[:, None] - xyz, axis=2) for xyz in (commanded, places))

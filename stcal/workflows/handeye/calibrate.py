@@ -118,7 +118,8 @@ def calibrate_handeye(
         given, options, offset = at_offset(given, setup, options)
     validation = Splits(repeats, held_out, seed, workers, motions)
     told = progress or (lambda *_: None)
-    return with_offset(calibrate(given, setup, method, options, validation, told, time_offset), offset)
+    outcome = calibrate(given, setup, method, options, validation, told, time_offset)
+    return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
 def _of_no_covariance(given: HandEyeInput, result: HandEye) -> tuple[str, ...]:
@@ -167,17 +168,10 @@ def calibrate(
     progress: Progress = lambda *_: None,
     offset_known: bool = False,
 ) -> Outcome:
-    """Returns the result and its errors on poses held out.
+    """Returns the result, of each method if :data:`ALL`, of the best way if :data:`AUTO`, and its errors on poses held
+    out. Clocks that differ are tried as a cause of residuals, unless ``offset_known``.
 
-    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
-
-    All methods are compared where ``method`` is :data:`ALL`;
-    the way of solving that predicts best is used where it is :data:`AUTO`.
-
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    Raises StcalError: as :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     with naming_left_out(given.left_out):
         pairs, views = given.pairs, given.views
@@ -246,23 +240,8 @@ def with_arm(
 ) -> Outcome:
     """Returns the calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
 
-    Parameters
-    ----------
-    outcome : calibration of the same poses, by the robot's file
-    arm : the arm at the joint values of these poses
-    options : options of the outcome
-    prior : prior of the intrinsics
-    rows : (s, k) poses to hold out; none where empty
-    workers, progress : as in :func:`stcal.handeye.cross_validate`
-
-    Returns
-    -------
-    Outcome
-
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye`.
+    ``outcome`` : calibration by the robot's file; ``arm`` : at the joint values of the same poses; ``options`` : of the
+    outcome; ``prior`` : of the intrinsics; ``rows`` : (s, k) poses to hold out. Raises StcalError.
     """
     pairs, views, setup = outcome.pairs, outcome.views, outcome.result.setup
     if pairs is None or views is None:
@@ -310,12 +289,9 @@ their order counts as that of a motion; and least number of such poses."""
 def at_offset(
     given: HandEyeInput, setup: Setup, options: HandEyeOptions
 ) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
-    """Returns the same input with the robot's poses at the estimated offset.
+    """Returns the input with the robot's poses at the estimated offset, and numberings of a symmetric board corrected.
 
-    Numberings of a symmetric board are corrected.
-
-    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: for the reasons given in
-    :func:`~stcal.handeye.time_offset.estimate_offset`.
+    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: as :func:`estimate_offset`.
     """
     timed = given.timed
     if timed is None:
@@ -351,23 +327,13 @@ def at_offset(
     return given, replace(options, symmetries=()), offset
 
 
-def with_offset(outcome: Outcome, offset: TimeOffset | None) -> Outcome:
-    """Returns the outcome with the offset in the report, and its σ in those of the transforms."""
-    if offset is None:
-        return outcome
-    return replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
-
-
 @one_thread()
 def lag_tried(
     given: HandEyeInput, setup: Setup, options: HandEyeOptions, result: HandEye
 ) -> tuple[HandEye, tuple[str, ...]]:
     """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
-    with the lag is then taken from the result's notes.
-
-    The poses are those of ``given`` and ``result``, with no offset applied. Where poses have no times, their order
-    gives velocities if they follow one another smoothly.
-    """
+    with the lag goes. Without times, the order of smooth rows gives velocities. No offset may be applied to
+    ``given``."""
     pairs = given.pairs
     timed = _moving(given)
     if timed is None or options.four_dof or len(result.outliers) != len(pairs):
@@ -405,14 +371,14 @@ def lag_tried(
 
 
 def _moving(given: HandEyeInput) -> Timed | None:
-    """Returns the robot's poses as a stream that tells its velocities at the images, by times or by the order of the
-    rows; None where neither does.
-
-    Where there is about one sample for each image, the poses must follow one another smoothly.
-    """
+    """Returns the robot's poses as a stream with velocities at the images, by times or by the order of smooth rows, or
+    None. About one sample for each image must be smooth too."""
     pairs, timed = given.pairs, given.timed
-    if timed is not None and not _close(timed):
-        return None
+    if timed is not None:
+        samples = timed.stream.seconds
+        after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
+        if np.median(samples[after] - samples[after - 1]) > LONGEST_S:
+            return None
     if timed is not None and timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
         return timed
     if len(pairs) < LEAST_ROWS:
@@ -427,16 +393,8 @@ def _moving(given: HandEyeInput) -> Timed | None:
     return timed if smooth else None
 
 
-def _close(timed: Timed) -> bool:
-    """Returns True if samples of the stream are so close about most images that poses between them are known."""
-    samples = timed.stream.seconds
-    after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
-    return float(np.median(samples[after] - samples[after - 1])) <= LONGEST_S
-
-
 def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
-    """Returns Student's t of an offset that is solved for with X and Z, to first order, from the poses that are not
-    outliers."""
+    """Returns Student's t of an offset solved for with X and Z, to first order, without outliers."""
     good = np.flatnonzero(~result.outliers)
     loop, x = Loop.of(pairs[good], setup), result.mount_from_camera
     residuals = loop.residuals(x, result.stand_from_board, result.scale)
@@ -470,8 +428,7 @@ LEAST_REACHED = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned:
-    """``result`` : from the poses taken; ``poses`` : poses to take; ``joints`` : joint values (k,) of these by column,
-    deg or mm, with a robot file; ``notes`` : on the poses."""
+    """``poses`` : to take, after ``result``; ``joints`` : (k,) of these by column, deg or mm, with a robot file."""
 
     result: HandEye
     poses: NextPoses
@@ -518,12 +475,13 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
         return Planned(result, plan_poses(given.pairs, result, count, outline, camera, None, seed), {}, ())
     near, notes = _taken(robot, given)
     planned = plan_poses(given.pairs, result, count, outline, camera, _reach(robot, near), seed)
-    return Planned(result, planned, _joints(robot, planned.base_from_flange, near), notes)
+    q = inverse(robot, planned.base_from_flange, near).q
+    joints = dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))
+    return Planned(result, planned, joints, notes)
 
 
 def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Returns the joint values (n,) of the last pose taken that the robot reaches, and notes on poses that it does
-    not."""
+    """Returns the joint values (n,) of the last pose that the robot reaches, and notes on those that it does not."""
     flange = given.pairs.base_from_flange
     solutions = inverse(robot, flange, _middle(robot))
     beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
@@ -550,8 +508,3 @@ def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
         return np.array([status == REACHED for status in inverse(robot, flange, near).status])
 
     return reachable
-
-
-def _joints(robot: Robot, flange: Poses, near: np.ndarray) -> dict[str, np.ndarray]:
-    q = inverse(robot, flange, near).q
-    return dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))

@@ -50,12 +50,8 @@ class AtImages:
 
 
 def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> AtImages:
-    """Returns poses of the robot at the times of images, where both have times, and these are not simply equal.
-
-    Poses stay as they are where ``timing`` is None, since joint values belong to images by name.
-
-    Raises InputError: there are no times where an option needs them, or no image lies within the stream.
-    """
+    """Returns poses at the times of images, where both have times that are not simply equal; as they are if ``timing``
+    is None. Raises InputError: an option needs times, or no image lies within the stream."""
     if timing is None:
         return AtImages(robot)
     images = _times_of_images(names, timing)
@@ -164,11 +160,8 @@ COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
-    """A robot at joint values (m, n), moved by small motions of its axes: a model of an arm as in
-    :class:`stcal.handeye.methods.bundle.ArmModel`.
-
-    Its base and flange frames stay where they are: X and Z absorb the error of their places.
-    """
+    """A robot at joint values (m, n) moved by small motions of its axes, as
+    :class:`stcal.handeye.methods.bundle.ArmModel`; X and Z absorb errors of its base and flange."""
 
     robot: Robot
     q: np.ndarray
@@ -205,9 +198,8 @@ class Arm:
 
 
 def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[RobotPoses, Arm]:
-    """Returns the robot's poses by its file, from a table with columns ``image`` and ``q1_deg`` … (CSV).
-
-    Where the table has base_from_flange_… too, ``understood`` says how far these poses are off.
+    """Returns the robot's poses by its file, from columns ``image`` and ``q1_deg`` … (CSV); ``understood`` says how far
+    base_from_flange_… beside them are off.
 
     Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
     """
