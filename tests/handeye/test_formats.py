@@ -7,8 +7,9 @@ import pytest
 from markupsafe import escape
 
 from stcal.report.document import sentence
-from tests.handeye.test_cli import INPUT, NOISE, poses_file
+from tests.handeye.test_cli import NOISE, poses_file
 from tests.handeye.written import FORMATS, easy_handeye, matrices
+from tests.outcome import INPUT, assert_error
 from tests.support.handeye import simulated
 
 QUICK = ("--method", "pose", "--splits", 0)
@@ -71,14 +72,7 @@ def test_the_setup_that_a_file_states_is_taken(command, tmp_path):
     assert code == 0
     assert "flange_from_base as easy_handeye writes it of eye-to-hand" in shown
     assert "base_from_camera" in shown
-    code, _, err = command(*arguments, *QUICK, "--setup", "eye-in-hand")
-    assert code == INPUT
-    assert "of a setup eye-to-hand, --setup eye-in-hand; leave the option out" in err
+    said = "of a setup eye-to-hand, --setup eye-in-hand; leave the option out"
+    assert_error(command(*arguments, *QUICK, "--setup", "eye-in-hand"), INPUT, said)
     arguments = easy_handeye(tmp_path, truth.pairs, "")  # as its server leaves it: --setup tells
     assert command(*arguments, *QUICK, "--setup", "eye-to-hand")[0] == 0
-
-
-def test_options_that_a_table_does_not_need(command, tmp_path, truth):
-    code, _, err = command(poses_file(tmp_path / "poses.csv", truth), "--length-unit", "m")
-    assert code == INPUT
-    assert "the names of columns state unit and rotation; leave --length-unit out" in err

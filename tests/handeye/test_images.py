@@ -80,10 +80,7 @@ def boards():
     }
 
 
-KINDS = ["dots", "chessboard", "charuco", "tags", "asymmetric circles", "aprilgrid"]
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", boards())
 def test_every_board_is_found_where_it_was_drawn(kind, tmp_path):
     board, sheet, first = boards()[kind]
     camera_from_board = UPWARDS if kind == "aprilgrid" else SLANTED

@@ -42,7 +42,7 @@ def test_the_size_of_the_board_is_found(setup, method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setup", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("setup", SETUPS)
 def test_derivatives_of_the_corners(setup):
     """By all shared unknowns, every ninth of the board's and the robot's."""
     truth = simulated_views(np.random.default_rng(5), 4, setup)
@@ -63,23 +63,19 @@ def test_derivatives_of_the_corners(setup):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize(
-    ("setup", "count"),
-    [("eye-in-hand", 2), *(pytest.param(setup, 20, marks=pytest.mark.full) for setup in SETUPS)],
-)
-def test_reprojection_knows_its_error(setup, count):
+@pytest.mark.parametrize("setup", SETUPS)
+def test_reprojection_knows_its_error(setup):
     """20 trials of 6 numbers scatter by 1/√240 = 6.5 %; σ of 12 robot poses by 1/√(2·20·30) = 3 %, and it is
     stated larger by 1/30 for caution."""
     errors, covariances, sigma = [], [], []
-    for seed in range(count):
+    for seed in range(20):
         truth = simulated_views(np.random.default_rng(seed), 12, setup, (3e-4, 0.1), 0.1, 0.03)
         found = handeye(truth.pairs, setup, views=truth.views)
         errors.append(error(found, truth))
         covariances.append(found.covariance)
         sigma.append([found.sigma[name] for name in ("corner_px", "robot_rad", "robot_mm", "board_mm")])
-    wider = np.sqrt(20 / count)
-    assert 1 - 0.25 * wider < normalised(errors, covariances) < 1 + 0.3 * wider
-    assert np.sqrt((np.array(sigma) ** 2).mean(0)) == pytest.approx([0.1, 3e-4, 0.1, 0.03], rel=0.15 * wider)
+    assert 0.75 < normalised(errors, covariances) < 1.3
+    assert np.sqrt((np.array(sigma) ** 2).mean(0)) == pytest.approx([0.1, 3e-4, 0.1, 0.03], rel=0.15)
 
 
 @pytest.mark.slow
