@@ -5,9 +5,9 @@
 All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Six parts:
 inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for it
 (`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), programs ended by signals, and with a
-full disk, a limit of files (`ulimit -f`) or little memory, from the beginning or at random moments (`k0`, `k1`, …),
-what runs keep swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). With `--json` cases that
-the file has already are not run again: a study that was stopped goes on. The seed and the case's name repeat a case:
+full disk (`ulimit -f`) or little memory, from the beginning or at random moments (`k0`, `k1`, …), what runs keep
+swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). With `--json` cases that the file has
+already are not run again: a study that was stopped goes on. The seed and the case's name repeat a case:
 `--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
 

@@ -31,11 +31,6 @@ CODES = (0, 2, 3, 4)
 """That a command ends with by itself."""
 FAILED_CHECKS = 4
 """Of a run whose results are written, and not to be used."""
-KINDS = (
-    *("traceback", "crash", "hang", "memory", "exit code", "input changed"),
-    *("earlier result lost", "earlier run lost", "broken result"),
-    *("message too long", "not printable", "not one line", "noise"),
-)
 EARLIER = "of an earlier call\n"
 IN, OUT = "in", "out"
 _PROGRESS = re.compile(r"(\S+: )?[\w, ]+: \d+ of \d+(, about \d+ (s|min) left)?")
@@ -209,13 +204,8 @@ def _bytes(what: str) -> int:
 def failures(
     call: Call, folder: Path, outcome: Outcome, before: dict[str, str], refused: bool
 ) -> list[tuple[str, str]]:
-    """(kind, what) of everything that must not be.
-
-    Parameters
-    ----------
-    before : hashes of the folder before the call
-    refused : the inputs are such that the command must not end with 0
-    """
+    """(kind, what) of everything that must not be; ``before`` : hashes of the folder before the call; ``refused`` : the
+    inputs are such that the command must not end with 0."""
     found = list(_ending(outcome, refused))
     if outcome.peak_bytes > MOST_BYTES or "not enough memory" in outcome.err:
         found.append(("memory", f"{outcome.peak_bytes / 2**20:.0f} MB; {outcome.err[-100:]}"))
@@ -278,13 +268,9 @@ def _left(call: Call, written: Path, code: int, before: dict, after: dict) -> It
             yield "broken result", f"{name} was not written, exit code 0"
     for place in call.folders if code not in (0, FAILED_CHECKS) else ():
         for path, old in before.items():
-            own = path.startswith(str(written / place)) and _entry(path, written / place) in RUN_ENTRIES
+            own = any(Path(path).is_relative_to(written / place / entry) for entry in RUN_ENTRIES)
             if own and after.get(path) != old:
                 yield "earlier run lost", f"{path} of the earlier run, exit code {code}"
-
-
-def _entry(path: str, folder: Path) -> str:
-    return Path(path).relative_to(folder).parts[0]
 
 
 BINARY = (".mat", ".bin")

@@ -124,24 +124,20 @@ def _others(path: Path, files: list[Path]) -> list[Path]:
     return [each for each in files if each != path and each.suffix == path.suffix and each.name.startswith(kind)]
 
 
-def _another(path: Path, files: list[Path], rng: np.random.Generator) -> str:
-    others = [each for each in _others(path, files) if each.is_file()]
-    if not others:
-        return missing(path, rng)
-    other = pick(rng, others)
-    shutil.copyfile(other, path)
-    return f"a copy of {other.name[:20]}"
+def _another(swap: bool):
+    """Puts another file of the same kind in its place, and this one in that one's."""
 
+    def change(path: Path, files: list[Path], rng: np.random.Generator) -> str:
+        others = [each for each in _others(path, files) if each.is_file()]
+        if not others:
+            return flipped(path, rng) if swap else missing(path, rng)
+        other, own = pick(rng, others), path.read_bytes()
+        shutil.copyfile(other, path)
+        if swap:
+            other.write_bytes(own)
+        return f"{'swapped with' if swap else 'a copy of'} {other.name[:20]}"
 
-def _swapped(path: Path, files: list[Path], rng: np.random.Generator) -> str:
-    others = [each for each in _others(path, files) if each.is_file()]
-    if not others:
-        return flipped(path, rng)
-    other = pick(rng, others)
-    first, second = path.read_bytes(), other.read_bytes()
-    path.write_bytes(second)
-    other.write_bytes(first)
-    return f"swapped with {other.name[:20]}"
+    return change
 
 
 def _aged(path: Path, _, rng: np.random.Generator) -> str:
@@ -173,7 +169,7 @@ def _plainly(mutation: Callable[[Path, np.random.Generator], str]):
 
 
 SPOILED = (
-    *(_another, _swapped, _swapped, _aged, _edited, _edited),
+    *(_another(False), _another(True), _another(True), _aged, _edited, _edited),
     *map(_plainly, (missing, a_folder, truncated, flipped, emptied)),
 )
 

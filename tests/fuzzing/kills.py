@@ -4,7 +4,6 @@ import contextlib
 import os
 import re
 import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,18 +17,7 @@ import numpy as np
 from stcal.sfm.runs.verify import verify
 from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged
-from tests.fuzzing.judged import (
-    CODES,
-    IN,
-    LONGEST_S,
-    OUT,
-    Outcome,
-    broken,
-    failures,
-    hashes,
-    lay_out,
-    lines_of,
-)
+from tests.fuzzing.judged import CODES, IN, LONGEST_S, OUT, Outcome, broken, failures, hashes, lay_out, lines_of
 from tests.fuzzing.mutations import pick
 
 ENDED = {signal.SIGKILL: (-9, 2.0), signal.SIGINT: (130, 2.0), signal.SIGTERM: (143, 2.0)}
@@ -40,8 +28,6 @@ LOADED_S = 1.0
 """Time that Python and the libraries take before any work."""
 LARGEST_FILE = (100, 300_000)
 MEMORY = (500 << 20, 900 << 20)
-DISK_BYTES = 256 << 20
-FILLER = "filler"
 STREAM = 10_000_000
 """Keeps the random numbers of kills from those of cases."""
 _SEEN_BELOW = ("not one line", "broken result", "earlier run lost")
@@ -63,7 +49,7 @@ def _killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     two = replace(call, words=call.words.replace("--workers 1", "--workers 2"))
     lay_out(stock, folder, call, earlier=True)
     before = hashes(folder)
-    kind = pick(rng, [*ENDED, "full disk", "little memory", "file limit falls", "disk fills"])
+    kind = pick(rng, [*ENDED, "full disk", "little memory", "file limit falls"])
     if isinstance(kind, signal.Signals):
         moment = float(rng.uniform(0, LOADED_S + 1.5 * call.seconds))
         said = f"{kind.name} after {moment:.2f} s"
@@ -72,16 +58,19 @@ def _killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
         limit = int(np.exp(rng.uniform(*np.log(MEMORY if kind == "little memory" else LARGEST_FILE))))
         said, found = f"{kind}, {limit} bytes", []
         if kind in ("full disk", "little memory"):
-            outcome = _limited(call, folder, kind, limit)
+            what = resource.RLIMIT_FSIZE if kind == "full disk" else resource.RLIMIT_AS
+            start = time.monotonic()
+            outcome = outcome_of(start_program(call, folder, [(what, limit)]), start)
         else:
             moment = float(rng.uniform(0, LOADED_S + 1.5 * call.seconds))
             said += f" after {moment:.2f} s"
-            outcome = _short_of_room(two, folder, kind, limit, moment)
+            outcome = _short_of_room(two, folder, limit, moment)
     after = [f for f in failures(call, folder, outcome, before, refused=False) if f[0] not in ("exit code", "noise")]
     found += [] if kind in ENDED else [("exit code", str(outcome.code))] * (outcome.code not in CODES)
     found += [f for f in after if f[0] != "memory" and not (kind in ENDED and f[0] in _SEEN_BELOW)]
     found += _whole(folder / OUT, kind is signal.SIGKILL)
-    found += _run_whole(call, folder)
+    # A run's folder holds the earlier results or the new ones, by its own hashes.
+    found += [("earlier result lost", note) for place in call.folders for note in verify(folder / OUT / place).notes()]
     return Judged(f"k{number}", f"{call.command}: {said}", tuple(found), outcome.code, outcome.seconds, call.command)
 
 
@@ -116,32 +105,8 @@ def outcome_of(process: subprocess.Popen, start: float) -> Outcome:
     return Outcome(process.returncode, *(t.decode(errors="replace") for t in (out, err)), seconds, trace=trace)
 
 
-def _limited(call: Call, folder: Path, kind: str, limit: int) -> Outcome:
-    what = resource.RLIMIT_FSIZE if kind == "full disk" else resource.RLIMIT_AS
-    start = time.monotonic()
-    return outcome_of(start_program(call, folder, [(what, limit)]), start)
-
-
-def _short_of_room(call: Call, folder: Path, kind: str, limit: int, moment: float) -> Outcome:
-    """The outcome of a call whose files may not grow beyond ``limit`` from a moment on, or whose disk has no more left.
-
-    What stands on the small disk is copied to where it is judged; without the right to mount one, files are limited.
-    """
-    written = folder / OUT
-    if kind == "disk fills" and _mounted(written):
-        try:
-            process, start = start_program(call, folder), time.monotonic()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(moment)
-            _fill(written, limit)
-            outcome = outcome_of(process, start)
-            (written / FILLER).unlink()
-            shutil.copytree(written, folder / "saved", symlinks=True)
-        finally:
-            subprocess.run(["umount", "-l", written], check=True)
-        shutil.rmtree(written)
-        (folder / "saved").rename(written)
-        return outcome
+def _short_of_room(call: Call, folder: Path, limit: int, moment: float) -> Outcome:
+    """The outcome of a call whose files may not grow beyond ``limit`` from a moment on."""
     process, start = start_program(call, folder), time.monotonic()
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(moment)
@@ -149,27 +114,6 @@ def _short_of_room(call: Call, folder: Path, kind: str, limit: int, moment: floa
         with contextlib.suppress(ProcessLookupError):
             resource.prlimit(each, resource.RLIMIT_FSIZE, (limit, limit))
     return outcome_of(process, start)
-
-
-def _mounted(folder: Path) -> bool:
-    """Puts a small disk in a folder's place, with what the folder holds; returns whether that is permitted."""
-    kept = folder.with_name("kept")
-    folder.rename(kept)
-    folder.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", folder]
-    if shutil.which("mount") is None or subprocess.run(words, capture_output=True, check=False).returncode:
-        folder.rmdir()
-        kept.rename(folder)
-        return False
-    shutil.copytree(kept, folder, symlinks=True, dirs_exist_ok=True)
-    shutil.rmtree(kept)
-    return True
-
-
-def _fill(disk: Path, left: int) -> None:
-    """Fills a disk up to so many bytes."""
-    with open(disk / FILLER, "wb") as stream, contextlib.suppress(OSError):
-        os.posix_fallocate(stream.fileno(), 0, max(1, shutil.disk_usage(disk).free - left))
 
 
 def _ended(call: Call, folder: Path, number: signal.Signals, moment: float) -> tuple[Outcome, list[tuple[str, str]]]:
@@ -219,8 +163,3 @@ def _whole(written: Path, by_force: bool) -> list[tuple[str, str]]:
         elif path.is_file() and not inside and not by_force and path.name.endswith(".partial"):
             found.append(("broken result", f"{path.relative_to(written)} is left behind"))
     return found
-
-
-def _run_whole(call: Call, folder: Path) -> list[tuple[str, str]]:
-    """A run's folder holds the earlier results or the new ones, by its own hashes."""
-    return [("earlier result lost", note) for place in call.folders for note in verify(folder / OUT / place).notes()]

@@ -4,7 +4,7 @@ import csv
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,11 @@ def call_of(command: str, place: str) -> Call:
     return next(call for call in CALLS if call.command == command and place in call.inputs)
 
 
+def rewritten(place: str, change: Callable[[str], str]) -> Edit:
+    """Another text of a file."""
+    return lambda read: (read / place).write_text(change((read / place).read_text()))
+
+
 def columns(place: str, change: Callable[[dict[str, list[str]]], dict[str, list[str]]]) -> Edit:
     """Change a CSV file as columns."""
 
@@ -75,7 +80,7 @@ def times(place: str, names: str, factor: float) -> Edit:
     )
 
 
-def named(place: str, old: str, new: str) -> Edit:
+def named(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
     """Columns under other names, their numbers as they are."""
     return columns(place, lambda table: {re.sub(old, new, n): c for n, c in table.items()})
 
@@ -105,6 +110,16 @@ def shuffled(place: str, names: str) -> Edit:
         return {n: [c[i] for i in order] if re.fullmatch(names, n) else c for n, c in table.items()}
 
     return columns(place, change)
+
+
+def both(*edits: Edit) -> Edit:
+    """One after another; without any the mistake is in the options."""
+
+    def edit(read: Path) -> None:
+        for each in edits:
+            each(read)
+
+    return edit
 
 
 def poses(place: str, change: Callable[[Poses], Poses], prefix: str = "") -> Edit:
@@ -137,13 +152,12 @@ def transposed(found: Poses) -> Poses:
 def text(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
     """Replace in a text file what matches."""
 
-    def edit(read: Path) -> None:
-        before = (read / place).read_text()
+    def edit(before: str) -> str:
         after = re.sub(old, new, before)
         assert before != after, f"{place} has no {old}"
-        (read / place).write_text(after)
+        return after
 
-    return edit
+    return rewritten(place, edit)
 
 
 def number_times(place: str, key: str, factor: float) -> Edit:
@@ -161,45 +175,42 @@ def json_times(place: str, keys: tuple[str, ...], factor: float) -> Edit:
             return [[*row[:3], row[3] * (factor if i < 3 else 1)] for i, row in enumerate(value)]
         return [v * factor for v in value]
 
-    def edit(read: Path) -> None:
-        content = json.loads((read / place).read_text())
-        (read / place).write_text(json.dumps(content | {key: scaled(content[key]) for key in keys}))
+    return json_keys(place, keys, scaled)
 
-    return edit
+
+def json_keys(place: str, keys: tuple[str, ...], change: Callable) -> Edit:
+    """The values of these keys, changed."""
+
+    def edit(text: str) -> str:
+        content = json.loads(text)
+        return json.dumps(content | {key: change(content[key]) for key in keys})
+
+    return rewritten(place, edit)
 
 
 def json_inverse(place: str, key: str) -> Edit:
     """A transform the other way round."""
-
-    def edit(read: Path) -> None:
-        content = json.loads((read / place).read_text())
-        content[key] = Rigid.from_matrix(np.array(content[key])).inverse().matrix().tolist()
-        (read / place).write_text(json.dumps(content))
-
-    return edit
+    return json_keys(place, (key,), lambda value: Rigid.from_matrix(np.array(value)).inverse().matrix().tolist())
 
 
 def decimal_commas(place: str) -> Edit:
     """As a spreadsheet of a country with decimal commas writes it."""
-
-    def edit(read: Path) -> None:
-        (read / place).write_text((read / place).read_text().replace(",", ";").replace(".", ","))
-
-    return edit
+    return rewritten(place, lambda text: text.replace(",", ";").replace(".", ","))
 
 
-def camera_times(place: str, factor: float) -> Edit:
-    """``cameras.txt`` of photographs of another size."""
+def camera_times(place: str, size: float, focal: float = 1.0) -> Edit:
+    """``cameras.txt`` of photographs of another size, or of another focal length."""
 
-    def edit(read: Path) -> None:
-        *head, line = (read / place).read_text().strip().splitlines()
+    def edit(content: str) -> str:
+        *head, line = content.strip().splitlines()
         number, model, width, height, *rest = line.split()
-        pixels = 3 if model.startswith("SIMPLE") else 4
-        values = [float(v) * (factor if i < pixels else 1) for i, v in enumerate(rest)]
-        size = round(int(width) * factor), round(int(height) * factor)
-        (read / place).write_text("\n".join([*head, " ".join(map(str, [number, model, *size, *values]))]) + "\n")
+        lengths = 1 if model.startswith("SIMPLE") else 2
+        factors = [size * focal] * lengths + [size] * 2 + [1.0] * len(rest)
+        values = [float(v) * factor for v, factor in zip(rest, factors, strict=False)]
+        sides = round(int(width) * size), round(int(height) * size)
+        return "\n".join([*head, " ".join(map(str, [number, model, *sides, *values]))]) + "\n"
 
-    return edit
+    return rewritten(place, edit)
 
 
 def _robot() -> list[Mistake]:
@@ -257,8 +268,8 @@ def _robot() -> list[Mistake]:
             ("robot in metres", number_times("robot/made.toml", "(?:a|d)_mm", 1e-3), "unit"),
             ("nominal robot in metres", number_times(robot, "(?:a|d)_mm", 1e-3), "mm apart"),
             ("nominal robot 4.1 m off", text(robot, r"d_mm = 1025\.0", "d_mm = 5125.0"), "mm apart"),
-            ("poses alone, metres as mm", _both(without(targets, r"q\d_deg"), times(targets, places, 1e-3)), "metres"),
-            ("poses alone, inches as mm", _both(without(targets, r"q\d_deg"), times(targets, places, INCH)), "inches"),
+            ("poses alone, metres as mm", both(without(targets, r"q\d_deg"), times(targets, places, 1e-3)), "metres"),
+            ("poses alone, inches as mm", both(without(targets, r"q\d_deg"), times(targets, places, INCH)), "inches"),
         )
     ]
     verify, before, after = "robot/verify.csv", "commanded_[xyz]_mm", "[xyz]_mm"
@@ -271,16 +282,13 @@ def _robot() -> list[Mistake]:
             ("rows shuffled", shuffled(verify, after), ""),
             ("x and y exchanged", exchanged(verify, "x_mm", "y_mm"), "distances alone are compared; they have no hand"),
             ("left-handed", times(verify, "z_mm", -1), "distances alone are compared; they have no hand"),
-            ("commanded and measured exchanged", columns(verify, _sides_exchanged), ""),
+            (
+                "commanded and measured exchanged",
+                named(verify, "^(commanded_)?(?=[xyz]_mm)", lambda m: "" if m[1] else "commanded_"),
+                "",
+            ),
         )
     ]
-
-
-def _sides_exchanged(table: dict) -> dict:
-    return table | {
-        **{f"commanded_{c}": table[c] for c in POSE[:3]},
-        **{c: table[f"commanded_{c}"] for c in POSE[:3]},
-    }
 
 
 def _handeye() -> list[Mistake]:
@@ -298,15 +306,15 @@ def _handeye() -> list[Mistake]:
             ("camera x y z w", rolled_quaternion(data, camera), ""),
             ("flange_from_base", poses(data, Poses.inverse, flange), ""),
             ("board_from_camera", poses(data, Poses.inverse, camera), ""),
-            ("both inverse", _both(poses(data, Poses.inverse, flange), poses(data, Poses.inverse, camera)), ""),
+            ("both inverse", both(poses(data, Poses.inverse, flange), poses(data, Poses.inverse, camera)), ""),
             ("robot conjugated", poses(data, transposed, flange), ""),
             ("rows one late", moved(data, flange + ".*"), ""),
             ("rows shuffled", shuffled(data, flange + ".*"), ""),
             ("decimal commas", decimal_commas(data), ""),
         )
     ]
-    chessboard = call_of("handeye", images)
-    found.append(Mistake("handeye: other setup", _with(call_of("handeye", data), "--setup eye-to-hand"), _nothing))
+    chessboard, pairs = call_of("handeye", images), call_of("handeye", data)
+    found.append(Mistake("handeye: other setup", replace(pairs, words=f"{pairs.words} --setup eye-to-hand"), both()))
     return found + [
         Mistake(f"handeye, images: {name}", chessboard, edit, TURNED if name.startswith("rows and") else "")
         for name, edit in {
@@ -322,22 +330,6 @@ def _handeye() -> list[Mistake]:
             "camera of double size": camera_times("handeye/cameras.txt", 2),
         }.items()
     ]
-
-
-def _with(call: Call, words: str) -> Call:
-    return Call(call.command, f"{call.words} {words}", call.seconds, call.code)
-
-
-def _both(first: Edit, second: Edit) -> Edit:
-    def edit(read: Path) -> None:
-        first(read)
-        second(read)
-
-    return edit
-
-
-def _nothing(_: Path) -> None:
-    """The mistake is in the options."""
 
 
 def _locate() -> list[Mistake]:
@@ -358,12 +350,7 @@ def _locate() -> list[Mistake]:
             ("run: hand-eye inverse", scenes, json_inverse("locate/handeye.json", "flange_from_camera"), one),
             ("run: offset in metres", scenes, json_times("locate/offset.json", ("obj_from_goal",), 1e-3), one),
             ("calibrate: camera of double size", images, camera_times(camera, 2), ""),
-            (
-                "calibrate: squares in inches",
-                images,
-                number_times("locate/board.toml", "square_mm", INCH),
-                "",
-            ),
+            ("calibrate: squares in inches", images, number_times("locate/board.toml", "square_mm", INCH), ""),
             ("calibrate: other dictionary", images, text("locate/plan.toml", "36h11", "25h9"), ""),
             (
                 "calibrate: board of another shape",
@@ -388,11 +375,7 @@ def _register() -> list[Mistake]:
         "decimal commas": decimal_commas(pairs),
     }
     return [Mistake(f"register: {name}", call, edit) for name, edit in found.items()] + [
-        Mistake(
-            "register: both in metres",
-            call,
-            times(pairs, ".*_mm", 1e-3),
-        ),
+        Mistake("register: both in metres", call, times(pairs, ".*_mm", 1e-3)),
         Mistake("register: arm in metres", arm, times("register/arm.csv", "a[xyz]_mm", 1e-3)),
         Mistake("register: rad as deg", arm, times("register/arm.csv", r"q\d_deg", np.pi / 180)),
         Mistake("register: robot in metres", arm, number_times("robot/robot.toml", "(?:a|d)_mm", 1e-3)),
@@ -403,43 +386,29 @@ def _sfm() -> list[Mistake]:
     run = next(call for call in CALLS if call.command == "sfm run" and "+" in call.words)
     measure, compare = call_of("sfm measure", "shots"), call_of("sfm compare", "run")
     target, board, camera = "data/target.toml", "data/board.toml", "data/cameras.txt"
+    exchanged_sides = r"rows = (\d+)\ncolumns = (\d+)", r"rows = \2\ncolumns = \1"
     turned = "its dots have the same distances, and so has the target the same scale"
     return [
         Mistake(name, call, edit, why)
         for name, call, edit, why in (
             ("run: camera of double size", run, camera_times(camera, 2), ""),
-            ("run: camera of half the focal length", run, _focal(camera, 0.5), ""),
-            ("run: focal length off by 3 %", run, _focal(camera, 1.03), ""),
+            ("run: camera of half the focal length", run, camera_times(camera, 1, 0.5), ""),
+            ("run: focal length off by 3 %", run, camera_times(camera, 1, 1.03), ""),
             ("run: target in cm", run, number_times(target, "(?:x|y|radius)_mm", 0.1), ""),
             ("run: target in inches", run, number_times(target, "(?:x|y|radius)_mm", INCH), ""),
             ("run: target mirrored", run, number_times(target, "x_mm", -1), ""),
             ("run: pitch of 31 mm", run, number_times(board, "pitch_mm", 31 / 30), ""),
             ("run: board in inches", run, number_times(board, ".*_mm", INCH), ""),
-            ("run: rows and columns exchanged", run, _rows_for_columns(board), turned),
+            ("run: rows and columns exchanged", run, text(board, *exchanged_sides), turned),
             ("run: other polarity", run, text(target, '"bright"', '"dark"'), ""),
             ("measure: camera of double size", measure, camera_times(camera, 2), ""),
-            ("measure: camera of half the focal length", measure, _focal(camera, 0.5), ""),
+            ("measure: camera of half the focal length", measure, camera_times(camera, 1, 0.5), ""),
             ("measure: faces in metres", measure, json_times("run/faces.json", LENGTHS, 1e-3), ""),
             ("measure: target in inches", measure, number_times(target, "(?:x|y|radius)_mm", INCH), ""),
             ("compare: truth in metres", compare, json_times("data/truth.json", LENGTHS, 1e-3), ""),
             ("compare: truth of another unit", compare, text("data/truth.json", '"unit": "mm"', '"unit": "m"'), ""),
         )
     ]  # fmt: skip
-
-
-def _focal(place: str, factor: float) -> Edit:
-    def edit(read: Path) -> None:
-        *head, line = (read / place).read_text().strip().splitlines()
-        words = line.split()
-        for i in (4,) if words[1].startswith("SIMPLE") else (4, 5):
-            words[i] = repr(float(words[i]) * factor)
-        (read / place).write_text("\n".join([*head, " ".join(words)]) + "\n")
-
-    return edit
-
-
-def _rows_for_columns(place: str) -> Edit:
-    return text(place, r"rows = (\d+)\ncolumns = (\d+)", lambda m: f"rows = {m[2]}\ncolumns = {m[1]}")
 
 
 MISTAKES = {each.name: each for each in (*_robot(), *_handeye(), *_locate(), *_register(), *_sfm())}

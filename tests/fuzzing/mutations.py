@@ -132,7 +132,7 @@ PLACE = (a_link,)
 
 def json_value(path: Path, rng: np.random.Generator) -> str:
     tree, said = structures.changed(json.loads(path.read_text()), rng)
-    path.write_text(structures.json_of(tree))
+    path.write_text(structures.text_of(tree))
     return said
 
 

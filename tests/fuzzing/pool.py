@@ -12,9 +12,12 @@ from functools import cache
 from pathlib import Path
 
 from stcal.parallel import ONE_THREAD
-from tests.commands import Call
+from tests.commands import CALLS, Call
 from tests.fuzzing.cases import Judged, judged, judged_option
 from tests.fuzzing.judged import LONGEST_S, OUT, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.kept import closed, of_kept
+from tests.fuzzing.kills import killed
+from tests.fuzzing.mistakes import MISTAKES, told
 from tests.fuzzing.writers import unchecked, watched
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
@@ -25,9 +28,6 @@ MOST_MEMORY = 8 << 30
 def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:
     """The case of this name: ``c12`` a spoiled input, ``k3`` a kill, ``s4`` kept files, ``d6`` closed streams, ``o7``
     an option, ``v5`` a valid call, else a mistake."""
-    from tests.fuzzing.kept import closed, of_kept
-    from tests.fuzzing.kills import killed
-
     if not name[1:].isdigit():
         return mistaken(stock, folder, name)
     if name[0] in "vo":
@@ -37,8 +37,6 @@ def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:
 
 def went_through(stock: Path, folder: Path, number: int) -> Judged:
     """A call of the table on good data: its exit code, and all that holds of any call."""
-    from tests.commands import CALLS
-
     call = CALLS[number]
     lay_out(stock, folder, call, earlier=True)
     before = hashes(folder)
@@ -56,8 +54,6 @@ def went_through(stock: Path, folder: Path, number: int) -> Judged:
 
 def mistaken(stock: Path, folder: Path, name: str) -> Judged:
     """A realistic mistake beside the same call on good data."""
-    from tests.fuzzing.mistakes import MISTAKES, told
-
     mistake = MISTAKES[name]
     valid = _on_good_data(stock, folder, mistake.call)
     read, _ = lay_out(stock, folder, mistake.call, earlier=False)

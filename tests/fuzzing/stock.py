@@ -122,32 +122,19 @@ def _cameras(folder: Path) -> None:
     (fx, fy), (cx, cy) = given.focal.tolist(), given.centre.tolist()
     forms = folder / "cameras"
     forms.mkdir()
-    matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    dist = [float(k) for k in given.distortion[:5]]
-    names = dict.fromkeys(("rows: 3, cols: 3", "rows: 1, cols: 5"))
-    one, two = (f"{{{name}, data: {values}}}" for name, values in zip(names, (matrix, dist), strict=True))
-    (forms / "ros.yaml").write_text(
-        f"image_width: {given.width}\nimage_height: {given.height}\ncamera_name: c\ncamera_matrix: {one}\n"
-        f"distortion_model: plumb_bob\ndistortion_coefficients: {two}\n"
-    )
-    node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
-    (forms / "opencv.yaml").write_text(
-        f"%YAML:1.0\n---\nimage_width: {given.width}\nimage_height: {given.height}\n"
-        f"camera_matrix: {node.format(3, 3, matrix)}distortion_coefficients: {node.format(1, 5, dist)}"
-    )
-    tag = '<{0} type_id="opencv-matrix"><rows>{1}</rows><cols>{2}</cols><dt>d</dt><data>{3}</data></{0}>'
-    (forms / "opencv.xml").write_text(
-        f'<?xml version="1.0"?>\n<opencv_storage>\n<image_width>{given.width}</image_width>\n'
-        f"<image_height>{given.height}</image_height>\n"
-        + tag.format("camera_matrix", 3, 3, " ".join(map(str, matrix)))
-        + tag.format("distortion_coefficients", 1, 5, " ".join(map(str, dist)))
-        + "</opencv_storage>\n"
-    )
+    storage = cv2.FileStorage(str(forms / "opencv.xml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", given.width)
+    storage.write("image_height", given.height)
+    storage.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    storage.write("distortion_coefficients", given.distortion[None, :5].copy())
+    storage.release()
     (forms / "industrial.yaml").write_text(f"intrinsics:\n  fx: {fx}\n  fy: {fy}\n  cx: {cx}\n  cy: {cy}\n")
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
     for name, form in (
+        ("ros.yaml", "ros"),
+        ("opencv.yaml", "opencv"),
         ("cameras.bin", "colmap-bin"),
         ("camchain.yaml", "kalibr"),
         ("camera.cameramodel", "mrcal"),
@@ -227,20 +214,15 @@ def _handeye(folder: Path, rng: np.random.Generator) -> None:
         [*pose_cells(a), *pose_cells(b)] for a, b in zip(pairs.base_from_flange, pairs.camera_from_board, strict=True)
     ]
     write_rows(folder / "poses.csv", header, rows)
-    _photographed(folder, looks(rng, 7, np.array([70.0, 50.0]), 0.6))
-    (folder / "checker.yaml").write_text(KALIBR)
-    (folder / "boards.toml").write_text(BOARDS)
-
-
-def _photographed(folder: Path, seen: Poses) -> None:
-    """Of a chessboard; the poses go to a name of their own."""
     inner = folder / "drawn"
     inner.mkdir()
-    found = photographs(inner, *chessboard_mm(6, 8, 20.0), seen, CHESSBOARD)
+    found = photographs(inner, *chessboard_mm(6, 8, 20.0), looks(rng, 7, np.array([70.0, 50.0]), 0.6), CHESSBOARD)
     for path, name in ((found.poses, "robot.csv"), (found.camera, "cameras.txt"), (found.board, "board.toml")):
         path.rename(folder / name)
     found.images.rename(folder / "images")
     inner.rmdir()
+    (folder / "checker.yaml").write_text(KALIBR)
+    (folder / "boards.toml").write_text(BOARDS)
 
 
 def _tags(folder: Path, rng: np.random.Generator) -> None:

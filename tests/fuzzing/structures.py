@@ -10,19 +10,8 @@ NUMBERS = (np.nan, np.inf, -np.inf, 1e308, -1e308, 1e-308, 0.0, -1.0, 1e9, 2**63
 WORDS = ("NaN", "1e999", "-1", "1e308", "null", "[]", '"x"', "9" * 5000, "[" * 100_000, "0x10", "1_000", "+1", "1,5")
 LONG = "x" * 100_000
 TEXTS = (
-    "",
-    "text",
-    "\x1b[31mred\x07",
-    "a\nb",
-    "\u202eabc",
-    "é",
-    LONG,
-    "../../etc",
-    "1,5",
-    "nan",
-    "٣",
-    "\x00",
-    "{{7*7}}",
+    *("", "text", "\x1b[31mred\x07", "a\nb", "\u202eabc", "é", LONG, "../../etc", "1,5", "nan", "٣"),
+    *("\x00", "{{7*7}}"),
 )
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 KEYS = ("x", "", "a.b", "a b", "\x1b[1m", "é" * 300)
@@ -87,24 +76,17 @@ def _pick(rng: np.random.Generator, values):
     return values[int(rng.integers(len(values)))]
 
 
+def _put(values):
+    def change(holder, key, rng) -> str:
+        holder[key] = _pick(rng, values)
+        return repr(holder[key])[:40]
+
+    return change
+
+
 def _gone(holder, key, rng) -> str:
     del holder[key]
     return "gone"
-
-
-def _number(holder, key, rng) -> str:
-    holder[key] = _pick(rng, NUMBERS)
-    return str(holder[key])
-
-
-def _text(holder, key, rng) -> str:
-    holder[key] = _pick(rng, TEXTS)
-    return repr(holder[key])[:40]
-
-
-def _word(holder, key, rng) -> str:
-    holder[key] = Raw(_pick(rng, WORDS))
-    return holder[key][:20]
 
 
 def _kind(holder, key, rng) -> str:
@@ -142,33 +124,28 @@ def _times(value, factor):
     return value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-CHANGES = (_gone, _number, _number, _text, _word, _kind, _sibling, _more, _scaled)
+_number = _put(NUMBERS)
+CHANGES = (
+    *(_gone, _number, _number, _put(TEXTS), _put([Raw(word) for word in WORDS])),
+    *(_kind, _sibling, _more, _scaled),
+)
 
 
-def json_of(value) -> str:
-    """With what JSON has not, as Python writes it."""
+def text_of(value, between: str = ": ") -> str:
+    """JSON with what JSON has not, as Python writes it; or inline TOML, " = " ``between`` a key and its value."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)}: {json_of(v)}" for k, v in value.items()) + "}"
+        return "{" + ", ".join(f"{json.dumps(k)}{between}{text_of(v, between)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(json_of, value)) + "]"
+        return "[" + ", ".join(text_of(each, between) for each in value) + "]"
+    if between != ": " and isinstance(value, float | None):
+        return '""' if value is None else repr(value)
     return str(value) if isinstance(value, Raw) else json.dumps(value, ensure_ascii=False)
 
 
 def toml_of(tree) -> str:
     """Keys with inline values."""
-    if not isinstance(tree, dict):
-        return f"x = {_toml_value(tree)}\n"
-    return "".join(f"{json.dumps(key)} = {_toml_value(value)}\n" for key, value in tree.items())
-
-
-def _toml_value(value) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {_toml_value(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_toml_value, value)) + "]"
-    if isinstance(value, float):
-        return repr(value)
-    return str(value) if isinstance(value, Raw) else json.dumps("" if value is None else value, ensure_ascii=False)
+    items = tree.items() if isinstance(tree, dict) else [("x", tree)]
+    return "".join(f"{json.dumps(key)} = {text_of(value, ' = ')}\n" for key, value in items)
 
 
 def number_replaced(text: str, rng: np.random.Generator) -> tuple[str, str]:

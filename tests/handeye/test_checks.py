@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import DegenerateError, StcalError
+from stcal.errors import StcalError
 from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
@@ -101,26 +101,20 @@ def test_motions_that_are_too_small_are_refused(setup):
         handeye(pairs, setup)
     pairs = simulated(np.random.default_rng(3), 12, setup, tilt=0.05).pairs  # ±3° do, with a larger σ
     assert handeye(pairs, setup).outliers.sum() == 0
-
-
-def test_translations_only_are_refused():
     rng = np.random.default_rng(4)
-    pairs = seen_from(flange_turned(rng, np.zeros((6, 3))), "eye-in-hand", rng)
     with fails_with("E-HANDEYE-AXES … 0"):
-        handeye(pairs)
+        handeye(seen_from(flange_turned(rng, np.zeros((6, 3))), setup, rng), setup)
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_too_few_poses(count):
-    pairs = simulated(np.random.default_rng(5), 4).pairs[:count]
-    with pytest.raises(DegenerateError, match=f"{count} poses, 3 needed and 10 wanted; rotate"):
-        handeye(pairs)
-
-
-def test_three_poses_are_enough():
-    truth = simulated(np.random.default_rng(6), 3)
-    found = handeye(truth.pairs)
-    assert found.flange_from_camera.translation == pytest.approx(truth.mount_from_camera.translation, abs=1e-5)
+    truth = simulated(np.random.default_rng(5), 3)
+    if count == 3:
+        found = handeye(truth.pairs)
+        assert found.flange_from_camera.translation == pytest.approx(truth.mount_from_camera.translation, abs=1e-5)
+        return
+    with fails_with(f"E-HANDEYE-FEW-POSES … {count} … 3 … 10 … rotate"):
+        handeye(truth.pairs[:count])
 
 
 def test_four_dof_where_it_does_not_belong():
@@ -389,11 +383,10 @@ def test_sound_poses_do_not_move(sets, most):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sets", [1, pytest.param(10, marks=pytest.mark.slow)])
-def test_rough_poses_that_fit_another_setup_better_are_said(sets):
+def test_rough_poses_that_fit_another_setup_better_are_said():
     """Errors of 0.5° and 5 mm, and turns of few degrees: no setup fits well, but the right one is named."""
     said = 0
-    for seed in range(sets):
+    for seed in range(10):
         truth = simulated(np.random.default_rng(seed), 15, "eye-in-hand", (8e-3, 5.0), (1e-3, 0.3), tilt=0.2)
         try:
             notes = handeye(truth.pairs, "eye-to-hand").notes
@@ -402,7 +395,7 @@ def test_rough_poses_that_fit_another_setup_better_are_said(sets):
         said += any("--setup eye-in-hand" in note for note in notes)
         right = handeye(truth.pairs, "eye-in-hand").notes
         assert not any("--setup eye-to-hand" in note for note in right)
-    assert said >= 0.8 * sets
+    assert said >= 8
 
 
 @pytest.mark.slow

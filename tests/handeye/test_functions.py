@@ -30,11 +30,7 @@ def written(command, tmp_path):
     return call
 
 
-def test_calibrate_handeye(written, poses):
-    answer = written(poses, "--splits", 0, "--method", "pose", "--setup", "eye-in-hand")
-    given = workflows.read_handeye(poses, setup="eye-in-hand")
-    found = workflows.calibrate_handeye(given, "pose", repeats=0)
-    assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
+def test_what_is_no_input_is_refused(poses):
     with fails_with("E-FIELD-TYPE … given … HandEyeInput"):
         workflows.calibrate_handeye(poses)
     with fails_with("E-OPTION-VALUE … setup"):

@@ -12,9 +12,8 @@ from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.model import mh80
 from tests.handeye.test_cli import NOISE, poses_file
+from tests.outcome import INPUT, assert_error
 from tests.support.handeye import simulated
-
-INPUT = 2
 
 
 @pytest.fixture
@@ -58,9 +57,8 @@ def test_a_robot_that_does_not_reach_the_poses_taken_is_refused(plan, taken):
     poses, robot_file = taken
     arm = mh80()
     save_robot(robot_file, replace(arm, rows=tuple(replace(row, a=row.a / 9, d=row.d / 9) for row in arm.rows)))
-    code, _, error = plan(poses, "--robot", robot_file)
-    assert code == INPUT
-    assert "reaches 0 of the 8 poses taken, first not line 2; give the robot's own file" in error
+    said = "reaches 0 of the 8 poses taken, first not line 2; give the robot's own file"
+    assert_error(plan(poses, "--robot", robot_file), INPUT, said)
 
 
 @pytest.mark.slow
@@ -81,5 +79,4 @@ def test_a_limit_that_some_poses_taken_pass_is_noted(plan, taken):
 
 def test_the_word_is_a_command_and_not_a_file(plan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, _, error = plan("nowhere.csv")
-    assert (code, "nowhere.csv: does not exist" in error) == (INPUT, True)
+    assert_error(plan("nowhere.csv"), INPUT, "nowhere.csv: does not exist")

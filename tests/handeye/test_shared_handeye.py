@@ -1,8 +1,5 @@
-"""Photographs of a ChArUco board on a real robot, static camera: the acceptance figures.
-
-The camera file has no distortion and the board is 0.5 % larger than stated; published for these data, in sample:
-1.25 px² and 0.96 mm at the board.
-"""
+"""Corners of a ChArUco board on a real robot, static camera: the camera file has no distortion, and the board is 0.5 %
+larger than stated. Errors on poses held out are those of its photographs, in ``test_shared_sets``."""
 
 import csv
 
@@ -12,12 +9,9 @@ import yaml
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, View, Views, cross_validate, pairs_of_views, splits
+from stcal.handeye import HandEyeOptions, View, Views, pairs_of_views
 from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import camera_prior
-
-MEAN_MM = 0.75
-"""3-D error at the board that held-out poses may have in the mean."""
 
 
 @pytest.fixture(scope="module")
@@ -39,18 +33,6 @@ def charuco(shared_data):
     views = Views(camera, tuple(views))
     prior = camera_prior(Camera.of(camera, "OPENCV"))
     return pairs_of_views(flange, views, tuple(f"{i}.png" for i in range(16))), views, prior
-
-
-@pytest.mark.slow
-def test_held_out_error_at_the_board(charuco):
-    pairs, views, prior = charuco
-    rows = splits(16, 5, 15)
-    options = HandEyeOptions(intrinsics=prior, with_scale=True)
-    ours = cross_validate(pairs, "eye-to-hand", "reprojection", views, options, rows)
-    park = cross_validate(pairs, "eye-to-hand", "park-martin", views, options, rows)
-    assert 0.3 < ours.board_mm.mean() <= MEAN_MM
-    assert (ours.board_mm.mean(1) < park.board_mm.mean(1)).all()
-    assert (ours.pose_mm.mean(1) < park.pose_mm.mean(1)).all()
 
 
 @pytest.mark.slow

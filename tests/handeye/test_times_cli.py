@@ -8,9 +8,9 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from tests.handeye.photographed import BOARD, write_poses
+from tests.outcome import INPUT, assert_error
 from tests.support.handeye_stream import StreamTruth, simulated_stream
 
-INPUT, COMPUTATION = 2, 3
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"
 
 
@@ -88,14 +88,11 @@ def test_times_of_images_in_a_file(command, tmp_path):
     assert code == 0, error
     assert "1 at a sample, 1 interpolated" in shown
     assert "left out c.png: no time in" in shown
-    code, _, error = command(*given, "--dry-run")
-    assert code == INPUT
-    assert "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)" in error
-    times.write_text("image,time_s\na,soon\n")
-    code, _, error = command(*given, "--dry-run", "--image-times", times)
-    assert (code, "time_s of a.png is 'soon', a number of seconds needed" in error) == (INPUT, True)
-    times.write_text("image,time_s\nz,1.5\n")
-    assert "no row is of an image: z" in command(*given, "--dry-run", "--image-times", times)[2]
+    said = "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)"
+    assert_error(command(*given, "--dry-run"), INPUT, said)
+    for row, said in (("a,soon", "time_s of a.png is 'soon', a number of"), ("z,1.5", "no row is of an image: z")):
+        times.write_text(f"image,time_s\n{row}\n")
+        assert_error(command(*given, "--dry-run", "--image-times", times), INPUT, said)
 
 
 def test_the_nearest_sample_stands_within_the_tolerance(command, tmp_path):
@@ -104,20 +101,5 @@ def test_the_nearest_sample_stands_within_the_tolerance(command, tmp_path):
     assert code == 0, error
     assert "2 by the nearest sample, up to 0.1 s away (0.15 s allowed), 1 left out" in shown
     assert "left out 102.3.png: in a gap of 1 s of robot.csv, 0.25 s allowed; the nearest sample is 0.3 s away" in shown
-    code, _, error = command(*given, "--dry-run", "--time-tolerance", 0.01)
-    assert code == INPUT
-    assert "no image has a pose: 100.05.png" in error
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--time-offset"], "--time-offset needs the robot's poses as a stream with times"),
-        (["--image-times", "times.csv"], "--image-times: only with a folder of images"),
-    ],
-)
-def test_options_of_times_need_times(command, tmp_path, options, said):
-    write_poses(tmp_path / "poses.csv", {"a": Rigid()})
-    code, _, error = command(tmp_path / "poses.csv", *options)
-    assert code == INPUT
-    assert said in error
+    outcome = command(*given, "--dry-run", "--time-tolerance", 0.01)
+    assert_error(outcome, INPUT, "no image has a pose: 100.05.png")

@@ -34,6 +34,9 @@ def test_every_pose_has_its_turn():
     assert splits(4).shape == (15, 1)
     with fails_with("E-HELD-OUT-FEW … 5 … 7 … 2 … 3"):
         splits(7, 5)
+    for held_out in (0, -1):
+        with fails_with(f"E-OPTION-RANGE … held_out {held_out}: 1 or more needed"):
+            splits(10, held_out)
 
 
 @pytest.mark.parametrize(
@@ -125,9 +128,3 @@ def test_the_last_motions_are_predicted_by_those_before():
     assert motion_errors(off, motions)[0] == pytest.approx([0, expected], abs=1e-5)
     with fails_with("E-OPTION-RANGE … --motions-held-out … 7 … 8 … 6"):
         predict_motions(truth.pairs, count=7)
-
-
-@pytest.mark.parametrize("held_out", [0, -1])
-def test_no_poses_held_out_are_refused(held_out):
-    with fails_with(f"E-OPTION-RANGE … held_out {held_out}: 1 or more needed"):
-        splits(10, held_out)

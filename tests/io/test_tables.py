@@ -37,72 +37,59 @@ def test_separators_and_decimal_commas(tmp_path, separator, comma):
         "name;X [mm];Y [mm];Z [mm]",
         "name;X_mm;Y_MM;z_mm",
         "name;x (mm);y(mm);z (MM)",
+        "name;X/mm;Y/mm;Z/mm",
         "name;X;Y;Z;",
         "name;X (millimeters);Y (Millimetres);Z [millimeter]",
     ],
 )
-def test_names_of_columns(tmp_path, head):
-    text = f"# Units: Millimeters\nsep=;\n{head}\n{lines(';')}\n"
-    if head.endswith(";"):
-        text = text.replace("\nP", ";\nP").replace(f"{head};", head).rstrip() + ";\n"
+@pytest.mark.parametrize("separator", [";", ","])
+def test_names_of_columns(tmp_path, head, separator):
+    end = ";" if head.endswith(";") else ""
+    rows = lines(";").replace("\n", f"{end}\n")
+    text = f"# Units: Millimeters\nsep=;\n{head}\n{rows}{end}\n".replace(";", separator)
     np.testing.assert_array_equal(table(tmp_path, text).points(), POINTS)
 
 
-def test_a_comma_behind_the_last_column_is_none(tmp_path):
-    found = table(tmp_path, "name,x_mm,y_mm,z_mm,\nP1,1.5,2,3,\nP2,1,4,5,\n")
-    np.testing.assert_array_equal(found.points(), [[1.5, 2, 3], [1, 4, 5]])
-
-
-def test_rows_without_a_header_are_named(tmp_path):
-    """Not the two columns that happen to be equal."""
-    with fails_with("E-TABLE-HEADER … line 1 … numbers"):
-        table(tmp_path, "PT0;10.5;2000.25;-3.125;0;0;1\nPT1;11.5;2000.25;-3.5;0;0;1\n")
-
-
-def test_the_case_of_turned_axes_stays(tmp_path):
-    found = table(tmp_path, "euler_ZYX_1_deg,X_mm,QW\n1,2,3\n")
-    assert list(found.columns) == ["euler_ZYX_1_deg", "x_mm", "qw"]
-
-
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "error"),
     [
-        ("a;b\n1,5;2.5\n", "1,5 beside 2.5"),
-        ("a\tb\n594,288\t1,155\n-2,000\t3\n", "594,288"),  # of thousands as well
+        ("a;b\n1,5;2.5\n", "E-TABLE-DECIMAL … 1,5 beside 2.5"),
+        ("a\tb\n594,288\t1,155\n-2,000\t3\n", "E-TABLE-DECIMAL … 594,288"),  # of thousands as well
+        ("a;b\n1;2\n3\n", "E-TABLE-CELLS … line 3"),  # no other separator
+        ("PT0;10.5;2000.25;-3.125;0;0;1\nPT1;11.5;2000.25;-3.5;0;0;1\n", "E-TABLE-HEADER … line 1 … numbers"),
+        ("My measurement\nname,x_mm,y_mm\nA,1,2\n", "E-TABLE-HEADER … line 1 … no header"),
+        ("P1 1.5 2.5 3.5\nP2 4 5 6\n", "E-TABLE-HEADER … line 1"),
     ],
 )
-def test_commas_that_may_be_of_thousands(tmp_path, text, named):
-    with fails_with(f"E-TABLE-DECIMAL … {named}"):
+def test_what_is_no_table_is_said(tmp_path, text, error):
+    with fails_with(error):
         table(tmp_path, text)
 
 
-def test_one_number_shows_what_a_comma_is(tmp_path):
+def test_cells_that_stay_as_they_are(tmp_path):
+    """Text that holds commas, the case of turned axes; one number shows what a comma is."""
+    assert table(tmp_path, "a;b\nx, y;1\n1,5;2\n").text("a") == ["x, y", "1,5"]
+    assert list(table(tmp_path, "euler_ZYX_1_deg,X_mm,QW\n1,2,3\n").columns) == ["euler_ZYX_1_deg", "x_mm", "qw"]
     np.testing.assert_array_equal(table(tmp_path, "a\tb\n594,288\t0,155\n").numbers("a"), [594.288])
 
 
-def test_text_that_holds_commas_stays(tmp_path):
-    assert table(tmp_path, "a;b\nx, y;1\n1,5;2\n").text("a") == ["x, y", "1,5"]
-
-
-def test_a_number_alone_in_a_line_is_no_other_separator(tmp_path):
-    with fails_with("E-TABLE-CELLS … line 3"):
-        table(tmp_path, "a;b\n1;2\n3\n")
-
-
-@pytest.mark.parametrize(("separator", "comma"), [(" ", False), (", ", False), (";", True), ("  ", True), (",", False)])
-def test_points_of_spatial_analyzer(tmp_path, separator, comma):
+@pytest.mark.parametrize(
+    ("separator", "comma", "unit", "factor"),
+    [
+        (" ", False, "units mm", 1),
+        (", ", False, "Units: Inches", 25.4),
+        (";", True, "Units: meters", 1000),
+        ("  ", True, "Units: mm", 1),
+        (",", False, "units mm", 1),
+    ],
+)
+def test_points_of_spatial_analyzer(tmp_path, separator, comma, unit, factor):
     rows = [separator.join([f"A::Main group::P {i}", *(f"{v:.4f}" for v in row)]) for i, row in enumerate(POINTS)]
     text = "\n".join(rows).replace(".", "," if comma else ".")
-    found = table(tmp_path, f"// SA 2021.1  Frame: World\n// units mm\n{text}\n")
-    np.testing.assert_array_equal(found.points(), POINTS)
+    found = table(tmp_path, f"// SA 2021.1  Frame: World\n// {unit}\n{text}\n")
+    np.testing.assert_allclose(found.points(), factor * POINTS, rtol=1e-15)
     assert found.text("name")[1] == "A::Main group::P 1"
     assert (found.text("group")[0], found.text("target")[2]) == ("Main group", "P 2")
-
-
-@pytest.mark.parametrize(("said", "factor"), [("Inches", 25.4), ("meters", 1000.0), ("mm", 1.0)])
-def test_the_unit_of_a_comment(tmp_path, said, factor):
-    found = table(tmp_path, f"// Units: {said}\nA::T::P0 1.0 2.0 3.0\n")
-    np.testing.assert_allclose(found.points(), [[factor, 2 * factor, 3 * factor]], rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -140,18 +127,6 @@ def test_key_columns_of_two_names(tmp_path):
 def test_a_row_of_units_below_the_header(tmp_path, units, separator):
     text = f"name,x,y,z\n,{units},{units},{units}\nA,1.5,2,3\nB,4,5,6\n".replace(",", separator)
     np.testing.assert_array_equal(table(tmp_path, text).points(), [[1.5, 2, 3], [4, 5, 6]])
-
-
-def test_units_behind_a_slash(tmp_path):
-    found = table(tmp_path, "% exported\nPunkt;X/mm;Y/mm;Z/mm\nA;1,5;2;3\nB;2,5;2;3\n")
-    np.testing.assert_array_equal(found.points(), [[1.5, 2, 3], [2.5, 2, 3]])
-
-
-def test_a_line_that_is_no_header_is_named(tmp_path):
-    with fails_with("E-TABLE-HEADER … line 1 … no header"):
-        table(tmp_path, "My measurement\nname,x_mm,y_mm\nA,1,2\n")
-    with fails_with("E-TABLE-HEADER … line 1"):
-        table(tmp_path, "P1 1.5 2.5 3.5\nP2 4 5 6\n")
 
 
 def test_a_covariance_is_whole_or_there_is_none(tmp_path):

@@ -107,19 +107,18 @@ def test_mistakes_are_named(tmp_path, every, error):
 
 
 def test_what_is_no_video_is_refused_and_touches_no_folder_of_others(tmp_path):
-    (tmp_path / "clip.mp4").write_bytes(b"no video")
-    with fails_with("E-VIDEO-UNREADABLE … clip.mp4"):
-        pipeline.run(tmp_path / "clip.mp4", None, tmp_path / "run", tag_cube(60))
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other/mine.txt").write_text("mine")
-    with fails_with("E-OUTPUT-EXISTS … other"):
-        pipeline.run(tmp_path / "clip.mp4", None, tmp_path / "other", tag_cube(60))
-    assert [path.name for path in (tmp_path / "other").iterdir()] == ["mine.txt"]
-
-
-def test_frames_of_a_folder_cannot_be_asked_for(tmp_path):
-    with fails_with("E-OPTION-VALUE … --every auto"):
-        pipeline.run(tmp_path, None, tmp_path / "run", tag_cube(60), every="auto")
+    video, other = tmp_path / "clip.mp4", tmp_path / "other"
+    video.write_bytes(b"no video")
+    other.mkdir()
+    (other / "mine.txt").write_text("mine")
+    for source, out, every, error in (
+        (video, tmp_path / "run", None, "E-VIDEO-UNREADABLE … clip.mp4"),
+        (video, other, None, "E-OUTPUT-EXISTS … other"),
+        (tmp_path, tmp_path / "run", AUTO, "E-OPTION-VALUE … --every auto"),
+    ):
+        with fails_with(error):
+            pipeline.run(source, None, out, tag_cube(60), every=every)
+    assert [path.name for path in other.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.slow

@@ -1,15 +1,12 @@
-"""Simulated arms that bend, that branch, or that hold their flange where it is wanted."""
+"""Simulated arms that bend or that branch."""
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
-from stcal.errors import ConvergenceError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
-from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
-from stcal.robot.kinematics.inverse import inverse
-from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 
@@ -19,8 +16,6 @@ MARKERS = ("left", "right", "elbow")
 """Of :func:`two_arms`."""
 LEFT, RIGHT = Rigid.exp([0.5, 0.2, 0.1, 100, 250, 300]), Rigid.exp([-0.5, 0.3, -0.1, 100, -250, 300])
 """Where its arms begin behind the torso."""
-STEPS, REACHED = 50, 1e-9
-"""Of Newton's steps to a pose; rad and mm at which it is reached."""
 
 
 def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0, heavier: float = 1.0) -> Robot:
@@ -53,36 +48,3 @@ def two_arms(convention: Convention = "standard") -> Robot:
     base = Rigid.exp([0.1, 0.2, 0.9, 1500, -300, 200])
     rows, joints = (*torso, *arm_rows, *arm_rows), (*wide, *arm.joints, *arm.joints)
     return Robot("torso", arm.convention, rows, joints, world_from_base=base, tools=tools, tree=tree)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueArm:
-    """``robot`` : as its file says, without joint limits; ``parameters`` : (k,) by which its axes really are off, small
-    motions of the joints' frames; ``q`` : (m, n) joint values at which the flange is where it was wanted."""
-
-    robot: Robot
-    parameters: np.ndarray
-    q: np.ndarray
-
-
-def arm_at(rng: np.random.Generator, base_from_flange: Poses, sigma_rad: float, sigma_mm: float) -> TrueArm:
-    """The example of a robot with axes off by these σ, at poses of its flange.
-
-    Raises
-    ------
-    ConvergenceError
-        A pose is not reached.
-    """
-    robot = replace(mh80(), joints=(Joint(),) * 6)
-    chain = replace(robot, world_from_base=Rigid()).chain()
-    sigma = [sigma_rad if component < 3 else sigma_mm for _, component in chain_parameters(chain)]
-    parameters = rng.normal(0, sigma)
-    true, q = moved_chain(chain, parameters), inverse(robot, base_from_flange).q.copy()
-    for _ in range(STEPS):
-        off = base_from_flange.difference(flange_poses(true, q))
-        if np.abs(off).max() < REACHED:
-            return TrueArm(robot, parameters, q)
-        q += np.linalg.solve(jacobian(robot, q), off[:, :, None])[:, :, 0]
-    raise ConvergenceError(
-        "E-NO-MINIMUM", f"arm: a pose of the flange is missed by {np.abs(off).max():.2g}; take others"
-    )

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from stcal.errors import InputError
 from stcal.synthetic.render import encode
 from tests.support.photograph import MARGIN_MM, Photograph, Plane, disc_share, half_share
 
@@ -26,8 +25,6 @@ BLOOM = 0.15
 
 def stored(image: np.ndarray, bits: int = 8) -> np.ndarray:
     """Pixels of a file: clipped, rounded, uint8; of 9 to 16 bits uint16 with white at 2^bits − 1."""
-    if not 8 <= bits <= 16:
-        raise InputError("E-SIMULATE-OPTIONS", f"degraded image: {bits} bits, 8 to 16 needed")
     top = 2**bits - 1
     levels = np.rint(np.clip(np.asarray(image, np.float32) * np.float32(top / WHITE), 0, top))
     return levels.astype(np.uint8 if bits == 8 else np.uint16)
@@ -188,12 +185,9 @@ def unevenly_lit(photograph: Photograph, ratio: float) -> np.ndarray:
 
 def without_circles(photograph: Photograph, labels: Iterable[str]) -> np.ndarray:
     """These circles painted over in the colour around them."""
-    image, gone = photograph.grey.astype(np.float32), set(labels)
-    for plane, i in _indices(photograph, gone):
-        if found := photograph.circle(plane, i, RING_REACH):
-            window, unit = found
-            cover = disc_share(unit, HIDDEN_REACH, 1.0)
-            image[window] = _covered(image[window], unit, cover)
+    image = photograph.grey.astype(np.float32)
+    for _, window, unit in _circles(photograph, RING_REACH, labels):
+        image[window] = _covered(image[window], unit, disc_share(unit, HIDDEN_REACH, 1.0))
     return image
 
 
@@ -203,13 +197,10 @@ def cut_circles(photograph: Photograph, labels: Iterable[str], share: float, see
     heights = np.linspace(-1, 1, 2001)
     beyond = (np.arccos(heights) - heights * np.sqrt(1 - heights**2)) / np.pi
     offset = float(np.interp(-share, -beyond, heights))
-    image, cut = photograph.grey.astype(np.float32), set(labels)
-    for plane, i in _indices(photograph, cut):
-        angle = rng.uniform(0, 2 * np.pi)
-        if found := photograph.circle(plane, i, RING_REACH):
-            window, unit = found
-            cover = disc_share(unit, HIDDEN_REACH, 1.0) * half_share(unit, angle, offset)
-            image[window] = _covered(image[window], unit, cover)
+    image = photograph.grey.astype(np.float32)
+    for _, window, unit in _circles(photograph, RING_REACH, labels):
+        segment = half_share(unit, rng.uniform(0, 2 * np.pi), offset)
+        image[window] = _covered(image[window], unit, disc_share(unit, HIDDEN_REACH, 1.0) * segment)
     return image
 
 
@@ -217,16 +208,13 @@ def half_darker(photograph: Photograph, share: float, angle_rad: float = 0.6) ->
     """One half of every circle has this share less contrast against its surroundings, the same half in all images, as
     where an LED stands off the middle behind it. Rims stay where they are: any shift of a centre is the detector's."""
     image = photograph.grey.astype(np.float32)
-    for plane in photograph.planes:
-        for i in range(len(plane.labels)):
-            if found := photograph.circle(plane, i, 1.3):
-                window, unit = found
-                ring = (np.hypot(unit[..., 0], unit[..., 1]) > 1.1) & (np.hypot(unit[..., 0], unit[..., 1]) < 1.3)
-                if not ring.any():
-                    continue
-                around = np.median(image[window][ring])
-                inside = disc_share(unit, 1.15, 1.0) * half_share(unit, angle_rad)
-                image[window] -= (np.float32(share) * inside * (image[window] - around)).astype(np.float32)
+    for _, window, unit in _circles(photograph, 1.3):
+        distance = np.hypot(unit[..., 0], unit[..., 1])
+        ring = (distance > 1.1) & (distance < 1.3)
+        if ring.any():
+            inside = disc_share(unit, 1.15, 1.0) * half_share(unit, angle_rad)
+            contrast = image[window] - np.median(image[window][ring])
+            image[window] -= (np.float32(share) * inside * contrast).astype(np.float32)
     return image
 
 
@@ -255,14 +243,10 @@ def covered_labels(photograph: Photograph, image: np.ndarray, least: float = 8.0
     part). All over means in nine tenths of the disc."""
     changed = np.abs(image - photograph.grey) >= least
     whole, part = set(), set()
-    for plane in photograph.planes:
-        for i, label in enumerate(plane.labels):
-            if label not in photograph.must_find or not (found := photograph.circle(plane, i, 1.1)):
-                continue
-            window, unit = found
-            disc = np.hypot(unit[..., 0], unit[..., 1]) < 1.1
-            share = changed[window][disc].mean() if disc.any() else 0.0
-            (whole if share > 0.9 else part if share > 0.02 else set()).add(label)
+    for label, window, unit in _circles(photograph, 1.1, photograph.must_find):
+        disc = np.hypot(unit[..., 0], unit[..., 1]) < 1.1
+        share = changed[window][disc].mean() if disc.any() else 0.0
+        (whole if share > 0.9 else part if share > 0.02 else set()).add(label)
     return whole, part
 
 
@@ -308,11 +292,13 @@ def _covered(pixels: np.ndarray, unit: np.ndarray, cover: np.ndarray) -> np.ndar
     return (pixels * (1 - cover) + (terms @ fit + noise) * cover).astype(np.float32)
 
 
-def _indices(photograph: Photograph, labels: set[str]):
+def _circles(photograph: Photograph, reach: float, labels: Iterable[str] | None = None):
+    """Label and surroundings (:meth:`Photograph.circle`) of circles in view, of all where no labels are given."""
+    wanted = None if labels is None else set(labels)
     for plane in photograph.planes:
         for i, label in enumerate(plane.labels):
-            if label in labels:
-                yield plane, i
+            if (wanted is None or label in wanted) and (found := photograph.circle(plane, i, reach)):
+                yield label, *found
 
 
 def _polygon(corners: np.ndarray, steps: int = 20) -> np.ndarray:

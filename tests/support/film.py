@@ -14,20 +14,8 @@ PERIOD = 50.0
 def filmed(
     scene: Scene, group: str, images: int, shift_mm: float = 40.0, turn_deg: float = 4.0, seed: int = 0, view: int = 0
 ) -> Scene:
-    """The scene with one group alone, whose camera swings about one of its views in all six degrees of freedom.
-
-    Parameters
-    ----------
-    scene : Scene
-    group : str
-    images : int
-    shift_mm, turn_deg : float
-        Amplitudes; from image to image the camera moves by up to a fifth of them, 2 π over the shortest period.
-    seed : int
-        Of periods and phases.
-    view : int
-        Number of the image in the group about which it swings.
-    """
+    """The scene with one group alone, whose camera swings about its view of that number in all six degrees of freedom,
+    with amplitudes ``shift_mm`` and ``turn_deg``; from image to image it moves by up to a fifth of them."""
     rng = np.random.default_rng(seed)
     period, phase = PERIOD * rng.uniform(0.67, 1.33, 6), rng.uniform(0, 2 * np.pi, 6)
     swing = np.sin(2 * np.pi * np.arange(images)[:, None] / period + phase)

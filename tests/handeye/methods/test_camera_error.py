@@ -26,7 +26,7 @@ def by_a_wrong_camera(seed: int, times: float, method: str, options: HandEyeOpti
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("method", ["pose", pytest.param("reprojection", marks=pytest.mark.full)])
+@pytest.mark.parametrize("method", ["pose", "reprojection"])
 @pytest.mark.parametrize("times", [1.0, 4.0])
 def test_sigma_covers_what_the_camera_file_errs(method, times):
     """Of all trials together within what chance makes of six numbers each, a factor of 1.25² left for errors that are

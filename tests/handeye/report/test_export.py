@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.report.export import FORMS, exported, opencv_yaml, read_urdf, ros_yaml, tree, urdf_joint
+from stcal.handeye.report.export import FORMS, exported, opencv_yaml, read_urdf, ros_yaml, urdf_joint
 from stcal.io.poses.programs import read_messages
 from tests.outcome import fails_with
 
@@ -134,17 +134,6 @@ def test_the_link_in_ros_and_urdf(write, read):
     (only,) = read(write(result_of(pose)))
     assert only.child == "camera_optical_frame"
     assert np.abs(only.pose.matrix() - pose.matrix()).max() < 1e-9
-
-
-def test_axes_of_the_link():
-    """A camera that looks along the flange's Z with its X along the flange's X: the link's X looks along Z too."""
-    link, optical = tree(result_of(Rigid()), camera_frame="link")
-    assert (link.pose.rotation @ [1, 0, 0] == [0, 0, 1]).all()  # forward
-    assert (link.pose.rotation @ [0, 1, 0] == [-1, 0, 0]).all()  # left
-    assert (link.pose.rotation @ [0, 0, 1] == [0, -1, 0]).all()  # up
-    assert Rotation.from_matrix(np.array(optical.pose.rotation)).as_euler("xyz") == pytest.approx(
-        [-np.pi / 2, 0, -np.pi / 2]
-    )
 
 
 POSE = Rigid(Rotation.from_euler("ZYX", [30, -20, 10], degrees=True).as_matrix(), [1.5, -20, 300.25])

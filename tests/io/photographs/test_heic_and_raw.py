@@ -42,17 +42,13 @@ def exif(orientation: int = 1) -> bytes:
 
 
 def test_a_heic_photograph_is_read(tmp_path):
-    data = heic()
-    (tmp_path / "a.HEIC").write_bytes(data)
+    """Told by its content where its name says otherwise."""
+    (tmp_path / "a.HEIC").write_bytes(heic())
     (file,), skipped = find_images(tmp_path)
     assert not skipped
-    image = decode(file.read(), file.name)
+    image = decode(file.read(), "a.jpg")
     assert np.abs(image.astype(int) - SCENE).mean() < 3  # JPEG of this quality: 2
     np.testing.assert_allclose(centre(image), centre(SCENE), atol=0.05)
-
-
-def test_a_heic_photograph_is_told_by_its_content():
-    assert decode(heic(), "a.jpg").shape == (HEIGHT, WIDTH)
 
 
 def test_the_turn_of_the_container_is_undone():
