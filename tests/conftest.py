@@ -30,7 +30,9 @@ from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import ImageObservations, WorldModel
+from stcal.sfm.pipeline import RunOptions, RunResult, run
 from stcal.sfm.planning.forecast import observe, true_models
+from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.shared import Once, without_rights
 
@@ -104,6 +106,39 @@ def sample() -> Path:
 def scene():
     """The reference target in four groups of five views, half-size camera."""
     return make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=5))
+
+
+SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
+
+
+@pytest.fixture(scope="session")
+def small_scene() -> Scene:
+    """The reference design in groups 12 and 14, four images of 1296×864 px each."""
+    return make_scene(SMALL)
+
+
+@pytest.fixture(scope="session")
+def small_dataset(small_scene, once) -> Path:
+    """``small_scene`` as a folder. Not to be written to: see ``small_set``."""
+    return once.folder("small", lambda folder: write_dataset(folder, small_scene, workers=1))
+
+
+@pytest.fixture(scope="session")
+def small_result(small_dataset, once) -> RunResult:
+    """Of a run of ``small_dataset``; its folder is ``small_run``."""
+    data = small_dataset
+    files = [data / name for name in ("target.toml", "board.toml")]
+
+    def make(out: Path) -> RunResult:
+        return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1))
+
+    return once.value("small_run", make)[1]
+
+
+@pytest.fixture(scope="session")
+def small_run(small_result) -> Path:
+    """A finished run of ``small_dataset``. Not to be written to."""
+    return small_result.out
 
 
 class LabelsOnly:

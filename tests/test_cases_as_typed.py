@@ -19,7 +19,7 @@ import pytest
 from stcal.boards.file import load_run_board
 from stcal.cli.main import main
 from stcal.io.design import load_target
-from tests.io.reported_cameras import SAMPLES, metashape, perspective
+from tests.io.reported_cameras import SAMPLES
 from tests.outcome import COMPUTATION, INPUT, ended, lines_of
 from tests.test_shared_cases import apart, truth
 
@@ -126,7 +126,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         for refused in (name in ("invbc", "uncal"),)
     ),
     "ros_none": (Typed(INPUT, "E-CAMERA-KEY", ("binning_x = 2", "set it to 0")),),
-    "rotated_tags": (Typed(COMPUTATION, says=("3 scenes, 0 accepted", *HALF_A_TURN)),),
+    "rotated_tags": (Typed(COMPUTATION, says=(*3 * HALF_A_TURN[1:], "3 scenes, 0 accepted")),),
     "scara_4dof_inverted_cam": (
         Typed(INPUT, "E-HANDEYE-CONVENTION", ("board_from_camera", "rename them in the file"), {}, ("column",)),
     ),
@@ -380,9 +380,3 @@ def test_own_target_is_not_its_mirror_image(shared_case, tmp_path, monkeypatch, 
     assert seen["right"][1].count("faces front, right") == 3
     assert "faces front" not in seen["mirrored"][1]
     assert "mirror" in seen["mirrored"][1] + seen["mirrored"][2]
-
-
-def test_values_of_foreign_lenses_are_projected_apart():
-    """The pixels that reported files are compared with differ from those without the keys that were dropped before."""
-    plain = perspective((3269.75, 3268.25, 1971, 1523.75), [0.11, -0.32, -0.0031, 0.0012, 0.21])
-    assert np.abs(metashape() - plain).max() > 1

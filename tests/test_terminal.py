@@ -191,20 +191,12 @@ def test_json_goes_to_standard_output_alone(program, tmp_path, monkeypatch):
     assert json.loads(out) == json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
     assert err.splitlines() == said.replace("written: design.json\n", "").splitlines()
     assert not (tmp_path / "-").exists()
+    assert_error(program(*words[:-1], "-"), INPUT, "E-OPTION-STDOUT", "--out", "--json")
+    assert not (tmp_path / "-").exists()
     assert [line.split()[-1] for line in said.splitlines() if line.startswith(("O1 ", "O2 "))] == [
         "(D-optimality)",
         "number",
     ]
-
-
-def test_only_json_goes_to_standard_output(program, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    nominal = tmp_path / "robot.toml"
-    program("robot", "init", nominal)
-    words = ["robot", "design", "--robot", nominal, "--count", "16", "--candidates", "40"]
-    outcome = program(*words, "--out", "-")
-    assert_error(outcome, INPUT, "E-OPTION-STDOUT", "--out", "--json")
-    assert not (tmp_path / "-").exists()
 
 
 def test_every_json_option_says_so():

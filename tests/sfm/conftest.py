@@ -1,51 +1,18 @@
 """Small data sets with pixels, made once, and the command line in this process."""
 
+import shutil
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from stcal.cli.main import main_sfm
-from stcal.sfm.pipeline import RunOptions, RunResult, run
-from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.sfm.runs.saved import SavedRun, load_run
 from tests.fuzzing.stock import make_stock
 from tests.outcome import Outcome, ended
 from tests.shared import own_copy
-
-SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
-
-
-@pytest.fixture(scope="session")
-def small_scene() -> Scene:
-    """The reference design in groups 12 and 14, four images of 1296×864 px each."""
-    return make_scene(SMALL)
-
-
-@pytest.fixture(scope="session")
-def small_dataset(small_scene, once) -> Path:
-    """``small_scene`` as a folder. Not to be written to: see ``small_set``."""
-    return once.folder("small", lambda folder: write_dataset(folder, small_scene, workers=1))
-
-
-@pytest.fixture(scope="session")
-def small_result(small_dataset, once) -> RunResult:
-    """Of a run of ``small_dataset``; its folder is ``small_run``."""
-    data = small_dataset
-    files = [data / name for name in ("target.toml", "board.toml")]
-
-    def make(out: Path) -> RunResult:
-        return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1))
-
-    return once.value("small_run", make)[1]
-
-
-@pytest.fixture(scope="session")
-def small_run(small_result) -> Path:
-    """A finished run of ``small_dataset``. Not to be written to."""
-    return small_result.out
 
 
 @pytest.fixture(scope="session")
@@ -55,11 +22,15 @@ def stock(small_dataset, small_run, once) -> Path:
 
 
 @pytest.fixture(scope="session")
-def other_pair_scene(small_scene) -> Scene:
-    """The same target and camera, faces 3 and 4 in view."""
-    scene = make_scene(replace(SMALL, images_per_group=3, groups=(("3", "4"),)))
-    assert scene.circles_target["1:1"].tolist() == small_scene.circles_target["1:1"].tolist()
-    return scene
+def saved(small_run) -> SavedRun:
+    """``small_run``, read once."""
+    return load_run(small_run)
+
+
+@pytest.fixture
+def own_run(small_run, tmp_path) -> Path:
+    """A copy of ``small_run`` to write to."""
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
 @dataclass(frozen=True)

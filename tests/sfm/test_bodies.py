@@ -41,6 +41,7 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
+from tests.levels import sampled
 from tests.outcome import COMPUTATION, assert_error, fails_with
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
@@ -202,8 +203,7 @@ def test_corners_behind_a_finger_are_named_and_no_others():
     assert sum(named) >= 7
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", sampled(range(5)))
 def test_of_photographs_of_tags_only_planted_corners_contradict(seed):
     """One sound corner of the some 100 of a set may be named in a hundred sets."""
     target, planted_px = tag_cube(45), 3.0

@@ -25,12 +25,6 @@ def written_json(stcal_sfm, out, *words) -> dict:
     return json.loads(out.read_text(encoding="utf-8"))
 
 
-def test_compare(stcal_sfm, small_run, small_dataset, tmp_path):
-    truth = small_dataset / "truth.json"
-    answer = written_json(stcal_sfm, tmp_path / "a.json", "compare", small_run, truth)
-    assert json.loads(json_text(sfm.compare(small_run, truth))) == answer
-
-
 def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
     words = "budget", small_run, "--field", "operator=A", "--no-strict"
     answer = written_json(stcal_sfm, tmp_path / "a.json", *words)
@@ -95,11 +89,6 @@ def test_design_tag_body_and_plan(stcal_sfm, tmp_path):
     assert plan_text(sfm.plan(session, target), found.source) in said
     with fails_with("E-OPTION-CONFLICT … board"):
         sfm.plan(session, target, stcal.reference_board())
-
-
-def test_noise_of_run(small_run):
-    noise = sfm.noise_of_run(small_run)
-    assert 0.001 < noise.edge < 0.2  # as of `planning/test_forecast.py`
 
 
 def test_calibrate_models(stcal_sfm, small_run, tmp_path):

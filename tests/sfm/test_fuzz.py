@@ -9,7 +9,7 @@ import pytest
 from stcal.cli.main import MESSAGE_CHARACTERS
 from stcal.io import cache as io_cache
 from stcal.io.files import require_written
-from tests.commands import CALLS, COMMANDS, options_of
+from tests.commands import CALLS, COMMANDS
 from tests.fuzzing import kept
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
@@ -203,9 +203,3 @@ def test_a_call_in_this_process(stock, tmp_path):
     assert "as JSON" in outcome.out
     assert (tmp_path / OUT / "errors.json").read_text() != EARLIER
     assert json.loads((tmp_path / OUT / "errors.json").read_text())["faces"]
-
-
-def test_options_are_found():
-    assert {"--seed", "--folds", "--model"} <= set(options_of("register"))
-    assert "--out" not in options_of("register")
-    assert "--allow-ambiguous" not in options_of("register")

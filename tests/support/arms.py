@@ -7,6 +7,7 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
 from stcal.robot.kinematics.forward import with_values
+from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 

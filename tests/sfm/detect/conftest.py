@@ -1,9 +1,16 @@
-"""The sample's photographs, read once."""
+"""The sample's photographs, read once; and what a group of images shows, without pixels."""
 
+import numpy as np
 import pytest
 
 from tests.sfm.detect.degraded import Bench
 from tests.support.photograph import read_set
+
+
+@pytest.fixture(scope="module")
+def group(scene, labels_only):
+    """Observations of group 12, to 0.003 px."""
+    return [o for o in labels_only.observations(scene, 0.003, np.random.default_rng(0)) if o.group == "12"]
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,13 @@
 """What does not fit the one rigid arrangement of a group is left out, whatever its brightness, and all else is kept."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
+from stcal.labels import DotLabel
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.labels import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
@@ -14,9 +17,11 @@ FOCAL_PX = 2787.0
 TARGET = reference_target()
 
 
-@pytest.fixture(scope="module")
-def group(scene, labels_only):
-    return [o for o in labels_only.observations(scene, 0.003, np.random.default_rng(0)) if o.group == "12"]
+def centres_of(centre_px, centre) -> Centres:
+    """Circles at these places that are alike in all else."""
+    n = len(centre)
+    one, two = np.ones(n), np.tile(np.eye(2), (n, 1, 1))
+    return Centres(centre_px, centre, 0.01 * two, 1e-4 * two, one, one, one, one, np.zeros((n, 2)), one.astype(bool))
 
 
 class Seen:
@@ -59,21 +64,7 @@ class Seen:
         return self
 
     def detection(self, mirrored=()) -> ImageDetection:
-        n = len(self.centre)
-        one = np.ones(n)
-        shapes = np.tile(np.eye(2), (n, 1, 1))
-        centres = Centres(
-            self.centre * FOCAL_PX,
-            self.centre,
-            0.01 * shapes,
-            1e-4 * shapes,
-            one,
-            one,
-            one,
-            one,
-            np.zeros((n, 2)),
-            one.astype(bool),
-        )
+        centres = centres_of(self.centre * FOCAL_PX, self.centre)
         return ImageDetection(
             centres, tuple(self.faces), tuple(self.boards), mirrored, open_faces=tuple(self.open_faces)
         )
@@ -246,3 +237,73 @@ def test_patterns_of_which_the_same_is_said_make_one_note(scene, group):
         seen.face("5", plane_centres(pose, TARGET.face("5").xy_mm)).unnamed("5")
     found = label_single("a.png", "12", seen.detection(), scene.target)
     assert [note.partition("(")[2] for note in found.notes if "may be another" in note] == ["3 times)"]
+
+
+# --- the numbering of the board ---
+
+
+def numbered(image, numberings) -> ImageDetection:
+    """With other numberings of its board, made of the true one and that after half a turn."""
+    seen = Seen(image)
+    (board,) = seen.boards
+    seen.boards = [BoardSighting(board.rows, np.stack(numberings(*board.numberings)))]
+    return seen.detection()
+
+
+def turned(true, other):
+    return other, true
+
+
+def is_numbered(image, result, half_a_turn=False) -> bool:
+    """Whether the board's labels are the true ones, or those after half a turn."""
+    truth = dict(zip(image.labels, map(tuple, image.centre), strict=True))
+    found = zip(result.observations.labels, map(tuple, result.observations.centre), strict=True)
+    dots = [(x, at) for x, at in found if x.plane == "board"]
+    return all(truth[DotLabel(6 - x.row, 8 - x.column) if half_a_turn else x] == at for x, at in dots)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_all_images_agree_on_one_numbering(scene, group, seed):
+    turns = np.random.default_rng(seed).integers(0, 2, len(group)).astype(bool)
+    detections = [numbered(o, turned) if turn else Seen(o).detection() for o, turn in zip(group, turns, strict=True)]
+    results, _ = labelled(scene, detections)
+    for o, r in zip(group, results, strict=True):
+        assert len(r.observations) == len(o)
+        assert is_numbered(o, r, turns[0])
+
+
+@pytest.mark.parametrize(
+    ("image", "others", "own"),
+    [
+        (3, turned, lambda true, other: [true]),  # an image that is certain speaks for the group
+        (2, lambda *both: both, lambda true, other: [other - [0, 1], true - [0, -1], other, true]),  # by a column
+    ],
+)
+def test_one_image_with_other_numberings_is_seen_through(scene, group, image, others, own):
+    detections = [numbered(o, own if i == image else others) for i, o in enumerate(group)]
+    results, _ = labelled(scene, detections)
+    assert all(is_numbered(o, r) for o, r in zip(group, results, strict=True))
+
+
+def test_an_image_without_a_face_keeps_no_uncertain_board(scene, group):
+    seen = [Seen(o) for o in group]
+    seen[1].faces = []
+    results, _ = labelled(scene, [s.detection() for s in seen])
+    assert len(results[1].observations) == 0
+    assert any("left out: 2 numberings fit" in note for note in results[1].notes)
+
+
+def test_a_target_that_was_moved_within_the_group_loses_the_board(scene, group):
+    """The third image shows the faces a fifth smaller than the board's place says."""
+    face = [i for i, label in enumerate(group[2].labels) if label.plane != "board"]
+    moved = group[2].centre.copy()
+    moved[face] = (moved[face] - moved[face].mean(0)) * 0.8 + moved[face].mean(0)
+    seen = [Seen(replace(o, centre=moved) if i == 2 else o) for i, o in enumerate(group)]
+    results, _ = labelled(scene, [s.detection() for s in seen])
+    assert not any(label.plane == "board" for label in results[2].observations.labels)
+    assert any("was moved" in note for note in results[2].notes)
+
+
+def test_without_a_board_the_target_is_labelled_all_the_same(scene, group):
+    ((results, _),) = label_groups([[("12/0", "12", Seen(group[0]).detection())]], scene.target, None, FOCAL_PX)
+    assert {label.plane for label in results[0].observations.labels} == {"1", "2"}

@@ -7,11 +7,11 @@ from scipy.spatial.transform import Rotation
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
 from stcal.sfm.detect.faces import FaceFinder
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection, confusable, is_named, mirror_images
+from tests.sfm.detect.test_arrangement import centres_of
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
@@ -96,8 +96,7 @@ def test_a_circle_of_another_size_is_left_out_of_its_face():
 def test_a_second_board_counts_if_it_is_of_similar_size(dots, repeated):
     cells = np.array([[r, c] for r in range(7) for c in range(9)])
     boards = [BoardSighting(np.arange(n), cells[None, :n]) for n in (63, dots)]
-    nothing = Centres(*(np.zeros((0, *shape)) for shape in ((2,), (2,), (2, 2), (2, 2), *[()] * 4, (2,), ())))
-    found = ImageDetection(nothing, (), tuple(boards))
+    found = ImageDetection(centres_of(np.zeros((0, 2)), np.zeros((0, 2))), (), tuple(boards))
     assert found.repeated == (("board",) if repeated else ())
     assert (found.board is None) == repeated
 

@@ -13,10 +13,9 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
-from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
-from stcal.sfm.detect.sightings import FaceSighting, ImageDetection, mirror_images
+from stcal.sfm.detect.sightings import mirror_images
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
@@ -157,10 +156,10 @@ def test_circles_blurred_beyond_their_size_give_no_wrong_label(bench):
 
 def detected(name, faces=(), mirrored=()):
     """An image that shows these faces, or these as a mirror does."""
-    nothing = Centres(*(np.zeros((0, *shape)) for shape in ((2,), (2,), (2, 2), (2, 2), *[()] * 4, (2,), ())))
-    sightings = tuple(FaceSighting(face, np.zeros(0, int), np.zeros(0, int)) for face in faces)
-    detection = ImageDetection(nothing, sightings, (), mirrored)
-    return DetectedImage(ImageFile(Path(name), name, "12"), detection, name, b"", 1.0, False)
+    seen = Seen()
+    for face in faces:
+        seen.face(face, np.zeros((0, 2)), [])
+    return DetectedImage(ImageFile(Path(name), name, "12"), seen.detection(mirrored), name, b"", 1.0, False)
 
 
 def images(mirrored, upright, empty=0):

@@ -56,10 +56,8 @@ class Group:
 
 
 @pytest.fixture
-def group(scene, labels_only):
-    return Group(
-        scene, [o for o in labels_only.observations(scene, 0.003, np.random.default_rng(0)) if o.group == "12"]
-    )
+def group(scene, group):
+    return Group(scene, group)
 
 
 def test_what_is_in_its_place_stays_and_leaves_the_arrangement_as_it_is(group):

@@ -8,10 +8,11 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
-from stcal.sfm.data.model import Centres, ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import _second, labelled_image
 from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, SecondLook, contradictions, measure_predicted
+from tests.sfm.detect.test_arrangement import centres_of
 from tests.sfm.detect.test_centres import sheet
 
 CAMERA = Camera(1600, 1200, [2500.0, 2400.0], [799.5, 599.5], [-0.12, 0.08, 1e-3, -5e-4, 0, 0, 0, 0])
@@ -235,8 +236,7 @@ def test_circles_of_other_sizes_than_the_options_ask_for_are_not_measured():
 
 def centres(n):
     """Of any circles."""
-    one, two = np.ones(n), np.tile(np.eye(2), (n, 1, 1))
-    return Centres(np.ones((n, 2)), np.ones((n, 2)), two, two, one, one, one, one, np.zeros((n, 2)), one.astype(bool))
+    return centres_of(np.ones((n, 2)), np.ones((n, 2)))
 
 
 def read(name, *faces):

@@ -228,18 +228,19 @@ def points_by_track(model) -> dict[tuple, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("schema", ["3.8", "3.11", "3.13"])
-def test_pycolmap_makes_the_same_model_of_the_export(schema, small_run, tmp_path):
+def test_pycolmap_makes_the_same_model_of_the_export(small_run, tmp_path):
     """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
     names, pair = first_group(small_run)
-    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", schema)
-    ours = mapped(small_run / "colmap/database.db", tmp_path / "ours", names, pair)
-    theirs = mapped(tmp_path / "out.db", tmp_path / "theirs", names, pair)
-    assert theirs.num_reg_images() == ours.num_reg_images() == len(names)
-    a, b = points_by_track(ours), points_by_track(theirs)
-    assert a.keys() == b.keys()
-    assert len(a) >= 80
-    assert all(np.array_equal(a[track], b[track]) for track in a)
+    own = small_run / "colmap/database.db"
+    ours = points_by_track(mapped(own, tmp_path / "ours", names, pair))
+    assert len(ours) >= 80
+    for schema in ("3.8", "3.13"):
+        copy_database(own, tmp_path / f"{schema}.db", schema)
+        model = mapped(tmp_path / f"{schema}.db", tmp_path / schema, names, pair)
+        assert model.num_reg_images() == len(names)
+        theirs = points_by_track(model)
+        assert theirs.keys() == ours.keys()
+        assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
 def test_native_colmap_maps_the_export(small_run, tmp_path):
@@ -567,16 +568,6 @@ def test_the_command_says_what_it_wrote(stcal_sfm, small_run, tmp_path):
     assert out.splitlines()[0] == "schema 3.8, checked: 8 images, 28 pairs, camera model OPENCV"
     assert str(tmp_path / "out.db") in out.splitlines()[1]
     assert state_of(small_run) == before
-    code, _, err = stcal_sfm("export-database", small_run, tmp_path / "out.db", "--schema", "3.8")
-    assert code == 2
-    assert err.startswith("error: ")
-    assert err.count("\n") == 1
-
-
-def test_the_command_wants_a_run(stcal_sfm, database, tmp_path):
-    code, _, err = stcal_sfm("export-database", database.parent, tmp_path / "out.db", "--schema", "3.8")
-    assert (code, err.count("\n")) == (2, 1)
-    assert "not a run's folder (no .stcal/run.json); give the --out of a finished run" in err
 
 
 def test_differences_are_told_column_by_column():

@@ -11,8 +11,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.board_alone import _is_symmetry, _numbered
 from stcal.sfm.detect.sightings import PlaneView
+from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet
-from tests.sfm.runs.test_bad_input import COMPUTATION, INPUT, blacken
+from tests.sfm.runs.test_bad_input import blacken
 from tests.shared import own_copy
 
 BOARD = reference_board()
@@ -64,7 +65,8 @@ def test_a_target_in_view_is_asked_for(small_set, small_scene, stcal_sfm):
     path.write_text(target_toml(replace(small_scene.target, polarity="dark")), encoding="utf-8")
     code, _, error = stcal_sfm(*small.arguments("--target", path))
     assert code == COMPUTATION
-    assert "no face of the target recognised" in error
+    assert "group 12: no face of the target recognised in 4 images" in error
+    assert "polarity" in error
     assert "use --board-only" in error
     code, text, _ = stcal_sfm(*small.arguments("--target", path, "--board-only", "--no-strict"))
     assert code == 0

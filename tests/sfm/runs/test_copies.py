@@ -8,7 +8,7 @@ import pytest
 
 from stcal.io.images import ImageFile, same_photograph
 from stcal.sfm.detect.files import _same_pixels
-from tests.sfm.conftest import SMALL
+from tests.conftest import SMALL
 
 pytestmark = pytest.mark.usefixtures("no_page")
 NOISE = 2.5

@@ -34,6 +34,7 @@ def test_the_reference_target_is_said_and_named_in_an_error(stcal_sfm, two_image
     assert TARGET_ASSUMED in out
     assert "reference board" not in out + err
     assert "no board recognised in 2 images" in err
+    assert "rows, columns" in err
     assert err.rstrip().endswith(TARGET_ASSUMED)
 
 

@@ -4,6 +4,8 @@ import shutil
 
 import pytest
 
+from tests.outcome import INPUT, assert_error
+
 pytestmark = pytest.mark.usefixtures("no_page")
 
 
@@ -37,9 +39,9 @@ def test_one_image_beside_the_folders_gets_its_own_advice(stcal_sfm, small_set):
 
 def test_the_parent_of_the_images_is_told_from_them(stcal_sfm, small_set):
     small = small_set("12", detected=False)
-    code, _, err = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.out)
-    assert code == 2
-    assert f"did you mean {small.images}?" in err
+    outcome = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.out)
+    parts = ("images lie in <group>/ directly", f"did you mean {small.images}?")
+    assert_error(outcome, INPUT, "E-IMAGES-NONE", *parts)
     small.image(0).rename(small.images / "stray.jpg")  # one image is found, and the others are deeper
     code, _, err = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.out, "--workers", 1)
     assert code == 3

@@ -7,9 +7,9 @@ import pytest
 
 from stcal import sfm, synthetic
 from stcal.synthetic.dataset import write_dataset
+from tests.conftest import SMALL
 from tests.levels import SLOW
 from tests.outcome import fails_with
-from tests.sfm.conftest import SMALL
 
 
 @pytest.fixture

@@ -36,6 +36,10 @@ def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatc
     assert (own / "report.html").read_bytes() == (small_run / "report.html").read_bytes()
     assert (own / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
     assert verify(own).notes() == []
+    with added_results(own) as stage:
+        (stage / "report.html").write_text("another")
+    assert not (own / "report.pdf").exists()  # it was made of the page before
+    assert verify(own).notes() == []
 
 
 def test_files_that_the_run_did_not_leave_so_are_said(own, stcal_sfm):
@@ -45,16 +49,6 @@ def test_files_that_the_run_did_not_leave_so_are_said(own, stcal_sfm):
     code, out, _ = stcal_sfm("report", own)
     assert code == 0
     assert out.startswith("note: the run's folder is not as the run left it: 1 changed (labels.csv)\n")
-
-
-@pytest.mark.slow
-def test_a_pdf_goes_with_the_page_that_it_was_made_of(own, stcal_sfm, monkeypatch):
-    monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")
-    assert stcal_sfm("report", own, "--pdf")[0] == 0
-    with added_results(own) as stage:
-        (stage / "report.html").write_text("another")
-    assert not (own / "report.pdf").exists()
-    assert verify(own).notes() == []
 
 
 @pytest.mark.slow

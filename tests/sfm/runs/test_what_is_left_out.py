@@ -25,14 +25,6 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 pytestmark = pytest.mark.usefixtures("no_page")
 
 
-def pair(small_set):
-    """A group of two images."""
-    small = small_set("12")
-    for i in (2, 3):
-        small.image(i).unlink()
-    return small
-
-
 def calibrate(folder, out, **options):
     """Chained: what is left out, and what is kept, is seen before faces are adjusted together."""
     data = [folder / name for name in ("images", "cameras.txt")]
@@ -92,20 +84,6 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     task = Task(find_images(folder / "images"), own, target, board, coarse, lambda *_: None)
     detection, _ = labelled_images(task, read_camera(folder / "cameras.txt"))
     assert not any(image.reused for image in detection.images)
-
-
-@pytest.mark.slow
-def test_a_damaged_cache_is_made_anew(small_set):
-    small = pair(small_set)
-    first = calibrate(small.folder, small.out)
-    assert all(image.reused for image in first.detection.images)
-    for path in (small.out / ".stcal/cache").iterdir():
-        path.write_bytes(path.read_bytes()[:-200])
-    again = calibrate(small.folder, small.out)
-    assert not any(image.reused for image in again.detection.images)
-    np.testing.assert_array_equal(
-        first.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
-    )
 
 
 def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):
