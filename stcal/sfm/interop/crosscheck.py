@@ -168,11 +168,8 @@ def _require_enough(group: str, pair: tuple[int, int], ids: dict[str, int], run:
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
-    """Returns our thresholds as options of the native mapper.
-
-    These are all of its ``Mapper.*`` options that pycolmap has, except negative values, with which newer versions ask
-    for an automatic choice.
-    """
+    """Returns our thresholds as options of the native mapper: all of pycolmap's except negative values, which newer
+    versions take as a request for an automatic choice."""
     options = pipeline_options(names, pair)
     chosen = {}
     for name in sorted(native.mapper_options):
@@ -350,10 +347,7 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
 
 
 def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, float]:
-    """Returns the differences of the cameras relative to the circles of their group, in σ of the cameras.
-
-    The two models of a group are aligned by all of their circles, which is the datum of the covariances.
-    """
+    """Differences of the cameras in their σ, relative to the circles of their group, the covariances' datum."""
     factors = run.sigma_factors()
     model_of_group = {model.group: model for model in b.models}
     sigmas = {}

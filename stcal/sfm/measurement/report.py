@@ -233,11 +233,7 @@ def _image_json(each: MeasuredImage) -> dict:
 
 
 def _printed(result: MeasureResult, every: bool) -> list[str]:
-    """Returns the table for the terminal, 80 columns wide for names of eight characters.
-
-    σ are the largest of three axes, n counts circles. Of more than :data:`MOST_LISTED` images, those are listed that
-    need a look, with the median and worst figures of all, unless ``every`` image is wanted.
-    """
+    """Returns the table for the terminal; of more than :data:`MOST_LISTED` images those that need a look."""
     every = every or len(result.images) <= MOST_LISTED
     doubtful = [image for image in result.images if not _sound(image)]
     images = result.images if every else doubtful[:MOST_LISTED]

@@ -27,28 +27,18 @@ SAME_RADIUS_MM = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TargetCircles(Brief):
-    """The c circles of a calibrated target, target frame, mm.
-
-    ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) joint covariance of all centres,
-    mm², zero if unknown; ``sigma_factor`` : factor on the centres' own σ, as estimated by the run; ``notes`` : what the
-    covariance lacks; ``design`` : design for detection in images, None if images are not searched. Computed from these:
-    ``normal`` : (c, 3) normal of the plane of each circle's face; ``target_from_plane`` : by face, with the origin of
-    the plane at the mean of its circles; ``place`` : index by label.
-
-    Raises DegenerateError if the circles of a face lie in line. Raises InputError: if an array has a wrong shape, a
-    number is out of range, a label occurs twice, or a covariance is invalid.
-    """
+    """The c circles of a calibrated target, target frame, mm."""
 
     labels: tuple[CircleLabel, ...]
-    xyz: np.ndarray
-    radius: np.ndarray
-    covariance: np.ndarray
-    sigma_factor: float = 1.0
-    notes: tuple[str, ...] = ()
-    design: TargetDesign | None = None
-    normal: np.ndarray = field(init=False)
-    target_from_plane: dict[str, Rigid] = field(init=False)
-    place: dict[CircleLabel, int] = field(init=False)
+    xyz: np.ndarray  # (c, 3)
+    radius: np.ndarray  # (c,)
+    covariance: np.ndarray  # (3c, 3c) of all centres, mm², zero if unknown
+    sigma_factor: float = 1.0  # on the centres' own σ, as estimated by the run
+    notes: tuple[str, ...] = ()  # what the covariance lacks
+    design: TargetDesign | None = None  # None if images are not searched
+    normal: np.ndarray = field(init=False)  # (c, 3) of the plane of each circle's face
+    target_from_plane: dict[str, Rigid] = field(init=False)  # with the mean of its circles as origin
+    place: dict[CircleLabel, int] = field(init=False)  # index by label
 
     def __post_init__(self):
         object.__setattr__(self, "labels", circle_labels(self.labels))

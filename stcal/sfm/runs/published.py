@@ -24,24 +24,15 @@ STEPS = ("centres of blurred edges", "eccentricity", "weights", "joint adjustmen
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Result of one method.
-
-    ``target`` ; ``models`` : models without unit that it rests on, one per group; ``scales`` : by group.
-    """
+    """Result of one method."""
 
     target: CalibratedTarget
-    models: tuple[WorldModel, ...]
-    scales: dict[str, Scale]
+    models: tuple[WorldModel, ...]  # without unit, one per group
+    scales: dict[str, Scale]  # by group
 
 
 def require_comparable(options: AdjustOptions) -> None:
-    """Refuses to compare a run that is itself a part of the published method.
-
-    Raises
-    ------
-    InputError
-        The solve is not the joint adjustment with eccentricity.
-    """
+    """Refuses to compare a run that is itself a part of the published method."""
     if options.solve != "joint" or not options.eccentricity:
         raise InputError(
             "E-OPTION-CONFLICT",
@@ -51,20 +42,8 @@ def require_comparable(options: AdjustOptions) -> None:
 
 
 def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
-    """Compares faces, board and residuals of the published method, and of each step of this package added in turn.
-
-    Parameters
-    ----------
-    result
-        Result of the joint adjustment.
-    published
-        Result of ``--solve paper`` on the same photographs, or the error that prevents it.
-
-    Returns
-    -------
-    Comparison
-        Poses as three-point frames, against those of ``result``'s circles.
-    """
+    """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
+    three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
     whole = _jointly(result)
     steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
@@ -81,10 +60,7 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
 
 
 def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
-    """Returns the answers from the run's own circles after each added step, without the joint adjustment.
-
-    Keys are the steps added last. If a step has no answer, the value is its error.
-    """
+    """Answers, or errors, from the run's own circles by the step added last, without the joint adjustment."""
     equal_models = [_alike(solution.model) for solution in result.solutions]
     weighted_models = [solution.model for solution in result.solutions]
     answers: dict[str, Answer | StcalError] = {}

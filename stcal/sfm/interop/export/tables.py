@@ -50,11 +50,8 @@ def table(content: Content) -> str:
 
 
 def opencv(content: Content) -> str:
-    """Returns YAML for ``cv2.FileStorage``, mm and rad.
-
-    It has a list of faces, each with its 4×4 pose, covariance, names of circles, centres (n, 3), radii and the
-    covariances (n, 9) of the centres.
-    """
+    """Returns YAML for ``cv2.FileStorage``, mm and rad: by face the 4×4 pose, covariance, and names, centres, radii and
+    covariances of circles."""
     lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
     lines += [
         f"reference_face: {_quoted(content.run.faces.reference_face)}",
@@ -107,10 +104,7 @@ def urdf(content: Content) -> str:
 
 
 def xacro(content: Content) -> str:
-    """Returns the same as a macro with ``prefix``, ``parent`` and ``origin``.
-
-    It places the target anywhere, and more than once.
-    """
+    """Macro with ``prefix``, ``parent`` and ``origin``, which places the target anywhere, and more than once."""
 
     def prefixed(name: str) -> str:
         return "${prefix}" + _escaped(name)
