@@ -20,13 +20,7 @@ from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinabl
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
-from stcal.io.images import (
-    TOP_GROUP,
-    ImageFile,
-    ImageFiles,
-    chosen_images,
-    require_common_size,
-)
+from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, require_common_size
 from stcal.io.photographs.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread
@@ -241,7 +235,8 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
     if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
         _require_seen(task, labelled)
     with overlays_beside(detection, labelled, target, task.folder, task.progress) as left_out:
-        if is_board_assumed and not options.board_only and not _shows_dots(labelled):
+        shows_dots = any(isinstance(label, DotLabel) for image in labelled for label in image.observations.labels)
+        if is_board_assumed and not options.board_only and not shows_dots:
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
             task = replace(task, target=target, board=scale_reference(None, target))
         result = _solved(task, detection, labelled, model)
@@ -463,10 +458,6 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
             *unseen_circles(solutions, target),
         ),
     )
-
-
-def _shows_dots(labelled: Sequence[LabelledImage]) -> bool:
-    return any(isinstance(label, DotLabel) for image in labelled for label in image.observations.labels)
 
 
 def as_one_group(labelled: Sequence[LabelledImage]) -> list[LabelledImage]:

@@ -149,8 +149,7 @@ def without_cameras(
     root = np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None]
     by_intrinsics = np.zeros((*by_pose.shape[:2], 0))
     if basis.shape[1]:
-        xyz = model.xyz_camera()
-        by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis
+        by_intrinsics = model.by_parameters(camera) @ basis
     a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_intrinsics))
     equations = equations_of_poses(model, a, c, e, residual * root)
     cameras = reduce(equations.block, equations.block_right, equations.cross)
@@ -164,8 +163,7 @@ def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.nda
     rows = np.zeros((n, 2, 3 * p + basis.shape[1]))
     columns = 3 * model.point_index[:, None] + np.arange(3)
     rows[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = model.whiten(by_point)
-    xyz = model.xyz_camera()
-    rows[:, :, 3 * p :] = model.whiten(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis)
+    rows[:, :, 3 * p :] = model.whiten(model.by_parameters(camera) @ basis)
     across = np.linalg.qr(model.whiten(by_pose).reshape(2 * n, 6), mode="complete")[0][:, 6:]
     return across.T @ rows.reshape(2 * n, -1)
 
@@ -495,8 +493,8 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
     index = 6 * np.arange(m)[:, None] + np.arange(6)
     local[index[:, :, None], index[:, None]] = cameras
     if q:
-        xyz, last = model.xyz_camera(), slice(6 * m + 6, width)
-        by_intrinsics = model.whiten(shared.camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ shared.basis)
+        last = slice(6 * m + 6, width)
+        by_intrinsics = model.whiten(model.by_parameters(shared.camera) @ shared.basis)
         np.add.at(cross[:, :, last], model.point_index, np.swapaxes(by_point, 1, 2) @ by_intrinsics)
         coupled = np.zeros((m, 6, q))
         np.add.at(coupled, model.image_index, np.swapaxes(by_pose, 1, 2) @ by_intrinsics)

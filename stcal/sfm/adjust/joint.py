@@ -113,11 +113,9 @@ class Adjusted:
         return _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
 
 
-def adjust_jointly(
-    models: Sequence[MetricModel], board: BoardDesign, camera: Camera, flatness_mm: float | None = None
-) -> JointResult:
+def adjust_jointly(models: Sequence[MetricModel], board: BoardDesign, camera: Camera) -> JointResult:
     """Returns the result of :func:`adjusted` with the covariances at its minimum."""
-    return adjusted(models, board, camera, flatness_mm).result()
+    return adjusted(models, board, camera).result()
 
 
 def adjusted(

@@ -74,8 +74,7 @@ class Network:
         return self.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
 
     def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the equations (q, q), (q,) of parameters of the group by the derivatives ``columns`` (n, 2, q) over
-        σ."""
+        """Equations (q, q), (q,) of parameters of the group by the derivatives ``columns`` (n, 2, q) over σ."""
         normal, right, to_points = self._by_image(columns)
         coupled = to_points.sum(0)
         weighted = coupled @ self.covariance_mm2
@@ -103,7 +102,7 @@ class Network:
         return np.eye(2 * k) - eliminated @ by_pose.T - weighted @ coupled.T, right - weighted @ self.point_right
 
     def _by_image(self, e: np.ndarray):
-        """By image, without its pose: normal (m, q, q), right-hand side (m, q), coupling to points (m, q, 3p)."""
+        """Returns by image, without its pose: normal (m, q, q), right side (m, q), coupling to points (m, q, 3p)."""
         model = self.model
         m, q, p = len(model.images), e.shape[2], len(model.labels)
         normal, by_pose, right = np.empty((m, q, q)), np.empty((m, q, 6)), np.empty((m, q))

@@ -157,11 +157,7 @@ class Refined:
 
 
 def refine(
-    model: WorldModel,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    eccentricity: bool = True,
+    model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign, eccentricity: bool = True
 ) -> Refined:
     """Alternates between the eccentricity of the circles and bundle adjustment until the corrections settle."""
     radius = target.radius_of() | board.radius_of()

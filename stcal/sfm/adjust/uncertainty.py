@@ -24,13 +24,7 @@ from stcal.sfm.adjust.equations import (
     robust_weights,
     shapes,
 )
-from stcal.sfm.adjust.faces import (
-    FrameKind,
-    face_frames,
-    missing_frame_circles,
-    placement_sigma_mm,
-    with_unmapped,
-)
+from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
 from stcal.sfm.adjust.joint import Adjusted, JointResult
 from stcal.sfm.adjust.refine import projection_jacobians
 
@@ -367,8 +361,7 @@ class _Answer:
                 batch = indices[begin : begin + AT_ONCE]
                 batch_model = model.observed(batch)
                 by_pose, by_point = projection_jacobians(batch_model, camera)
-                xyz = batch_model.xyz_camera()
-                lens = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
+                lens = batch_model.by_parameters(camera)
                 rows = by_pose @ self.cameras[batch_model.image_index] + by_point @ self.points[batch_model.point_index]
                 rows = rows + (lens @ shared.basis) @ self.intrinsics
                 whitened = (batch_model.whiten(array) * root[batch] for array in (rows, lens))

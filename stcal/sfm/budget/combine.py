@@ -145,10 +145,7 @@ def budget(
     more: tuple[Source, ...] = (),
     camera_given: bool = True,
 ) -> Budget:
-    """Returns the budget of an adjustment. Arguments are as in :func:`stcal.sfm.budget.sources.sources_of`.
-
-    ``more`` : further rows.
-    """
+    """Returns the budget of an adjustment, as :func:`stcal.sfm.budget.sources.sources_of`; ``more``: further rows."""
     sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
     if own.circles_designed.shape[2]:
         sources += (_placed(own),)

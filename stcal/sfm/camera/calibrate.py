@@ -129,9 +129,11 @@ def calibrate_camera(
     settled = of_perspective = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
-            detection = _detect(
-                files, camera, colmap_model, target, board, ellipses, Path(cache), workers, progress, rounds
-            )
+            # No size is given: it comes from most of the images, and messages should say so.
+            lens = camera.focal, camera.centre, camera.distortion
+            model = CameraModel(*lens, colmap_model, None, None, "the images")
+            step, options = counted(progress, f"detect {rounds}", len(files)), ellipses or EllipseOptions()
+            detection = detect_files(files, model, target, board, options, Path(cache), workers, step, pictures=False)
             try:
                 views, skipped, result = _of_one_round(
                     files, not_images, detection, board, camera, colmap_model, before is None
@@ -240,15 +242,6 @@ def judged(
         of_held_out = None
         warnings.append(f"no views could be held out, as the others alone are too few: {error}")
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, of_held_out, tuple(warnings))
-
-
-def _detect(
-    files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, progress, rounds: int
-) -> DetectionResult:
-    # No size is given: it comes from most of the images, and messages should say so.
-    model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
-    step = counted(progress, f"detect {rounds}", len(files))
-    return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step, pictures=False)
 
 
 def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:

@@ -197,9 +197,9 @@ def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
     block, block_right, cross = [], [], []
     for i in rows:
         model, k = state.models[i], state.camera_of[i]
-        camera, xyz = state.cameras[k], model.xyz_camera()
+        camera = state.cameras[k]
         by_pose, by_point = projection_jacobians(model, camera)
-        by_kept = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ setting.basis[k]
+        by_kept = model.by_parameters(camera) @ setting.basis[k]
         root = np.sqrt(robust_weights(model, camera, setting.huber))[:, None]
         a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_kept))
         equations = equations_of_poses(model, a, c, e, normalised(model, camera) * root)

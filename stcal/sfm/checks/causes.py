@@ -252,7 +252,7 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     removed = -camera.parameters()[:, None] * (np.arange(len(unit)) > 3)[:, None]
 
     def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
-        return lambda network: network.model.whiten(_by_parameters(network, camera) @ direction)
+        return lambda network: network.model.whiten(network.model.by_parameters(camera) @ direction)
 
     def of_file(name: str, remedy: str, size: Size, direction: np.ndarray, whole: bool = False) -> _Cause:
         return _Cause(name, remedy, size, by(direction), whole=whole, direction=direction)
@@ -333,11 +333,6 @@ def _turned(camera: Camera, quarters: int) -> np.ndarray:
         parameters[12:16] = s3, s4, -s1, -s2
         size = size[::-1]
     return parameters
-
-
-def _by_parameters(network: Network, camera: Camera) -> np.ndarray:
-    xyz = network.model.xyz_camera()
-    return camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
 
 
 def _by_row(network: Network) -> np.ndarray:

@@ -71,7 +71,8 @@ def camera_check(
     else:
         tested = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
         tested = "THIN_PRISM_FISHEYE" if camera.fisheye else tested
-        normal, right = summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
+        basis, found = intrinsic_basis(tested), calibration.camera
+        normal, right = summed(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
         test = solve_score(normal, right)
         estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(tested)
     redundancy = sum(n.redundancy.sum() for n in networks)
@@ -89,12 +90,6 @@ def camera_check(
 def _names(colmap_model: str) -> list[str]:
     basis = intrinsic_basis(colmap_model)
     return [PARAMETER_NAMES[i] for i in basis.argmax(0)]
-
-
-def _by_intrinsics(network: Network, camera: Camera, colmap_model: str) -> np.ndarray:
-    xyz = network.model.xyz_camera()
-    by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ intrinsic_basis(colmap_model)
-    return network.model.whiten(by_intrinsics)
 
 
 def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -357,7 +352,8 @@ def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]
     count = Counter(o.image for o in outliers)
     found = []
     for network in networks:
-        names = [*network.model.images, *(n for n in count if _of_group(n, network) and n not in network.model.images)]
+        of_group = [name for name in count if name.rpartition("/")[0] == network.model.group]
+        names = list(dict.fromkeys([*network.model.images, *of_group]))
 
         def worst(out: Collection[int], names: list[str] = names) -> int | None:
             many = [i for i, name in enumerate(names) if i not in out and count[name] >= MANY]
@@ -366,10 +362,6 @@ def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]
         if worst(()) is not None:
             found.append(culprits(names, worst, f"group {network.model.group}"))
     return found
-
-
-def _of_group(image: str, network: Network) -> bool:
-    return image.rpartition("/")[0] == network.model.group
 
 
 def _trials(networks: Sequence[Network]) -> list[Trial]:

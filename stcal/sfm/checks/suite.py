@@ -18,14 +18,7 @@ from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.checks.board import KINDS, board_checks, measure_radii, pitch_check, radius_checks, rim_check
 from stcal.sfm.checks.causes import whole_set_cause
-from stcal.sfm.checks.faces import (
-    Again,
-    agreement_check,
-    flatness_check,
-    groups_check,
-    halves_check,
-    loops_check,
-)
+from stcal.sfm.checks.faces import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
 from stcal.sfm.checks.images import (
     camera_check,
     evenness_check,
@@ -110,12 +103,6 @@ def _before_circles_mm(evidence: Evidence, rims: Mapping[str, Rim], check: Check
     return {k: rims[kind].height_mm if kind in found else stated.get(k, 0.0) for k, kind in of_label.items()}
 
 
-def _bend(evidence: Evidence) -> tuple[set[str], float]:
-    """Returns the faces of known shape, and the factor on the flatness of these."""
-    joint = evidence.calibration.joint
-    return {face.id for face in faces_of_known_shape(evidence.board)}, 1.0 if joint is None else joint.bend_factor
-
-
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
     """Returns all checks in the order of the report, the cause of the whole set before them if one failed."""
     networks, calibration = evidence.networks(), evidence.calibration
@@ -124,6 +111,8 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     of_rims = rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
     before_mm = _before_circles_mm(evidence, rims, of_rims)
     radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
+    joint, known_faces = calibration.joint, {face.id for face in faces_of_known_shape(board)}
+    factors = (1.0, 1.0) if joint is None else (joint.print_factor, joint.bend_factor)
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior, evidence.camera_given),
         lambda: field_check(networks, camera),
@@ -138,13 +127,11 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
         lambda: radius_checks(radii),
         lambda: of_rims,
-        lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
+        lambda: flatness_check(networks, evidence.options.flatness_mm, known_faces, factors[1]),
         lambda: control_check(evidence, networks),
     )
     if isinstance(board, ScaleReference):  # the target tells its size itself
-        joint = calibration.joint
-        factor = 1.0 if joint is None else joint.print_factor
-        makers += (lambda: scales_check(networks, board, factor),)
+        makers += (lambda: scales_check(networks, board, factors[0]),)
     step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
     checks: list[Check] = []
     for make in makers:

@@ -206,6 +206,11 @@ class GroupModel:
         xyz = self.xyz_model[self.point_index]
         return np.einsum("nij,nj->ni", rotation[self.image_index], xyz) + translation[self.image_index]
 
+    def by_parameters(self, camera: Camera) -> np.ndarray:
+        """Returns the derivatives of the projections (px) by the camera's parameters, (n, 2, 16)."""
+        xyz = self.xyz_camera()
+        return camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
+
     def residuals_px(self, camera: Camera) -> np.ndarray:
         """Returns the residuals, corrected minus projected, (n, 2)."""
         return self.corrected_px() - camera.project(self.xyz_camera())

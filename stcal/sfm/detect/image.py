@@ -106,7 +106,7 @@ def _outside(ellipses: Ellipses, polygon: np.ndarray | None) -> Ellipses:
 def detect_target(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
-    """Is :func:`detect_image`, with the dots of the board only set aside: they take half of the time."""
+    """Does as :func:`detect_image`, but only sets the dots of the board aside: they take half of the time."""
     return detect_image(image, camera, target, board, options, dots=False)
 
 

@@ -282,7 +282,7 @@ def _label_circles(
 
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
-    """Is :func:`label_images` without a second look."""
+    """Labels all images as :func:`label_images`, without a second look."""
     groups = [named for _, named in _groups(detection)]
     focal_px = float(np.sqrt(detection.camera.focal.prod()))
     return [each for found, _ in label_groups(groups, target, board, focal_px) for each in found]
@@ -381,12 +381,7 @@ def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
 
 
 def _labelled(
-    name: str,
-    group: str,
-    detection: ImageDetection,
-    readings: list[Readings],
-    arrangement: Arrangement,
-    image: int,
+    name: str, group: str, detection: ImageDetection, readings: list[Readings], arrangement: Arrangement, image: int
 ) -> LabelledImage:
     if detection.mirrored:
         note = (

@@ -24,13 +24,7 @@ from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
-from stcal.sfm.mapping.models import (
-    ReadModel,
-    find_models,
-    open_model,
-    read_model,
-    write_reconstruction,
-)
+from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judged
 from stcal.sfm.runs.crosscheck import (
     CameraDifference,
@@ -136,7 +130,8 @@ def _compared(
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
             names = [image.name for image in group]
-            pair = _initial_pair(run, name, ids)
+            chosen = next(row for row in run.report["groups"] if row["name"] == name)["pairs"][0]
+            pair = ids[chosen["first"]], ids[chosen["second"]]
             work = folder / f"group{index}"
             options = mapper_options(native, names, pair)
             _require_enough(name, pair, ids, run)
@@ -182,11 +177,6 @@ def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]
                 chosen[name] = str(int(setting)) if isinstance(setting, bool) else repr(setting)
     seed = next((o for o in ("random_seed", "default_random_seed") if o in native.mapper_options), None)
     return chosen | ({seed: str(options.random_seed)} if seed else {})
-
-
-def _initial_pair(run: SavedRun, group: str, ids: dict[str, int]) -> tuple[int, int]:
-    pair = next(row for row in run.report["groups"] if row["name"] == group)["pairs"][0]
-    return ids[pair["first"]], ids[pair["second"]]
 
 
 def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun, ids) -> tuple[Path, ReadModel]:

@@ -47,7 +47,8 @@ def require_whole(database: Path, copy: sqlite3.Connection) -> None:
 
 
 def _faults(copy: sqlite3.Connection) -> Iterator[str]:
-    yield from _faulty_references(copy)
+    for table, row, parent, _ in copy.execute("PRAGMA foreign_key_check"):
+        yield f"row {row} of {table} refers to one that is not in {parent}"
     for image, name in copy.execute("SELECT image_id, name FROM images"):
         fault = name_fault(name) if isinstance(name, str) else "not a text"
         if fault:
@@ -70,11 +71,6 @@ def _faults(copy: sqlite3.Connection) -> Iterator[str]:
                 if _size(blob) != REAL * numbers:
                     yield f"{table} {row}: {column} of {_told(blob)}, {REAL * numbers} bytes or none needed"
     yield from _faulty_pairs(copy)
-
-
-def _faulty_references(copy: sqlite3.Connection) -> Iterator[str]:
-    for table, row, parent, _ in copy.execute("PRAGMA foreign_key_check"):
-        yield f"row {row} of {table} refers to one that is not in {parent}"
 
 
 def _faulty_matrices(copy: sqlite3.Connection, table: str, width: int, allowed: Sequence[int] | None) -> Iterator[str]:

@@ -491,7 +491,7 @@ def _minimum(body: Body, used: Corners, basis, prior, given: Camera, huber: floa
 
 
 def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:
-    """Body_from_face by the view that fits all corners of the face best, or as before where none fits better."""
+    """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
     rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
     i = body.camera_from_body
     for face in np.flatnonzero(body.placed_faces)[1:]:

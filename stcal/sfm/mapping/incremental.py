@@ -25,11 +25,7 @@ MIN_RAY_ANGLE_RAD = np.radians(0.5)
 
 def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, max_error_px: float) -> WorldModel:
     """Returns the model with all images of the group that its points can resect, and with the circles that these add.
-
-    An image is placed if at least six of its labelled points, and at least a quarter of those that the model contains,
-    fit within ``max_error_px`` (RANSAC and refinement of pycolmap on ideal coordinates). Circles that the model lacks
-    are then triangulated from all placed images. All observations of placed images are used.
-    """
+    An image needs six labelled points, and a quarter of the model's, that fit within ``max_error_px``."""
     xyz = dict(zip(model.labels, model.xyz_model, strict=True))
     poses = dict(zip(model.images, model.camera_from_model, strict=True))
     for image in group:

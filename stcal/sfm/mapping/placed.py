@@ -87,11 +87,8 @@ def place_and_find_camera(
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
     _require_sizes(corners, first)
-    best: Body | None = None
-    for camera in cameras:
-        found = _with_focal_length(corners, camera)
-        if found is not None and (best is None or _better(found, best)):
-            best = found
+    bodies = [body for camera in cameras if (body := _with_focal_length(corners, camera)) is not None]
+    best = max(bodies, key=lambda body: (int(body.placed_images.sum()), -body.cost), default=None)
     if best is None:
         raise MappingError(
             "E-BODY-NO-CAMERA",
@@ -139,12 +136,6 @@ def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
         return body
     except (ConvergenceError, DegenerateError, np.linalg.LinAlgError):
         return None
-
-
-def _better(body: Body, other: Body) -> bool:
-    """Returns whether a body explains more images, or as many of them better."""
-    images = int(body.placed_images.sum()), int(other.placed_images.sum())
-    return images[0] > images[1] or (images[0] == images[1] and body.cost < other.cost)
 
 
 def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:

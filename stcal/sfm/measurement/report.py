@@ -13,17 +13,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells, require_pose_table_written
-from stcal.report.document import (
-    Block,
-    Document,
-    Printed,
-    Section,
-    alarms,
-    fold,
-    legend,
-    plot,
-    plots,
-)
+from stcal.report.document import Block, Document, Printed, Section, alarms, fold, legend, plot, plots
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, count_ticks, limits, round_below
 from stcal.report.text import number, text_table

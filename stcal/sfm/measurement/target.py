@@ -108,7 +108,10 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
     try:
         labels = circle_labels(faces.circles)
         xyz = np.array(list(faces.circles.values())).reshape(-1, 3)
-        xyz = xyz + _seen_in_front(faces, labels)
+        # Circles behind rims are seen half a rim in front of their luminous surface.
+        outward = {face: pose.rotation[:, 2] for face, pose in faces.poses().items()}
+        shifts = [0.5 * faces.rim_mm.get(label, 0.0) * outward.get(label.face, np.zeros(3)) for label in labels]
+        xyz = xyz + np.array(shifts).reshape(-1, 3)
         radius = np.array([faces.radius_mm[label] for label in labels])
         covariance, notes = _covariance(labels, _joint(faces, labels), faces.circle_covariance_mm2)
         if faces.centre_sigma_factor is None:
@@ -122,13 +125,6 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
         ) from error
     _require_design(target, design, path)
     return target
-
-
-def _seen_in_front(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray:
-    """Returns how far in front of their luminous surface circles behind rims are seen, (c, 3), mm."""
-    outward = {face: pose.rotation[:, 2] for face, pose in faces.poses().items()}
-    shifts = [0.5 * faces.rim_mm.get(label, 0.0) * outward.get(label.face, np.zeros(3)) for label in labels]
-    return np.array(shifts).reshape(-1, 3)
 
 
 def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:

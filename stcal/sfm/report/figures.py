@@ -85,10 +85,7 @@ LEAST_UPRIGHT = 0.5
 
 
 def upright(report: dict) -> dict:
-    """Returns the report with target, boards and cameras turned as they stood, if the photographs were taken upright.
-
-    Else the target's Z is up.
-    """
+    """Report with target, boards and cameras as they stood for upright photographs, else the target's Z up."""
     from scipy.spatial.transform import Rotation
 
     scene = report["scene"]
@@ -197,7 +194,8 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
     everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])
     depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
     for camera in scene["cameras"]:
-        path = _traced(frustum(camera, report["camera"], depth))
+        lines = frustum(camera, report["camera"], depth)
+        path = np.vstack([section for line in lines for section in (lines[0][:1], line)])  # back to the tip each time
         parts.append(_part("line", path, colours.get(camera["group"], INK), name=camera["image"], size=1.1))
     return parts
 
@@ -219,12 +217,6 @@ def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict
         middle = centres.mean(0) if len(centres) else origin
         parts.append(_part("text", [middle + 0.9 * reach * pose[:3, 2]], "#1c2733", name=name, target=True))
     return parts
-
-
-def _traced(lines: list[np.ndarray]) -> np.ndarray:
-    """Returns the pyramid's lines as one path from its tip, which goes back to the tip after each line."""
-    tip = lines[0][:1]
-    return np.vstack([section for line in lines for section in (tip, line)])
 
 
 def _part(kind: str, xyz, colour: str, **more) -> dict:
@@ -263,14 +255,7 @@ class Photographs:
 
 
 def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> Photographs:
-    """Returns all photographs that the page shows, with vectors on one scale.
-
-    Parameters
-    ----------
-    report : content of ``report.json``
-    overlays : JPEG by image name
-    residuals : by image name
-    """
+    """Returns all photographs that the page shows, with vectors on one scale."""
     width, height = report["camera"]["size_px"]
     mapped = {row["image"]: row for row in report["residuals_by_image"]}
     lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])

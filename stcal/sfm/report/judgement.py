@@ -115,14 +115,14 @@ def judged(report: dict) -> dict:
 def judgement_of(report: dict) -> Judgement:
     """Returns the judgement of a run from the content of ``report.json``."""
     verdict, use = _use(report)
-    failed = any(check["verdict"] == "failed" for check in report.get("checks", []))
+    failed = [check["key"] for check in report.get("checks", []) if check["verdict"] == "failed"]
     lost = None if failed else _by_lost_group(report)  # what is only suspicious comes after it
     by_result = _control(report) or lost or _by_checks(report) or _by_gaps(report)
     cause = by_result or _by_drawing(report) or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
-    invalid = _invalid(report)
+    invalid = invalidated(failed)
     return Judgement(
         verdict=verdict,
         use=use,
@@ -136,11 +136,6 @@ def judgement_of(report: dict) -> Judgement:
         invalid=invalid,
         missing=[*_missing_faces(report), *_lost_groups(report)],
     )
-
-
-def _invalid(report: dict) -> list[str]:
-    """Returns what the failed checks do not let hold, each once."""
-    return invalidated(check["key"] for check in report.get("checks", []) if check["verdict"] == "failed")
 
 
 def invalidated(failed: Iterable[str]) -> list[str]:

@@ -44,10 +44,14 @@ def require_comparable(options: AdjustOptions) -> None:
 def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
     """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
     three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
-    whole = _jointly(result)
+    joint, scales = result.calibration.joint, result.calibration.scales
+    if joint is None:
+        raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
+    whole = calibrated_target(joint, result.target, result.target_design, "three-point")
     steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
-    rows.append(_last_row(f"+ {STEPS[-1]}", result))
+    rms = residual_rms_px(joint.models, result.calibration.camera)
+    rows.append(_compared(f"+ {STEPS[-1]}", {}, [], scales, rms, None))
     sigma = {
         face: SigmaRow(
             translation_um=MICRO * float(np.sqrt(np.trace(c[3:, 3:]))),
@@ -77,14 +81,6 @@ def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
 def answer_of(run: RunResult) -> Answer:
     """Returns the answer of a run, group by group."""
     return Answer(run.target, tuple(solution.model for solution in run.solutions), run.calibration.scales)
-
-
-def _jointly(result: RunResult) -> CalibratedTarget:
-    """Returns the run's own target with three-point frames."""
-    joint = result.calibration.joint
-    if joint is None:
-        raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
-    return calibrated_target(joint, result.target, result.target_design, "three-point")
 
 
 def _alike(model: WorldModel) -> WorldModel:
@@ -123,14 +119,6 @@ def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera:
             )
     missing = [face for face in others if face not in faces]
     return _compared(name, faces, missing, found.scales, residual_rms_px(found.models, camera), None)
-
-
-def _last_row(name: str, result: RunResult) -> ComparedRow:
-    """Returns the row of the run's own method, with the board's least-squares residuals in each group."""
-    joint = result.calibration.joint
-    models = () if joint is None else joint.models
-    rms = residual_rms_px(models, result.calibration.camera)
-    return _compared(name, {}, [], result.calibration.scales, rms, None)
 
 
 def residual_rms_px(models: Sequence[GroupModel], camera: Camera) -> float:

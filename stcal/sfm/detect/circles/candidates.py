@@ -128,7 +128,7 @@ class OutlineGates:
     longest: float
 
     def ellipse(self, contour: np.ndarray) -> tuple[float, ...] | None:
-        """Returns an outline's ellipse within the limits, (x, y, full axis 1, full axis 2, angle of axis 1 in deg)."""
+        """Returns an ellipse within the limits, (x, y, full axes 1 and 2, angle of axis 1 in deg), or None."""
         if not self.shortest <= len(contour) <= self.longest:
             return None
         x, y, w, h = cv2.boundingRect(contour)

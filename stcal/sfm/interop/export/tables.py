@@ -11,14 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.poses.programs import (
-    Static,
-    fixed_joint,
-    messages,
-    ros1_launch,
-    ros2_launch,
-    static_of_joint,
-)
+from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, ros2_launch, static_of_joint
 from stcal.io.toml import load_yaml, opencv_matrix
 from stcal.sfm.interop.export.content import Content
 
@@ -34,7 +27,8 @@ def table(content: Content) -> str:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     for face, pose in content.faces.items():
-        turned = [*_wxyz(pose.rotation), *pose.rotation[:, 2].tolist()]
+        x, y, z, w = Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True).tolist()
+        turned = [w, x, y, z, *pose.rotation[:, 2].tolist()]
         sigma = content.face_sigma(face)
         sigma_cells = (
             [""] * 6 if sigma is None else [_digits(v) for v in (*(1e3 * sigma[1]), *(1e3 * np.degrees(sigma[0])))]
@@ -73,11 +67,6 @@ def opencv(content: Content) -> str:
         matrix_lines = [line for name, values in matrices.items() for line in opencv_matrix(name, values)]
         lines.append(indent("\n".join(matrix_lines), "      "))
     return "\n".join(lines) + "\n"
-
-
-def _wxyz(rotation: np.ndarray) -> list[float]:
-    x, y, z, w = Rotation.from_matrix(np.array(rotation)).as_quat(canonical=True).tolist()
-    return [w, x, y, z]
 
 
 def _digits(value: float) -> str:
