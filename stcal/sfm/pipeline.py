@@ -20,13 +20,7 @@ from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinabl
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
-from stcal.io.images import (
-    TOP_GROUP,
-    ImageFile,
-    ImageFiles,
-    chosen_images,
-    require_common_size,
-)
+from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, require_common_size
 from stcal.io.photographs.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread
@@ -155,13 +149,7 @@ def run(
 
 
 def frames_in_run(video: str | Path, out: str | Path, every: str | int) -> Path:
-    """Writes the chosen frames of a video below the folder of a run, and returns their folder.
-
-    Raises
-    ------
-    InputError
-        The folder is not a run's; or as :func:`stcal.io.photographs.video.write_frames`.
-    """
+    """Writes the chosen frames of a video below the folder of a run, and returns their folder."""
     require_ours(Path(out))
     folder = frames_folder(out)
     write_frames(video, folder, every)
@@ -221,13 +209,7 @@ def run_on_files(
 
 
 def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
-    """Returns the checks of a caller's own on a result.
-
-    Raises
-    ------
-    InputError
-        A function returns no check, or one with the key of another.
-    """
+    """Returns the checks of a caller's own on a result; an error if one is none, or has the key of another."""
     checks: list[Check] = []
     for make in makers:
         check = make(result)
@@ -253,7 +235,8 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
     if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
         _require_seen(task, labelled)
     with overlays_beside(detection, labelled, target, task.folder, task.progress) as left_out:
-        if is_board_assumed and not options.board_only and not _shows_dots(labelled):
+        shows_dots = any(isinstance(label, DotLabel) for image in labelled for label in image.observations.labels)
+        if is_board_assumed and not options.board_only and not shows_dots:
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
             task = replace(task, target=target, board=scale_reference(None, target))
         result = _solved(task, detection, labelled, model)
@@ -285,8 +268,7 @@ def _with_found_camera(task: Task) -> tuple[DetectionResult, list[LabelledImage]
 
 
 def is_rough(model: CameraModel, options: RunOptions) -> bool:
-    """Returns whether a camera is too rough to map the groups with: one to be refined whose focal length is known less
-    well than the boards tell it, as that of EXIF."""
+    """Whether a camera is to be refined whose focal length, as of EXIF, is known less well than boards tell it."""
     return options.refine_camera and is_vague(model)
 
 
@@ -302,15 +284,8 @@ def _focal_sigma(model: CameraModel) -> float:
 
 
 def _camera_of_dots(task: Task, rough: CameraModel | None) -> CameraModel:
-    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens.
-
-    The adjustment of all groups estimates it again from the same dots, so that the σ of the calibration are not used.
-
-    Raises
-    ------
-    DetectionError, DegenerateError
-        Boards in too few images, or a lens that the boards do not tell.
-    """
+    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens: the adjustment
+    of all groups estimates it again from the same dots."""
     files = task.files[0]
     start = guessed_cameras(files)[0] if rough is None else rough.calibrated(*require_common_size(files)[0])
 
@@ -323,13 +298,7 @@ def _camera_of_dots(task: Task, rough: CameraModel | None) -> CameraModel:
 
 
 def _require_seen(task: Task, labelled: Sequence[LabelledImage]) -> None:
-    """Refuses images in which no printed face of the target is seen, and names the tags that are.
-
-    Raises
-    ------
-    DetectionError
-        No image shows one, and the target has some.
-    """
+    """Refuses images in which no printed face of the target is seen, and names the tags that are."""
     if unseen := _why_unseen(task, labelled):
         raise DetectionError("E-TARGET-UNSEEN", unseen)
 
@@ -343,8 +312,7 @@ def _why_unseen(task: Task, labelled: Sequence[LabelledImage]) -> str:
 
 
 def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
-    """Returns cameras at which the search for an unknown one begins: that of the EXIF of the first photograph that
-    states one, or one of medium focal length."""
+    """Returns where the search for a camera begins: at the first EXIF that states one, or a medium focal length."""
     (width, height), _ = require_common_size(list(files))
     for file in files:
         try:
@@ -358,10 +326,7 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
 
 def _camera_for_a_look(task: Task) -> tuple[CameraModel, bool]:
     """Returns the camera with which images are detected where none is given, and whether the dots of the board told it.
-
-    Where they do not, it is one of medium focal length without distortion: it moves no corner of a printed face and the
-    centres of circles a little, but far from the middle of a wide image faces may lose their names.
-    """
+    Else it is one of medium focal length: in a wide image faces far from the middle may lose their names."""
     if task.board.rows:
         with suppress(DetectionError, DegenerateError):
             return _camera_of_dots(task, None), True
@@ -369,13 +334,7 @@ def _camera_for_a_look(task: Task) -> tuple[CameraModel, bool]:
 
 
 def _require_for_printed(options: RunOptions) -> None:
-    """Refuses options that a target with boards or tags on its faces has no use for.
-
-    Raises
-    ------
-    InputError
-        One of them is given.
-    """
+    """Refuses options that a target with boards or tags on its faces has no use for."""
     given = {
         "--solve paper": options.solve == "paper",
         "--compare paper": options.compare is not None,
@@ -499,10 +458,6 @@ def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage
             *unseen_circles(solutions, target),
         ),
     )
-
-
-def _shows_dots(labelled: Sequence[LabelledImage]) -> bool:
-    return any(isinstance(label, DotLabel) for image in labelled for label in image.observations.labels)
 
 
 def as_one_group(labelled: Sequence[LabelledImage]) -> list[LabelledImage]:

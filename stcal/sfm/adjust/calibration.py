@@ -33,28 +33,14 @@ Solve = Literal["joint", "chain", "paper"]
 
 @dataclass(frozen=True, slots=True)
 class AdjustOptions:
-    """Options of the adjustment of models to a calibrated target, with every default decided.
+    """Options of the adjustment of models to a calibrated target, with every default decided."""
 
-    ``reference_face`` : id of the face whose frame is the target frame; ``solve`` : ``joint`` (one adjustment over all
-    groups), ``chain`` (group by group, weighted over all ways to a face) or ``paper`` (Zhang & Wei 2017: group by
-    group, λ by rows, faces by single transforms); ``frame`` : ``plane`` (Z from the plane of all circles of a face) or
-    ``three-point`` (as in the paper); ``eccentricity`` : whether it is corrected; ``flatness_mm`` : σ of a circle about
-    the plane of its face, None if it is unknown; ``refine_camera`` : adjust the intrinsics, with the given ones as
-    observations.
-
-    Raises
-    ------
-    InputError
-        A choice does not exist, σ is out of range, an option contradicts ``paper``, or intrinsics are to be refined
-        without the joint adjustment.
-    """
-
-    reference_face: str
-    solve: Solve = "joint"
-    frame: FrameKind = "plane"
+    reference_face: str  # whose frame is the target frame
+    solve: Solve = "joint"  # over all groups at once, chained over all ways, or as Zhang & Wei (2017)
+    frame: FrameKind = "plane"  # Z from the plane of all circles of a face, or as in the paper
     eccentricity: bool = True
-    flatness_mm: float | None = FLATNESS_MM
-    refine_camera: bool = False
+    flatness_mm: float | None = FLATNESS_MM  # σ of a circle about the plane of its face, None if it is unknown
+    refine_camera: bool = False  # with the given intrinsics as observations
 
     def __post_init__(self):
         require_fields(self, "options")
@@ -86,13 +72,12 @@ known to 13 %."""
 
 @dataclass(frozen=True, slots=True)
 class SigmaFactors:
-    """Ratios of the residuals of the single groups to the centres' own σ: of ``all``, and by kind (``circles`` of the
-    faces, ``dots`` of the board, ``printed`` corners of the faces ``printed_faces``)."""
+    """Ratios of the residuals of the single groups to the centres' own σ, in all and by kind."""
 
     all: float
     circles: float
     dots: float
-    printed: float = 1.0
+    printed: float = 1.0  # corners of the ``printed_faces``
     printed_faces: frozenset[str] = frozenset()
 
     @property
@@ -109,28 +94,20 @@ class SigmaFactors:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Calibration(Brief):
-    """The calibrated target, and what it rests on.
-
-    ``target`` : the result; ``scales`` : by group; ``faces`` : faces of the single groups; ``joint`` : joint adjustment
-    if it was requested; ``sigma_factors`` : ratios of the residuals of the single groups to the centres' own σ;
-    ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
-    ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
-    reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the
-    result is the luminous surface, empty if it is the visible outline; ``rim_sigma_mm`` : σ of all of them together;
-    ``circle_sigma_px`` : σ of the centres of the target's circles and corners in the joint adjustment, RMS per axis.
-    """
+    """The calibrated target, and what it rests on."""
 
     target: CalibratedTarget
-    scales: dict[str, Scale]
-    faces: tuple[FaceInGroup, ...]
+    scales: dict[str, Scale]  # by group
+    faces: tuple[FaceInGroup, ...]  # of the single groups
     joint: JointResult | None
     sigma_factors: SigmaFactors
-    models: tuple[MetricModel, ...]
-    camera: Camera
-    notes: tuple[str, ...]
+    models: tuple[MetricModel, ...]  # mm, target frame, without groups that are not linked to the result
+    camera: Camera  # as refined
+    notes: tuple[str, ...]  # faces without a frame and the reasons, and an adjustment that did not settle
+    # of circles whose luminous surface is the result; empty: the visible outline
     rim_mm: Mapping[CircleLabel, float] = field(default_factory=dict)
-    rim_sigma_mm: float = 0.0
-    circle_sigma_px: float | None = None
+    rim_sigma_mm: float = 0.0  # of all of them together
+    circle_sigma_px: float | None = None  # of the target's points in the joint adjustment, RMS per axis
 
 
 def calibrate(
@@ -201,15 +178,7 @@ def calibrate(
 def calibrate_board(
     models: Sequence[WorldModel], camera: Camera, board: BoardDesign, options: AdjustOptions
 ) -> Calibration:
-    """Returns the scale from models of the board alone: a target without faces, and the models in the board's frame.
-
-    Zhang & Wei (2017), §4.1.
-
-    Raises
-    ------
-    ScaleError
-        A group's board is not mapped.
-    """
+    """Returns the scale from models of the board alone, in its frame, without faces (Zhang & Wei 2017, §4.1)."""
     scales = {model.group: find_scale(model, board, options.solve == "paper") for model in models}
     return Calibration(
         target=CalibratedTarget(options.reference_face, {}, {}, {name: Rigid() for name in scales}),
@@ -230,15 +199,7 @@ def on_luminous_surface(
     target: TargetDesign,
     frame: FrameKind,
 ) -> Calibration:
-    """Returns the calibration with circles on their luminous surface, behind rims.
-
-    A circle behind a rim of height h is seen h/2 in front of its surface. ``sigma_mm`` : σ of all heights together.
-
-    Raises
-    ------
-    InputError
-        The calibration has no joint adjustment.
-    """
+    """Calibration with circles behind rims, which are seen half a height in front of their luminous surface."""
     joint = calibration.joint
     if joint is None:
         raise InputError("E-RIM-SOLVE", "rims are corrected by the joint adjustment alone; use --solve joint")
@@ -266,8 +227,7 @@ def rim_covariance_mm2(
 
 
 def _outward(joint: JointResult, target_from_face: Mapping[str, Rigid]) -> np.ndarray:
-    """Returns the outward normals of the circles' faces, (c, 3), in the frame of the adjustment; zero of faces without
-    a pose."""
+    """Outward normals of the circles' faces, (c, 3), in the frame of the adjustment; zero without a pose."""
     outward = np.zeros_like(joint.xyz_model)
     for face, pose in target_from_face.items():
         members = [i for i, label in enumerate(joint.labels) if label.face == face]
@@ -278,12 +238,8 @@ def _outward(joint: JointResult, target_from_face: Mapping[str, Rigid]) -> np.nd
 def _faces(
     models: Sequence[MetricModel], camera: Camera, target: TargetDesign, options: AdjustOptions
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Returns the frames of the faces in all groups, and notes.
-
-    Frame circles that a group does not map are placed by the other circles of the face: as other groups have them, or
-    as the design has them if no group maps all three. The joint adjustment starts from these places, and then takes the
-    circles from all groups.
-    """
+    """Returns the frames of the faces in all groups, and notes. Frame circles that a group lacks are placed by the
+    others, as other groups or the design have them; the joint adjustment starts from there."""
     results = [faces_of_group(model, camera, target, options.frame) for model in models]
     circles_by_face = _circles_of([face for group_faces, _ in results for face in group_faces])
     if any(notes for _, notes in results):
@@ -335,12 +291,8 @@ def _joint_rounds(options: AdjustOptions, prior: CameraPrior | None) -> int:
 def _adjust_all(
     models: list[MetricModel], factors: SigmaFactors, camera: Camera, target, board, options: AdjustOptions, prior, step
 ) -> tuple[Adjusted, SigmaFactors]:
-    """Runs the joint adjustments from the chained result; returns the state of the last one and the factors on the
-    centres' σ.
-
-    The eccentricity is computed again before each adjustment. With refined intrinsics, so are the factors, since a
-    wrong camera enlarges residuals.
-    """
+    """Runs joint adjustments; returns the last state and the factors on the centres' σ. Eccentricity, and for a refined
+    camera the factors, are computed again before each."""
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]
     rounds = _joint_rounds(options, prior)
@@ -362,13 +314,8 @@ def _adjust_all(
 
 
 def image_sigma_factors(models: Sequence[GroupModel], camera: Camera, printed: Iterable[str] = ()) -> SigmaFactors:
-    """Returns the ratios of the residuals of adjusted free networks to the centres' own σ: variance components by kind
-    (Förstner 1979).
-
-    ``printed`` : ids of printed faces, whose corners have their own factor. This factor and that of ``circles`` are at
-    least 1, as their σ include errors that do not show in residuals: the uncertainty of corrections of centres, and
-    errors of printed corners that all photographs share.
-    """
+    """Returns the ratios of the residuals of free networks to the centres' own σ: variance components (Förstner 1979).
+    Those of circles and of ``printed`` faces are at least 1: their σ include errors that residuals do not show."""
     start = SigmaFactors(1.0, 1.0, 1.0, 1.0, frozenset(printed))
     square, redundancy = np.zeros(3), np.zeros(3)
     for model in models:

@@ -21,10 +21,7 @@ Way = tuple[tuple[str, ...], tuple[str, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceChain:
-    """One way from the reference face to another face, and its deviation from the combined pose.
-
-    Along the way, ``faces`` and ``groups`` alternate.
-    """
+    """One way from the reference face to another face, along alternating faces and groups, and its deviation."""
 
     faces: tuple[str, ...]
     groups: tuple[str, ...]
@@ -34,42 +31,25 @@ class FaceChain:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class CalibratedTarget(Brief):
-    """Result of the calibration: poses of the faces and centres of the circles in the target frame.
-
-    ``target_from_face`` : by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : by group,
-    pose of its metric frame; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the
-    target frame about the face's origin); ``circle_covariance`` : 3×3 mm² by label; ``distance_sigma_mm`` : σ of the
-    distance between the origins of two faces; ``scale_sigma`` : relative σ of all lengths together;
-    ``covariance_mm2`` : joint covariance (3c, 3c) of all circles, target frame, in their order;
-    ``position_sources_mm`` : by face and kind of observation, what it contributes to σ of x, y, z, (3,). Covariances
-    and σ are empty or None if none was computed.
-    """
+    """Poses of the faces and centres of the circles in the target frame; covariances may be empty or None."""
 
     reference_face: str
     target_from_face: dict[str, Rigid]
-    circles: dict[CircleLabel, np.ndarray]
-    target_from_group: dict[str, Rigid]
+    circles: dict[CircleLabel, np.ndarray]  # (3,) mm, target frame
+    target_from_group: dict[str, Rigid]  # of its metric frame
+    # 6×6 (rad, mm), target frame, about the origin
     face_covariance: dict[str, np.ndarray] = field(default_factory=dict)
-    circle_covariance: dict[CircleLabel, np.ndarray] = field(default_factory=dict)
+    circle_covariance: dict[CircleLabel, np.ndarray] = field(default_factory=dict)  # 3×3 mm²
+    # of the distance between the origins of two faces
     distance_sigma_mm: dict[tuple[str, str], float] = field(default_factory=dict)
-    scale_sigma: float | None = None
-    covariance_mm2: np.ndarray | None = None
+    scale_sigma: float | None = None  # relative, of all lengths together
+    covariance_mm2: np.ndarray | None = None  # (3c, 3c) of all circles, target frame, in their order
+    # by face and kind of observation, part of σ of x, y, z
     position_sources_mm: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
 
 def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Combines the faces of all groups into the target frame, which is the frame of the reference face.
-
-    Each group provides the poses of its faces relative to one another. A least-squares adjustment over all groups,
-    weighted by how well each face is determined in each group, gives one pose for each face.
-
-    Raises
-    ------
-    InputError
-        The design has no such reference face.
-    MappingError
-        The reference face is not mapped, or a face is not linked to it.
-    """
+    """Combines the faces of all groups into the frame of the reference face by weighted least squares."""
     chains = _ways(faces, target, reference)
     target_from_face, target_from_group = _adjust(faces, chains, reference)
     circles = _circles(faces, target_from_face, target)
@@ -77,18 +57,8 @@ def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: s
 
 
 def chain_singly(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Chains each face to the reference face by single transforms, along its shortest way through the groups.
-
-    Zhang & Wei (2017), eq. 11, with the inverses where they belong. Other ways to a face are not used. The circles of a
-    face are those of the last group of its way.
-
-    Raises
-    ------
-    InputError
-        The design has no such reference face.
-    MappingError
-        The reference face is not mapped, or a face is not linked to it.
-    """
+    """Chains each face by single transforms along its shortest way (Zhang & Wei 2017, eq. 11, inverses where they
+    belong). The circles of a face are those of the last group of its way."""
     shortest = {face_id: ways[0] for face_id, ways in _ways(faces, target, reference).items()}
     target_from_face = {face_id: _along(way, faces) for face_id, way in shortest.items()}
     nearest: dict[str, FaceInGroup] = {}
@@ -125,10 +95,7 @@ def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) ->
 
 
 def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
-    """Returns the faces that no way through the groups links to the reference face.
-
-    The list is empty if no other face is linked: nothing would remain, and :func:`chain_faces` raises the error.
-    """
+    """Faces that no way links to the reference face; empty if none is linked (:func:`chain_faces` raises)."""
     linked = {face.face for face in faces if face.face == reference or _chains(faces, reference, face.face)}
     return sorted({face.face for face in faces} - linked) if len(linked) > 1 else []
 
@@ -143,10 +110,7 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
 
 
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
-    """Returns the simple ways from one face to another as (faces, groups), the shortest first.
-
-    Each has at most one face more than the shortest.
-    """
+    """Returns the simple ways from one face to another, the shortest first, and those with one face more."""
     by_group: dict[str, list[str]] = {}
     for face in faces:
         by_group.setdefault(face.group, []).append(face.face)
@@ -193,10 +157,8 @@ def _pose_information(each: FaceInGroup) -> np.ndarray:
 
 
 def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Estimates the poses of faces and groups in the target frame by weighted least squares over all (group, face).
-
-    Poses are perturbed on the right, so that the step of a face enters its residual with the factor −1.
-    """
+    """Estimates the poses of faces and groups in the target frame. Poses are perturbed on the right, so that the step
+    of a face enters its residual with the factor −1."""
     start = {face_id: _along(ways[0], faces) for face_id, ways in chains.items()}
     groups = list(dict.fromkeys(face_in_group.group for face_in_group in faces))
     start_group = {}

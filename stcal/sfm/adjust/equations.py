@@ -22,38 +22,27 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shared:
-    """Unknowns that all groups share.
+    """Unknowns that all groups share."""
 
-    ``xyz_model`` : (c, 3) circles, mm; ``shape_mm`` : (d, 3) deviation of the dots from the design that all groups have
-    in common, board frame; ``camera`` ; ``basis`` : (16, q) derivative of the camera's parameters by those that are
-    adjusted.
-    """
-
-    xyz_model: np.ndarray
-    shape_mm: np.ndarray
+    xyz_model: np.ndarray  # (c, 3) circles, mm
+    shape_mm: np.ndarray  # (d, 3) deviation of the dots from the design common to all groups, board frame
     camera: Camera
-    basis: np.ndarray
+    basis: np.ndarray  # (16, q) derivative of the camera's parameters by those that are adjusted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """One group of the joint adjustment.
-
-    ``model_from_board`` ; ``design`` : (e, 3) designed positions of its dots, board frame; ``sigma_mm`` : σ of a dot
-    about the common shape; ``dots``, ``circles`` : indices of the model's points that are dots and circles;
-    ``dot_place`` : (e,) index of each dot in the common shape, empty if each group has its own; ``circle_place`` :
-    index of each circle among all; ``photographs`` : (3p + q, 3p + q) normal matrix of its points and the intrinsics
-    from all of its images, if it is known.
-    """
+    """One group of the joint adjustment."""
 
     model: MetricModel
     model_from_board: Rigid
-    design: np.ndarray
-    sigma_mm: float
-    dots: np.ndarray
+    design: np.ndarray  # (e, 3) of its dots, board frame
+    sigma_mm: float  # of a dot about the common shape
+    dots: np.ndarray  # indices of the model's points, as ``circles``
     circles: np.ndarray
-    dot_place: np.ndarray
-    circle_place: np.ndarray
+    dot_place: np.ndarray  # (e,) in the common shape, empty if each group has its own
+    circle_place: np.ndarray  # of each circle among all
+    # (3p + q, 3p + q) normal matrix of points and intrinsics from images, if known
     photographs: np.ndarray | None = None
 
     def expected_dots(self, shared: Shared) -> np.ndarray:
@@ -72,17 +61,12 @@ class Block:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
-    """Normal equations of a group after elimination of its own unknowns.
-
-    ``normal``, ``right`` : over the group's outer unknowns (its circles, dots of the common shape, intrinsics);
-    ``inner`` : gives the step of dots and board from that of the outer unknowns; ``cameras`` : then gives the step of
-    the cameras, if these are moved.
-    """
+    """Normal equations over a group's outer unknowns: its circles, dots of the common shape, intrinsics."""
 
     normal: np.ndarray
     right: np.ndarray
-    inner: Reduction
-    cameras: Reduction | None
+    inner: Reduction  # gives the step of dots and board from that of the outer unknowns
+    cameras: Reduction | None  # then gives the step of the cameras, if these are moved
 
     @property
     def gain(self) -> float:
@@ -122,17 +106,13 @@ def reduced(block: Block, shared: Shared, huber: float) -> Reduced:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEquations:
-    """Normal equations of a model's m images.
+    """Normal equations of a model's m images over p points and s other unknowns."""
 
-    ``normal``, ``right`` : over p points and s other unknowns, (3p + s); ``block`` : (m, 6, 6), ``block_right`` :
-    (m, 6), of the poses; ``cross`` : (m, 6, 3p + s) between the poses and the rest.
-    """
-
-    normal: np.ndarray
+    normal: np.ndarray  # (3p + s, 3p + s)
     right: np.ndarray
-    block: np.ndarray
+    block: np.ndarray  # (m, 6, 6) of the poses
     block_right: np.ndarray
-    cross: np.ndarray
+    cross: np.ndarray  # (m, 6, 3p + s)
 
 
 def equations_of_poses(
@@ -169,8 +149,7 @@ def without_cameras(
     root = np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None]
     by_intrinsics = np.zeros((*by_pose.shape[:2], 0))
     if basis.shape[1]:
-        xyz = model.xyz_camera()
-        by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis
+        by_intrinsics = model.by_parameters(camera) @ basis
     a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_intrinsics))
     equations = equations_of_poses(model, a, c, e, residual * root)
     cameras = reduce(equations.block, equations.block_right, equations.cross)
@@ -178,28 +157,20 @@ def without_cameras(
 
 
 def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.ndarray:
-    """Returns the whitened equations of a model of one image with its pose eliminated, (2n − 6, 3p + q).
-
-    The rows are over the points and the intrinsics, for n observations, and orthogonal to the pose. Their squares give
-    the normal matrix of :func:`without_cameras`.
-    """
+    """Whitened equations (2n − 6, 3p + q) of one image, orthogonal to its pose, over points and intrinsics."""
     by_pose, by_point = projection_jacobians(model, camera)
     n, p = len(model.point_index), len(model.labels)
     rows = np.zeros((n, 2, 3 * p + basis.shape[1]))
     columns = 3 * model.point_index[:, None] + np.arange(3)
     rows[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = model.whiten(by_point)
-    xyz = model.xyz_camera()
-    rows[:, :, 3 * p :] = model.whiten(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis)
+    rows[:, :, 3 * p :] = model.whiten(model.by_parameters(camera) @ basis)
     across = np.linalg.qr(model.whiten(by_pose).reshape(2 * n, 6), mode="complete")[0][:, 6:]
     return across.T @ rows.reshape(2 * n, -1)
 
 
 def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndarray):
-    """Appends pose of the board and common shape with the observations dot = pose · (design + shape ± σ).
-
-    The last two results are the indices of the eliminated unknowns (dots, pose) and of the rest (circles, shape,
-    intrinsics).
-    """
+    """Appends pose of the board and common shape with the observations dot = pose · (design + shape ± σ); returns the
+    indices of the eliminated unknowns (dots, pose) and of the rest (circles, shape, intrinsics) last."""
     p, q, d = len(block.model.labels), shared.basis.shape[1], len(block.dots)
     s = 3 * len(block.dot_place)
     size = 3 * p + q
@@ -269,20 +240,17 @@ class Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """Constants of one minimisation; ``flatness_mm`` is infinite if it is unknown.
-
-    ``print_factor``, ``bend_factor`` : factors on the stated σ of faces of known shape, in their plane and off it.
-    """
+    """Constants of one minimisation."""
 
     labels: tuple[CircleLabel, ...]
     board: BoardDesign
     common: float
-    flatness_mm: float
+    flatness_mm: float  # infinite if unknown
     given: Camera
     prior: np.ndarray
     huber: float
-    print_factor: float = 1.0
-    bend_factor: float = 1.0
+    print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
+    bend_factor: float = 1.0  # off their plane
 
     def places(self, shared: Shared) -> "Places":
         """Returns the indices of the shared unknowns."""
@@ -383,10 +351,7 @@ def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
 def add_knowledge(
     normal: np.ndarray, right: np.ndarray | None, shared: Shared, setting: Setting, intrinsics: slice
 ) -> None:
-    """Adds the knowledge that is not from photographs or board: the prior of the intrinsics, the flatness of faces.
-
-    ``right`` : None if nothing is moved.
-    """
+    """Adds the prior of the intrinsics and the flatness of faces; ``right`` is None if nothing is moved."""
     normal[intrinsics, intrinsics] += setting.prior
     if right is not None:
         right[intrinsics] -= setting.prior @ _away(shared, setting)
@@ -412,10 +377,8 @@ def add_knowledge(
 
 
 def planes(shared: Shared, setting: Setting):
-    """Yields the circles of each face, the projector from heights to distances from the best plane, and its normal.
-
-    Faces with three circles or fewer have no such distances and are left out, as are faces of known shape.
-    """
+    """Yields the circles of each face of more than three, the projector from heights to distances from the best plane,
+    and its normal; not of faces of known shape."""
     if not np.isfinite(setting.flatness_mm):
         return
     known = {face.id for face in faces_of_known_shape(setting.board)}
@@ -435,10 +398,7 @@ def planes(shared: Shared, setting: Setting):
 
 
 def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
-    """Yields the faces of known shape, with their stated σ in the plane and the flatness off it.
-
-    Yields nothing for a state that a step has sent to infinity; the cost of its images is infinite, too.
-    """
+    """Yields the faces of known shape, with their stated σ; none for a state that a step has sent to infinity."""
     if not np.isfinite(shared.xyz_model).all():
         return
     off, known = setting.bend_factor * setting.flatness_mm, known_points(setting.labels, setting.board)
@@ -455,8 +415,7 @@ def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
 
 
 def bars(shared: Shared, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
-    """Yields the known distances: places of both points, the direction from the second to the first, how much longer
-    than stated it is, and σ, mm."""
+    """Yields the known distances: both points, the direction to the first, how much too long, and σ, mm."""
     place = {label: i for i, label in enumerate(setting.labels)}
     for known in known_distances(setting.board):
         if known.first in place and known.second in place:
@@ -485,10 +444,7 @@ def cost_of(blocks: Sequence[Block], shared: Shared, setting: Setting) -> float:
 
 
 def free_directions(count: int, shared: Shared) -> np.ndarray:
-    """Returns the directions (count, 6) in which all circles move as one.
-
-    The datum is that of smallest trace over the circles.
-    """
+    """Directions (count, 6) in which all circles move as one; the datum is that of smallest trace over them."""
     free = np.zeros((count, FREE_DIRECTIONS))
     free[: shared.xyz_model.size] = free_motions(shared.xyz_model, scale=False)
     return free
@@ -500,10 +456,7 @@ def is_dots_first_cheaper(blocks: Sequence[Block]) -> bool:
 
 
 def circle_equations(blocks: Sequence[Block], shared: Shared, setting: Setting) -> np.ndarray:
-    """Returns the normal matrix (3c + q, 3c + q) over circles and intrinsics, with all other unknowns eliminated.
-
-    No residual is down-weighted.
-    """
+    """Returns the normal matrix (3c + q, 3c + q) over circles and intrinsics; no residual is down-weighted."""
     size = 3 * len(setting.labels) + shared.basis.shape[1]
     ends = size + np.cumsum([0, *(6 * len(b.model.images) + 6 for b in blocks)])
     normal = np.zeros((ends[-1], ends[-1]))
@@ -540,8 +493,8 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
     index = 6 * np.arange(m)[:, None] + np.arange(6)
     local[index[:, :, None], index[:, None]] = cameras
     if q:
-        xyz, last = model.xyz_camera(), slice(6 * m + 6, width)
-        by_intrinsics = model.whiten(shared.camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ shared.basis)
+        last = slice(6 * m + 6, width)
+        by_intrinsics = model.whiten(model.by_parameters(shared.camera) @ shared.basis)
         np.add.at(cross[:, :, last], model.point_index, np.swapaxes(by_point, 1, 2) @ by_intrinsics)
         coupled = np.zeros((m, 6, q))
         np.add.at(coupled, model.image_index, np.swapaxes(by_pose, 1, 2) @ by_intrinsics)

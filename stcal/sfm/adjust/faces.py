@@ -23,20 +23,15 @@ SHAPE_STEPS, SHAPE_SETTLED = 20, 1e-13
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """The n points of a face of known shape against its design, which is laid over them with their weights.
+    """The n points of a face of known shape against its design, which is laid over them with their weights."""
 
-    ``members`` : (n,) indices among the circles; ``rotation`` : (3, 3) model_from_face; ``off_mm`` : (n, 3) points
-    minus design, face frame; ``weight`` : (n, 3) 1/σ²; ``by_pose`` : (3n, 7) derivative of ``off_mm`` by the pose and
-    the relative size of the print; ``size`` : that size minus 1, of weight ``size_weight``, infinite if it is exact.
-    """
-
-    members: np.ndarray
-    rotation: np.ndarray
-    off_mm: np.ndarray
-    weight: np.ndarray
-    by_pose: np.ndarray
-    size: float
-    size_weight: float
+    members: np.ndarray  # (n,) indices among the circles
+    rotation: np.ndarray  # (3, 3) model_from_face
+    off_mm: np.ndarray  # (n, 3) points minus design, face frame
+    weight: np.ndarray  # (n, 3) 1/σ²
+    by_pose: np.ndarray  # (3n, 7) derivative of ``off_mm`` by the pose and the relative size of the print
+    size: float  # relative, minus 1
+    size_weight: float  # infinite if the size is exact
 
     @classmethod
     def of(
@@ -68,8 +63,7 @@ class Shape:
         return float((self.weight * self.off_mm**2).sum()) + own
 
     def _to_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the derivative (6, 3n) of the pose by the deviations, and the covariance (6, 6) of the pose; with one
-        more row if the size is free."""
+        """Pose by the deviations (6, 3n), and its covariance (6, 6), with one more row if the size is free."""
         weighted = self.weight.reshape(-1, 1) * self.by_pose
         normal = self.by_pose.T @ weighted
         if np.isfinite(self.size_weight):
@@ -90,10 +84,7 @@ class Shape:
         return np.einsum("ai,minj,bj->manb", self.rotation, blocks, self.rotation, optimize=True).reshape(3 * n, 3 * n)
 
     def by_size(self) -> np.ndarray:
-        """Returns the right-hand side (3n,) of the normal equations that a stated size one σ off brings.
-
-        Model frame; 0 for an exact size.
-        """
+        """Returns the right-hand side (3n,) that a stated size one σ off brings, model frame; 0 for an exact size."""
         if not np.isfinite(self.size_weight):
             return np.zeros(self.off_mm.size)
         weighted = self.weight.reshape(-1, 1) * self.by_pose
@@ -101,9 +92,7 @@ class Shape:
         return (force.reshape(-1, 3) @ self.rotation.T).ravel()
 
     def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
-        """Returns the variance of each adjusted deviation over its stated variance, (n, 3), at most 1.
-
-        ``covariance_mm2`` : (3n, 3n) of the points."""
+        """Variance of adjusted deviations, by that of the points, over the stated one, (n, 3), at most 1."""
         n = len(self.members)
         turned = covariance_mm2.reshape(n, 3, n, 3)
         turned = np.einsum("ai,manb,bj->minj", self.rotation, turned, self.rotation, optimize=True)
@@ -125,20 +114,15 @@ shows how good it is."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceInGroup:
-    """One face in the metric frame of one group.
-
-    ``group_from_face`` : pose of the face; ``labels`` : (n,) its mapped circles; ``xyz_face`` : (n, 3) mm;
-    ``information`` : (n, 3, 3) inverse covariances of the circles in the face frame, given the cameras; ``images`` :
-    number of images that show the face.
-    """
+    """One face in the metric frame of one group."""
 
     group: str
     face: str
     group_from_face: Rigid
-    labels: tuple[CircleLabel, ...]
-    xyz_face: np.ndarray
-    information: np.ndarray
-    images: int
+    labels: tuple[CircleLabel, ...]  # (n,) its mapped circles
+    xyz_face: np.ndarray  # (n, 3) mm
+    information: np.ndarray  # (n, 3, 3) inverse covariances in the face frame, given the cameras
+    images: int  # number of images that show the face
 
     def __post_init__(self):
         n = len(self.labels)
@@ -147,10 +131,7 @@ class FaceInGroup:
 
 
 def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
-    """Returns the ids of the circles that define the frame of the face but are not mapped.
-
-    A face of known shape lacks none, as its frame is that of its whole design.
-    """
+    """Returns the circles of the face's frame that are not mapped; none for a face of known shape."""
     if face.sigma_mm is not None:
         return ()
     return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
@@ -159,16 +140,7 @@ def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[st
 def with_unmapped(
     face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """Returns the circles (3,) by id, completed by the circles of the frame that are not mapped.
-
-    A rigid fit of the mapped circles to the design, or to ``known`` places (3,) in any frame of the face, gives the
-    positions of the missing circles.
-
-    Raises
-    ------
-    DegenerateError
-        Fewer than four mapped circles have a known place, or they are collinear.
-    """
+    """Returns the circles (3,) by id, unmapped ones of the frame by a rigid fit to the design or ``known`` places."""
     missing = missing_frame_circles(face, xyz)
     if not missing:
         return dict(xyz)
@@ -214,19 +186,9 @@ def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray])
 
 
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
-    """Returns model_from_face, computed from circle centres by Gram–Schmidt (Zhang & Wei, eqs. 8–10).
-
-    Parameters
-    ----------
-    xyz : centres (3,) by circle id, all that are mapped
-    kind : ``three-point`` as in the paper; ``plane``: Z from the plane of all circles, and origin and X in it
-    towards : direction (3,) to the side from which the face is seen
-
-    Raises
-    ------
-    DegenerateError
-        A frame circle is missing, or the circles are collinear.
-    """
+    """Returns model_from_face, computed from circle centres by Gram–Schmidt (Zhang & Wei, eqs. 8–10). ``kind``:
+    ``three-point`` as in the paper; ``plane``: Z from the plane of all circles; ``towards``: direction to the side from
+    which the face is seen."""
     if missing := missing_frame_circles(face, xyz):
         names = " and ".join(f"{face.id}:{circle}" for circle in missing)
         raise DegenerateError(
@@ -239,11 +201,8 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
 def face_frames(
     face: FaceDesign, circles: Sequence[str], xyz: np.ndarray, kind: FrameKind, towards: np.ndarray
 ) -> Poses:
-    """Returns the result of :func:`face_frame` for k sets of centres, (k, n, 3), of the same ``circles``.
-
-    The circles of the frame must be among them. The frame of a face of known shape is that of the design, laid over
-    all of its points by least squares.
-    """
+    """Returns :func:`face_frame` of k sets of centres, (k, n, 3). The frame of a face of known shape is that of the
+    design, laid over all of its points by least squares."""
     if face.sigma_mm is not None:
         return _fitted(face, circles, xyz)
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
@@ -283,11 +242,8 @@ def faces_of_group(
     kind: FrameKind,
     known: Mapping[str, Mapping[str, np.ndarray] | None] | None = None,
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Returns the frames of all faces of one group, and the reasons why other faces have none.
-
-    ``known`` : faces whose frame circles may be placed by their other circles if they are not mapped, see
-    :func:`with_unmapped`.
-    """
+    """Returns the frames of all faces of one group, and the reasons why other faces have none; frame circles of
+    ``known`` faces may be placed by their other circles."""
     xyz = model.xyz_model
     information = _point_information(model, camera)
     cameras = np.stack([pose.inverse().translation for pose in model.camera_from_model])

@@ -135,10 +135,7 @@ class FacesFile(ResultFile):
         centre_sigma_factor: float,
         rim_mm: Mapping[CircleLabel, float] | None = None,
     ) -> "FacesFile":
-        """Returns the file of a calibrated target, with covariances if the target states them.
-
-        ``rim_mm`` : heights of rims if the target is of the luminous surface behind them.
-        """
+        """File of a calibrated target, with covariances if it states them, and rims behind which it lies."""
         radius = design.radius_of()
         content: dict[str, Any] = {
             "format": "stcal faces 1",

@@ -1,9 +1,5 @@
 """Joint adjustment of all groups: one target, one board with a pose per group, all cameras, intrinsics if requested.
-
-Positions of the board's dots are observations with their stated σ, so that scale is part of the estimate. The circles
-of a face are coplanar within a stated σ. Residuals far beyond their σ get less weight (Huber). The inverse of the
-reduced normal matrix is the marginal covariance of the circles, which accounts for all other unknowns.
-"""
+Dots are observations with their stated σ, so that scale is estimated; circles of a face are coplanar within theirs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -66,34 +62,23 @@ zero. Above the second, the remainder of a single group would be smaller than on
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointResult:
-    """The adjusted models, in one frame, mm.
+    """The adjusted models, in one frame, mm."""
 
-    ``models`` : one for each group, mm; ``model_from_board`` : by group; ``labels`` : (c,) of the target's circles;
-    ``xyz_model`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
-    ``sigma_scale``²; ``sigma0`` : residuals over the σ of all observations; ``board_residuals_mm`` : by group, (n, 3),
-    board frame;
-    ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted if requested;
-    ``camera_covariance`` : (q, q) of the parameters of its COLMAP model, else empty; ``weights`` : by group, (n,)
-    Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : largest move of a projection by the last whole
-    step; ``print_factor``, ``bend_factor`` : deviations of faces of known shape from their design over the stated σ, in
-    their plane and off it, which multiply these σ.
-    """
-
-    models: tuple[MetricModel, ...]
+    models: tuple[MetricModel, ...]  # one for each group
     model_from_board: dict[str, Rigid]
-    labels: tuple[CircleLabel, ...]
-    xyz_model: np.ndarray
-    covariance_mm2: np.ndarray
-    sigma0: float
-    board_residuals_mm: dict[str, np.ndarray]
-    board_common: float
+    labels: tuple[CircleLabel, ...]  # (c,) of the target's circles
+    xyz_model: np.ndarray  # (c, 3)
+    covariance_mm2: np.ndarray  # (3c, 3c), datum of smallest trace, scaled by ``sigma_scale``²
+    sigma0: float  # residuals over the σ of all observations
+    board_residuals_mm: dict[str, np.ndarray]  # by group, (n, 3), board frame
+    board_common: float  # share of the board's variance that all groups have in common
     camera: Camera
-    camera_covariance: np.ndarray
-    weights: dict[str, np.ndarray]
-    redundancy: int
-    last_move_px: float
-    print_factor: float = 1.0
-    bend_factor: float = 1.0
+    camera_covariance: np.ndarray  # (q, q) of the parameters of its COLMAP model, if adjusted
+    weights: dict[str, np.ndarray]  # by group, (n,) Huber's
+    redundancy: int  # degrees of freedom
+    last_move_px: float  # largest move of a projection by the last whole step
+    print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
+    bend_factor: float = 1.0  # off their plane
 
     def __post_init__(self):
         c = len(self.labels)
@@ -102,11 +87,7 @@ class JointResult:
 
     @property
     def sigma_scale(self) -> float:
-        """Factor that the covariances include: σ₀ if the residuals are larger than the σ of the observations, else 1.
-
-        It is never below 1: the single groups have confirmed the σ of the centres, and a board that is better than
-        its design says does not make them smaller.
-        """
+        """Factor in the covariances: σ₀, but at least 1, as the single groups have confirmed the σ of the centres."""
         return scale_of(self.sigma0)
 
     @property
@@ -117,18 +98,13 @@ class JointResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """State of a joint adjustment at its minimum.
-
-    ``blocks`` : the groups; ``shared`` : what the groups share; ``setting`` : constants of the adjustment, weights
-    included; ``normal`` : normal matrix over the shared unknowns; ``move_px`` : largest move of a projection by the
-    next whole step, px.
-    """
+    """State of a joint adjustment at its minimum."""
 
     blocks: tuple[Block, ...]
     shared: Shared
-    setting: Setting
-    normal: np.ndarray
-    move_px: float
+    setting: Setting  # weights included
+    normal: np.ndarray  # over the shared unknowns
+    move_px: float  # largest move of a projection by the next whole step
 
     def result(self) -> JointResult:
         """Returns the result with its covariances."""
@@ -137,42 +113,25 @@ class Adjusted:
         return _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
 
 
-def adjust_jointly(
-    models: Sequence[MetricModel], board: BoardDesign, camera: Camera, flatness_mm: float | None = None
-) -> JointResult:
+def adjust_jointly(models: Sequence[MetricModel], board: BoardDesign, camera: Camera) -> JointResult:
     """Returns the result of :func:`adjusted` with the covariances at its minimum."""
-    return adjusted(models, board, camera, flatness_mm).result()
+    return adjusted(models, board, camera).result()
 
 
 def adjusted(
     models: Sequence[MetricModel],
     board: BoardDesign,
     camera: Camera,
-    flatness_mm: float | None = None,
-    prior: CameraPrior | None = None,
-    start: Camera | None = None,
+    flatness_mm: float | None = None,  # of a circle from the plane of its face, None if unknown
+    prior: CameraPrior | None = None,  # covariance of the intrinsics about ``camera``; None: these are fixed
+    start: Camera | None = None,  # of the intrinsics
+    # share of the board's variance common to all groups; no residual is then down-weighted
     common: float | None = None,
-    factors: tuple[float, float] = (1.0, 1.0),
-    settled: float = EXACTLY,
+    factors: tuple[float, float] = (1.0, 1.0),  # ``print_factor`` and ``bend_factor`` of an earlier result
+    settled: float = EXACTLY,  # largest predicted decrease of the last step, as a share of χ²
 ) -> Adjusted:
-    """Adjusts metric models that share one frame, with all observations weighted by their σ.
-
-    ``flatness_mm`` : σ of a circle's distance from the plane of its face, None if it is unknown; ``prior`` : the
-    intrinsics of ``camera`` are observations with this covariance and are adjusted, beginning at ``start``; they are
-    fixed if None; ``common`` : share of the board's variance that all groups have in common. If it is given, no
-    residual is down-weighted, so that the result is linear in the observations; ``factors`` : on the σ of faces of
-    known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts;
-    ``settled`` : largest predicted decrease of the last step, as a share of χ².
-
-    If ``common`` is None, the dots show whether the board kept its shape between the groups (one plate) or not (a film,
-    a screen). First every group has its own deviations from the design. If these deviations agree, a common shape is
-    estimated next.
-
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
-    """
+    """Adjusts metric models that share one frame. The dots show whether the board kept its shape between the groups
+    (one plate) or not (a film, a screen), if ``common`` is None."""
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common or 0.0)
     shared = replace(shared, camera=start or camera)
     if common is None:
@@ -191,16 +150,7 @@ def adjusted(
 def adjust_part(
     models: Sequence[MetricModel], board: BoardDesign, flatness_mm: float | None, whole: JointResult
 ) -> JointResult:
-    """Adjusts a part of the models of a ``whole`` joint result, from which it begins, with the weights of the whole.
-
-    Camera, factors on the σ of faces of known shape, and the share of the board's variance that groups have in common
-    are those of the whole.
-
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
-    """
+    """Adjusts a part of the models of a ``whole`` joint result, with its weights, camera, factors and common share."""
     # Of a single group, the variance of its board is the same whatever share of it other groups have.
     common = whole.board_common if len(models) > 1 else 0.0
     blocks, shared, setting = _start(models, board, whole.camera, flatness_mm, None, common)
@@ -234,8 +184,7 @@ def _with_shape_factors(
 
 
 def _shape_factors(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[float, float]:
-    """Returns the factors on the σ of faces of known shape in their plane and off it: variance components (Förstner
-    1979), with the stated σ as a weak prior."""
+    """Returns print and bend factor: variance components (Förstner 1979), with the stated σ as a weak prior."""
     normal, _, _ = normal_equations(blocks, shared, setting)
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     square, freedom = np.zeros(2), np.zeros(2)
@@ -258,13 +207,9 @@ def covariance_of(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
-    photographs: Mapping[str, np.ndarray] | None = None,
+    photographs: Mapping[str, np.ndarray] | None = None,  # of :func:`photographs_of`
 ) -> JointResult:
-    """Returns the result of :func:`adjust_jointly` for models at their true positions, which do not move; σ₀ is 1.
-
-    The arguments are those of :func:`adjusted`; ``common`` : share of the board's variance that all groups have in
-    common; ``photographs`` : results of :func:`photographs_of`, by group.
-    """
+    """Returns the result of :func:`adjust_jointly` for models at their true positions, which do not move; σ₀ is 1."""
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
     if photographs or not equations.is_dots_first_cheaper(blocks):
         return _result(blocks, shared, setting, 0.0, 1.0)
@@ -281,38 +226,24 @@ def basis_of(prior: CameraPrior | None) -> np.ndarray:
 def photographs_of(
     models: Sequence[MetricModel], board: BoardDesign, camera: Camera, prior: CameraPrior | None
 ) -> dict[str, np.ndarray]:
-    """Returns the normal matrices of the photographs alone, by group.
-
-    Each matrix (3p + q, 3p + q) is over the points of the group and the intrinsics, from all of its images; σ₀ is 1.
-    """
+    """Normal matrices (3p + q, 3p + q) of points and intrinsics from the photographs alone, by group; σ₀ is 1."""
     blocks, shared, _ = _start(models, board, camera, None, prior)
     return {b.model.group: without_cameras(b.model, camera, shared.basis, np.inf)[0] for b in blocks}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extensible:
-    """The circle covariance of :func:`covariance_of`, prepared for one more view.
-
-    Its size does not grow with the number of images.
-
-    ``camera`` ; ``basis`` : (16, q) derivative of its parameters by those that are adjusted; ``covariance_mm2`` :
-    (3c, 3c) of the circles; ``points`` : by group, covariance (3p + q, 3p + q) of its points and the intrinsics;
-    ``to_circles`` : by group, covariance (3p + q, 3c) between these and the circles.
-    """
+    """The circle covariance of :func:`covariance_of`, prepared for one more view, for any number of images."""
 
     camera: Camera
-    basis: np.ndarray
-    covariance_mm2: np.ndarray
-    points: dict[str, np.ndarray]
-    to_circles: dict[str, np.ndarray]
+    basis: np.ndarray  # (16, q) derivative of its parameters by those that are adjusted
+    covariance_mm2: np.ndarray  # (3c, 3c) of the circles
+    points: dict[str, np.ndarray]  # by group, (3p + q, 3p + q) of its points and the intrinsics
+    to_circles: dict[str, np.ndarray]  # by group, (3p + q, 3c) between these and the circles
 
     def lowered(self, view: MetricModel, to_functions: np.ndarray) -> np.ndarray:
-        """Returns by how much one more view lowers the variances of f functions of the circles, (f,).
-
-        ``view`` : a model of one image and all points of its group; ``to_functions`` : (3p + q, f) covariance between
-        these points and intrinsics, and the functions. The inverse is that of a matrix with a change of small rank
-        (Woodbury 1950).
-        """
+        """Returns by how much one more view lowers the variances of f functions of the circles, (f,) (Woodbury 1950).
+        ``to_functions``: (3p + q, f) covariance between points and intrinsics, and the functions."""
         rows = rows_of_view(view, self.camera, self.basis)
         inner = np.eye(len(rows)) + rows @ self.points[view.group] @ rows.T
         half = solve_triangular(np.linalg.cholesky(inner), rows @ to_functions, lower=True)
@@ -503,11 +434,7 @@ def _result(
     sigma0: float | None = None,
     equations: tuple[np.ndarray, slice, slice] | None = None,
 ) -> JointResult:
-    """Returns the result with its covariances.
-
-    ``move_px`` : move by the last step; ``sigma0`` : estimated from the residuals if None; ``equations`` : normal
-    matrix over circles, intrinsics and perhaps more, and the places of circles and intrinsics in it; computed if None.
-    """
+    """Returns the result with its covariances; ``equations``: normal matrix, places of circles and intrinsics in it."""
     if equations is None:
         places = setting.places(shared)
         equations = normal_equations(blocks, shared, setting)[0], places.circles, places.intrinsics

@@ -1,9 +1,5 @@
 """The free network of one group with its cofactors: random variation of residuals, circles and further parameters.
-
-A fault is modelled by further parameters that the adjustment lacks: another camera, a face that moved in one image. The
-residuals alone show whether these parameters are needed, to first order and without another adjustment (score test, Rao
-1948; for one observation Baarda's data snooping, 1968).
-"""
+Whether further parameters are needed is a score test, without another adjustment (Rao 1948; Baarda 1968)."""
 
 from dataclasses import dataclass
 
@@ -25,25 +21,18 @@ its error."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
-    """An adjusted group, mm, with n observations, m images, p points.
-
-    ``residual`` : (n, 2) over σ; ``by_pose`` : (n, 2, 6), ``by_point`` : (n, 2, 3), derivatives of the projections over
-    σ; ``inverse`` : (m, 6, 6) of the poses' normal blocks; ``coupling`` : (m, 6, 3p) between poses and points;
-    ``pose_right`` : (m, 6), ``point_right`` : (3p,) right-hand sides after the adjustment, almost zero;
-    ``covariance_mm2`` : (3p, 3p) of the points, in the datum of smallest trace (7 free directions);
-    ``residual_cofactor`` : (n, 2, 2) covariance of each residual over σ².
-    """
+    """An adjusted group, mm, with n observations, m images, p points."""
 
     model: GroupModel
-    residual: np.ndarray
-    by_pose: np.ndarray
-    by_point: np.ndarray
-    inverse: np.ndarray
-    coupling: np.ndarray
-    pose_right: np.ndarray
-    point_right: np.ndarray
-    covariance_mm2: np.ndarray
-    residual_cofactor: np.ndarray
+    residual: np.ndarray  # (n, 2) over σ
+    by_pose: np.ndarray  # (n, 2, 6) derivatives of the projections over σ
+    by_point: np.ndarray  # (n, 2, 3)
+    inverse: np.ndarray  # (m, 6, 6) of the poses' normal blocks
+    coupling: np.ndarray  # (m, 6, 3p) between poses and points
+    pose_right: np.ndarray  # (m, 6) right-hand sides after the adjustment, almost zero
+    point_right: np.ndarray  # (3p,)
+    covariance_mm2: np.ndarray  # (3p, 3p) of the points, in the datum of smallest trace
+    residual_cofactor: np.ndarray  # (n, 2, 2) covariance of each residual over σ²
 
     def __post_init__(self):
         p = 3 * len(self.model.labels)
@@ -55,11 +44,8 @@ class Network:
         return np.trace(self.residual_cofactor, axis1=1, axis2=2)
 
     def squares_of_observations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the squared residual of each observation over its own covariance, (n,), and the degrees of freedom.
-
-        It follows χ² with these (n,) 0, 1 or 2 degrees of freedom: a direction along which the other observations
-        hardly control this one tells nothing.
-        """
+        """Returns the squared residuals over their own covariances, (n,), and the degrees of freedom, 0 to 2: a
+        direction that the other observations hardly control tells nothing."""
         value, vector = np.linalg.eigh(self.residual_cofactor)
         held = value > MIN_CONTROL
         along = (np.swapaxes(vector, 1, 2) @ self.residual[..., None])[..., 0]
@@ -83,19 +69,12 @@ class Network:
         return self.covariance_mm2[np.ix_(place, place)]
 
     def pose_covariance(self) -> np.ndarray:
-        """Returns the covariances of the poses, (m, 6, 6) rad and mm, in the datum of the points.
-
-        Rotations are perturbed on the left.
-        """
+        """Returns (m, 6, 6) rad and mm, in the datum of the points, rotations perturbed on the left."""
         to_points = self.inverse @ self.coupling
         return self.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
 
     def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the normal equations (q, q), (q,) of q further parameters, with all other unknowns eliminated.
-
-        The parameters are common to the whole group; ``columns`` : (n, 2, q) derivatives of the projections by them,
-        over σ.
-        """
+        """Equations (q, q), (q,) of parameters of the group by the derivatives ``columns`` (n, 2, q) over σ."""
         normal, right, to_points = self._by_image(columns)
         coupled = to_points.sum(0)
         weighted = coupled @ self.covariance_mm2
@@ -108,11 +87,8 @@ class Network:
         return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right
 
     def score_of_image(self, image: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns :meth:`score` of one parameter for each coordinate that was observed in an image: (2k, 2k), (2k,).
-
-        These parameters can explain any residuals of the image, as if the image were left out. Those of the first
-        coordinate come first, then those of the second.
-        """
+        """Returns :meth:`score` (2k, 2k), (2k,) of one parameter per coordinate of an image, the first ones first. They
+        explain any residuals of the image, as if the image were left out."""
         rows = self.model.rows_by_image()[image]
         k, p = len(rows), len(self.model.labels)
         by_pose = np.concatenate([self.by_pose[rows, 0], self.by_pose[rows, 1]])
@@ -126,10 +102,7 @@ class Network:
         return np.eye(2 * k) - eliminated @ by_pose.T - weighted @ coupled.T, right - weighted @ self.point_right
 
     def _by_image(self, e: np.ndarray):
-        """Returns the equations of each image with its pose eliminated.
-
-        They are the normal matrix (m, q, q), the right-hand side (m, q), and the coupling to the points (m, q, 3p).
-        """
+        """Returns by image, without its pose: normal (m, q, q), right side (m, q), coupling to points (m, q, 3p)."""
         model = self.model
         m, q, p = len(model.images), e.shape[2], len(model.labels)
         normal, by_pose, right = np.empty((m, q, q)), np.empty((m, q, 6)), np.empty((m, q))
@@ -185,11 +158,7 @@ def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.nd
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoreTest:
-    """Result of a score test.
-
-    ``estimate`` : (q,) further parameters, with ``covariance`` (q, q); ``statistic`` : follows χ² with ``freedom``
-    degrees of freedom if no further parameter is needed.
-    """
+    """Result of a score test: ``statistic`` follows χ² if no further parameter is needed."""
 
     estimate: np.ndarray
     covariance: np.ndarray
@@ -198,10 +167,7 @@ class ScoreTest:
 
 
 def solve_score(normal: np.ndarray, right: np.ndarray) -> ScoreTest:
-    """Returns the test for the equations of :meth:`Network.score`.
-
-    Directions that the normal matrix does not determine are left out of it.
-    """
+    """Returns the test for the equations of :meth:`Network.score`, without directions that they do not determine."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
     held = value > MIN_SHARE

@@ -27,15 +27,7 @@ DAMPING = 1e-10
 
 
 def adjust(model: M, camera: Camera) -> M:
-    """Minimises the weighted reprojection error of the corrected centres over poses and points.
-
-    Raises
-    ------
-    MappingError
-        The model is empty.
-    ConvergenceError
-        No minimum after ``MAX_STEPS`` steps.
-    """
+    """Minimises the weighted reprojection error of the corrected centres over poses and points."""
     if not model.images:
         raise MappingError(
             "E-GROUP-FEW-IMAGES",
@@ -63,11 +55,7 @@ def _cost(model: GroupModel, camera: Camera) -> float:
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the derivatives of the projections (px) by poses and by points.
-
-    Those by the poses' left perturbation (rotation, translation) are (n, 2, 6), those by the points (n, 2, 3), in the
-    world's unit.
-    """
+    """Returns the derivatives of the projections (px) by poses, left perturbed, (n, 2, 6), and by points, (n, 2, 3)."""
     xyz = model.xyz_camera()
     ideal = xyz[:, :2] / xyz[:, 2:]
     by_ideal = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
@@ -80,11 +68,7 @@ def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
-    """Normal equations of m poses and p points.
-
-    They are blocks (m, 6, 6), (p, 3, 3), right-hand sides (m, 6), (p, 3), and ``cross`` (m, p, 6, 3) between poses and
-    points.
-    """
+    """Normal equations of m poses and p points, and their ``cross`` blocks (m, p, 6, 3)."""
 
     cost: float
     poses: np.ndarray
@@ -167,33 +151,15 @@ MAX_OUTLIER_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refined:
-    """Result of :func:`refine`.
-
-    ``model`` : the model with settled corrections; ``rounds`` : number of rounds; ``outliers`` : observations that were
-    left out.
-    """
-
     model: WorldModel
     rounds: int
-    outliers: tuple[Outlier, ...]
+    outliers: tuple[Outlier, ...]  # observations that were left out
 
 
 def refine(
-    model: WorldModel,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    eccentricity: bool = True,
+    model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign, eccentricity: bool = True
 ) -> Refined:
-    """Alternates between the eccentricity of the circles and bundle adjustment.
-
-    Raises
-    ------
-    ConvergenceError
-        The corrections did not settle.
-    MappingError
-        A face has too few mapped circles to have a plane, or too many observations are outliers.
-    """
+    """Alternates between the eccentricity of the circles and bundle adjustment until the corrections settle."""
     radius = target.radius_of() | board.radius_of()
     model = adjust(model, camera)
     observations = len(model.image_index)
@@ -238,13 +204,7 @@ def _require_few(outliers: list[Outlier], observations: int, group: str) -> None
 
 
 def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, float], mm_per_unit: float) -> np.ndarray:
-    """Returns the centre of the imaged ellipse minus the image of the circle's centre, (n, 2), for every observation.
-
-    Raises
-    ------
-    MappingError
-        A face has too few mapped circles to have a plane.
-    """
+    """Centre of the imaged ellipse minus the image of the circle's centre, (n, 2), for every observation."""
     normal = np.zeros((len(model.labels), 3))
     for key, members in model.points_by_face().items():
         if max(radius_mm[model.labels[i]] for i in members) <= POINT_RADIUS_MM:
@@ -267,10 +227,8 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
 
 
 def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outlier]]:
-    """Returns the worst observation of each image if it is an outlier of comparable size to the worst of all.
-
-    One bad observation affects all observations that share a point or a camera with it.
-    """
+    """Returns the worst observation of each image near the worst of all: a bad one affects others that share its point
+    or camera."""
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     rms = np.sqrt(2) * robust_sigma(residual, 2)
     limit = np.maximum(np.maximum(OUTLIER_RMS * rms, 2 * OUTLIER_RMS * model.sigma_px()), MIN_OUTLIER_PX)

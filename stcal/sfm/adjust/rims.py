@@ -31,19 +31,14 @@ STEPS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RadiusViews:
-    """The radii in n observations of circles of one group.
-
-    ``point_index`` : (n,) of the model; ``design_mm`` : (n,) designed radius; ``ratio`` : (n,) measured over designed;
-    ``size_px`` : (n,) designed radius in the image; ``blur_mm`` : (n,) correction of the radius for blur, which is in
-    the ratio; ``tan_tilt`` : (n,) tangent of the angle between the normal and the line of sight.
-    """
+    """The radii in n observations of circles of one group."""
 
     point_index: np.ndarray
     design_mm: np.ndarray
-    ratio: np.ndarray
-    size_px: np.ndarray
-    blur_mm: np.ndarray
-    tan_tilt: np.ndarray
+    ratio: np.ndarray  # measured over designed radius
+    size_px: np.ndarray  # designed radius in the image
+    blur_mm: np.ndarray  # correction of the radius for blur, which is in the ratio
+    tan_tilt: np.ndarray  # of the angle between the normal and the line of sight
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +53,9 @@ class Rim:
 def radius_views(
     model: GroupModel, images: Mapping[str, ImageObservations], design_mm: Mapping[Label, float], camera: Camera
 ) -> RadiusViews:
-    """Returns the radii from the areas of the ellipses and the positions and planes of the circles.
-
-    The areas of the circles' images follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3),
-    with the estimated planes of the faces. A blur of σ reduces the radius R of a disc's image by σ²/2R, and the
-    fitted radius by about as much. The result is corrected for this.
-    """
+    """Returns the radii from areas of ellipses, by the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3)
+    of the planes of the faces. A blur of σ reduces a disc's radius R by σ²/2R, and the fitted one by about as much:
+    corrected."""
     focal = float(np.sqrt(camera.focal.prod()))
     rows = model.rows_by_image()
     order = np.concatenate(rows)
@@ -94,22 +86,15 @@ def radius_views(
 
 
 def lost_radius_mm(height_mm: float, tan_tilt: np.ndarray, radius_mm: float | np.ndarray) -> np.ndarray:
-    """Returns by how much a rim of this height reduces the radius of a circle at these tilts, mm.
-
-    The visible area is common to two discs that are h tan τ apart; to second order."""
+    """Returns by how much a rim reduces a radius, mm: the area common to two discs h tan τ apart, to second order."""
     return height_mm * tan_tilt / np.pi + SECOND_ORDER * height_mm * abs(height_mm) * tan_tilt**2 / radius_mm
 
 
 def find_rims(
     models: Sequence[GroupModel], images: Sequence[ImageObservations], design_mm: Mapping[Label, float], camera: Camera
 ) -> dict[str, Rim]:
-    """Returns the height of the rim in front of the faces' ``circles`` and of the board's ``dots``.
-
-    A kind with too few views is left out.
-
-    The visible part of a disc of radius r behind a rim of the same radius and height h is the area common to both. At
-    a tilt τ they are h tan τ apart. The area appears h/2 in front of the disc, and its radius is smaller by h tan τ/π.
-    """
+    """Returns the height of the rim in front of the faces' ``circles`` and of the board's ``dots``, if views suffice.
+    The area common to disc and rim appears h/2 in front of the disc, and its radius is smaller by h tan τ/π."""
     by_name = {image.name: image for image in images}
     parts: dict[str, list[tuple[np.ndarray, ...]]] = {"circles": [], "dots": []}
     before = 0
@@ -131,12 +116,9 @@ def find_rims(
 
 
 def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.ndarray, image: np.ndarray) -> Rim:
-    """Returns the rim from the radii's excess ``short`` (mm) over the design, with an offset of each radius, and the
-    share of the blur's effect that its correction left in all of them.
-
-    The circles of one ``image`` share its exposure, focus and tilt, so that their errors are not independent: σ is at
-    least that by whole images (Liang & Zeger 1986, Biometrika 73).
-    """
+    """Returns the rim from the radii's excess ``short`` (mm), with an offset of each radius and the share of blur left
+    in all. Circles of one ``image`` share exposure, focus and tilt: σ is at least that by whole images (Liang & Zeger
+    1986, Biometrika 73)."""
     _, kind = np.unique(radius, return_inverse=True)
     rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -tangent / np.pi])
     height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)

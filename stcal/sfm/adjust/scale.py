@@ -23,23 +23,15 @@ ScaleSource = Literal["board", "faces", "distances", "drawing"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scale:
-    """The scale of one group.
+    """The scale of one group."""
 
-    ``board_from_world`` : similarity over all dots by least squares, unless λ by rows was requested; its scale is λ
-    (mm per unit); ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs); ``rows`` : these
-    two rows; ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
-    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions; ``source`` : what determines λ:
-    ``board``, ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames),
-    ``distances``, or the ``drawing`` if no size is known.
-    """
-
-    board_from_world: Similarity
-    rows_mm_per_unit: float
+    board_from_world: Similarity  # over all dots by least squares, unless by rows; its scale is λ, mm per unit
+    rows_mm_per_unit: float  # λ as in Zhang & Wei (2017): first and last row, all pairs
     rows: tuple[int, int]
-    labels: tuple[Label, ...]
-    residuals_mm: np.ndarray
-    sigma_mm_per_unit: float
-    source: ScaleSource = "board"
+    labels: tuple[Label, ...]  # (n,) the dots, or the corners of faces of known shape
+    residuals_mm: np.ndarray  # (n, 3) minus design, board frame, of corners face frames
+    sigma_mm_per_unit: float  # from the stated σ of the dots' positions
+    source: ScaleSource = "board"  # what determines λ; ``drawing`` if no size is known
 
     def __post_init__(self):
         freeze(self, "residuals_mm", (len(self.labels), 3), "residuals")
@@ -62,21 +54,12 @@ class Scale:
         return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
 
     def spread_mm(self) -> float:
-        """Returns the standard deviation of the residuals' lengths: the second measure of Zhang & Wei's Table 1.
-
-        The table calls it mean square error. It is smaller than the mean there, which no root mean square can be.
-        """
+        """Spread of the residuals' lengths, the second measure of Zhang & Wei's Table 1, there a mean square error."""
         return float(np.linalg.norm(self.residuals_mm, axis=1).std())
 
 
 def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> Scale:
-    """Returns the scale of a model from the dots of the board; ``by_rows`` : λ as in Zhang & Wei (2017).
-
-    Raises
-    ------
-    ScaleError
-        Fewer than four dots are mapped, or all are collinear.
-    """
+    """Returns the scale of a model from the dots of the board; ``by_rows``: λ as in Zhang & Wei (2017)."""
     members = model.points_by_face().get("board", np.zeros(0, int))
     where = f"group {model.group}: scale"
     if len(members) < MIN_DOTS and (own := _of_faces(model, board) or _of_distances(model, board)) is not None:
@@ -151,10 +134,8 @@ def _of_distances(model: WorldModel, board: BoardDesign) -> Scale | None:
 
 
 def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations]) -> BoardDesign:
-    """Returns the board with the σ of printed sizes enlarged by the σ of a common shift of the edges of tags.
-
-    Light, ink and the camera's response make all tags look larger or smaller alike, which no residual shows.
-    """
+    """Returns the board with the σ of printed sizes enlarged by that of a common shift of the edges of tags: light, ink
+    and camera make all tags look larger or smaller alike, which no residual shows."""
     if not isinstance(board, ScaleReference) or not any(face.of_tags for face in board.faces):
         return board
     sides: dict[CircleLabel, CircleLabel] = {}

@@ -24,13 +24,7 @@ from stcal.sfm.adjust.equations import (
     robust_weights,
     shapes,
 )
-from stcal.sfm.adjust.faces import (
-    FrameKind,
-    face_frames,
-    missing_frame_circles,
-    placement_sigma_mm,
-    with_unmapped,
-)
+from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
 from stcal.sfm.adjust.joint import Adjusted, JointResult
 from stcal.sfm.adjust.refine import projection_jacobians
 
@@ -40,22 +34,16 @@ STEP_MM = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Derivatives:
-    """The target in its own frame, and its derivatives by the circles in the models' frame, mm.
-
-    ``target_from_face`` : by face; ``xyz_target`` : (c, 3); ``target_from_model`` ; ``faces`` : by face, (6, 3c)
-    rotation (rad) and translation (mm), perturbation in the target frame; ``circles`` : (c, 3, 3c); ``face_designed`` :
-    by face, (6, d), and ``circles_designed`` : (c, 3, d), derivatives by the in-plane positions of frame circles that
-    were not mapped; ``designed_sigma_mm`` : σ of these positions.
-    """
+    """The target in its own frame, and its derivatives by the circles in the models' frame, mm."""
 
     target_from_face: dict[str, Rigid]
-    xyz_target: np.ndarray
+    xyz_target: np.ndarray  # (c, 3)
     target_from_model: Rigid
-    faces: dict[str, np.ndarray]
-    circles: np.ndarray
-    face_designed: dict[str, np.ndarray]
-    circles_designed: np.ndarray
-    designed_sigma_mm: float
+    faces: dict[str, np.ndarray]  # by face, (6, 3c) rad and mm, perturbation in the target frame
+    circles: np.ndarray  # (c, 3, 3c)
+    face_designed: dict[str, np.ndarray]  # by face, (6, d) by in-plane positions of frame circles that were not mapped
+    circles_designed: np.ndarray  # (c, 3, d)
+    designed_sigma_mm: float  # of these positions
 
     def face_covariance(self, covariance_mm2: np.ndarray) -> dict[str, np.ndarray]:
         """Returns 6×6 by face from the covariance (3c, 3c) of the circles, in any datum."""
@@ -92,16 +80,12 @@ class Derivatives:
 
 def calibrated_target(
     result: JointResult,
-    start: CalibratedTarget,
+    start: CalibratedTarget,  # gives the reference face and the side to which each face looks
     target: TargetDesign,
     kind: FrameKind,
-    state: Adjusted | None = None,
+    state: Adjusted | None = None,  # without it the contributions to the σ of positions are not computed
 ) -> CalibratedTarget:
-    """Returns faces and circles of the adjusted target in the target frame, with their marginal covariances.
-
-    ``start`` gives the reference face and the side to which each face looks; ``state`` : of the adjustment; if
-    None, the contributions of the kinds of observations to the σ of positions are not computed.
-    """
+    """Returns faces and circles of the adjusted target in the target frame, with their marginal covariances."""
     target_derivatives = derivatives(result, start, target, kind)
     return CalibratedTarget(
         reference_face=start.reference_face,
@@ -134,10 +118,7 @@ def _position_sources_mm(state: Adjusted, scale: float, own: Derivatives) -> dic
 
 
 def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
-    """Returns the relative σ of the scale of the circles.
-
-    The scale is that of the similarity between the adjusted and the true circles.
-    """
+    """Returns the relative σ of the scale of the similarity between the adjusted and the true circles."""
     middle = xyz_model - xyz_model.mean(0)
     gradient = (middle / (middle**2).sum()).ravel()
     return float(np.sqrt(gradient @ covariance_mm2 @ gradient))
@@ -196,16 +177,13 @@ class _Moves:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MovedFace:
-    """A face with its m circles, which its frame follows when they move.
-
-    ``rows`` : (m,) places of the circles among all; ``xyz`` : (m, 3); ``placed`` : frame circles that were not mapped.
-    """
+    """A face with its m circles, which its frame follows when they move."""
 
     face: FaceDesign
-    rows: np.ndarray
+    rows: np.ndarray  # (m,) places of the circles among all
     circles: tuple[str, ...]
     xyz: np.ndarray
-    placed: tuple[str, ...]
+    placed: tuple[str, ...]  # frame circles that were not mapped
     kind: FrameKind
     towards: np.ndarray
 
@@ -217,8 +195,7 @@ class _MovedFace:
         return cls(face, rows, circles, result.xyz_model[rows], placed, kind, towards)
 
     def frames(self, moves: np.ndarray, shifts: np.ndarray | None = None) -> Poses:
-        """Returns model_from_face after k sets of moves (k, m, 3), and of shifts (k, p, 3) of the placed circles,
-        mm."""
+        """Returns model_from_face after k sets of moves (k, m, 3), and of shifts (k, p, 3) of placed circles, mm."""
         xyz = self.xyz + moves
         if not self.placed:
             return face_frames(self.face, self.circles, xyz, self.kind, self.towards)
@@ -272,19 +249,13 @@ AT_ONCE = 10_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contributions:
-    """Contributions to the covariance of the c circles, in the datum of the adjustment.
-
-    ``joint`` : result of the adjustment; ``covariance_mm2`` : (3c, 3c) by kind of observation, which add up to the
-    covariance of ``joint``; ``by_scale`` : (3c,) mm, error of the circles per relative error of the board's pitch;
-    ``by_intrinsics`` : (3c, 16), error of the circles per error of the intrinsics if these are fixed, else zero;
-    ``centre_sigma_px`` : σ of the centres of circles and of dots, RMS per axis, scaled by σ₀ of the adjustment.
-    """
+    """Contributions to the covariance of the c circles, in the datum of the adjustment."""
 
     joint: JointResult
-    covariance_mm2: dict[str, np.ndarray]
-    by_scale: np.ndarray
-    by_intrinsics: np.ndarray
-    centre_sigma_px: dict[str, float]
+    covariance_mm2: dict[str, np.ndarray]  # (3c, 3c) by kind of observation, adding up to that of ``joint``
+    by_scale: np.ndarray  # (3c,) mm per relative error of the board's pitch
+    by_intrinsics: np.ndarray  # (3c, 16) per error of the intrinsics if these are fixed, else zero
+    centre_sigma_px: dict[str, float]  # of circles and of dots, RMS per axis, scaled by σ₀
 
     def __post_init__(self):
         c = 3 * len(self.joint.labels)
@@ -309,8 +280,7 @@ def contributions_of(state: Adjusted) -> Contributions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
-    """Effects of errors of the observations on k quantities: ``covariance`` : (k, k) by kind, with the σ of the
-    observations; ``by_scale`` and ``by_intrinsics`` : (k,), (k, 16), as in :class:`Contributions`."""
+    """Effects of errors of the observations on k quantities, as in :class:`Contributions`."""
 
     covariance: dict[str, np.ndarray]
     by_scale: np.ndarray
@@ -359,17 +329,13 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Answer:
-    """Columns of the inverse normal matrix for the k coordinates of all circles, with the rows of one group.
+    """Columns of the inverse normal matrix for the k coordinates of all circles, with the rows of one group."""
 
-    ``points`` : (p, 3, k); ``cameras`` : (m, 6, k); ``pose`` : (6, k) of the group's board; ``shape`` : (d, 3, k);
-    ``intrinsics`` : (q, k).
-    """
-
-    points: np.ndarray
-    cameras: np.ndarray
-    pose: np.ndarray
-    shape: np.ndarray
-    intrinsics: np.ndarray
+    points: np.ndarray  # (p, 3, k)
+    cameras: np.ndarray  # (m, 6, k)
+    pose: np.ndarray  # (6, k) of the group's board
+    shape: np.ndarray  # (d, 3, k)
+    intrinsics: np.ndarray  # (q, k)
 
     @classmethod
     def of(cls, block: Block, reduced: Reduced, outer: np.ndarray, shared: Shared) -> "_Answer":
@@ -386,11 +352,7 @@ class _Answer:
         return cls(points, cameras, inner[3 * d :], shape, intrinsics)
 
     def images(self, block: Block, shared: Shared, setting: Setting) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        """Yields the equations of the images batch by batch.
-
-        A batch is its kind of observation, the whitened rows (2n, k), and the whitened derivatives of the observations
-        by the intrinsics (2n, 16).
-        """
+        """Yields by batch of images the kind, whitened rows (2n, k), and derivatives by the intrinsics (2n, 16)."""
         model, camera = block.model, shared.camera
         root = np.sqrt(robust_weights(model, camera, setting.huber))[:, None, None]
         of_circle = np.isin(model.point_index, block.circles)
@@ -399,8 +361,7 @@ class _Answer:
                 batch = indices[begin : begin + AT_ONCE]
                 batch_model = model.observed(batch)
                 by_pose, by_point = projection_jacobians(batch_model, camera)
-                xyz = batch_model.xyz_camera()
-                lens = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
+                lens = batch_model.by_parameters(camera)
                 rows = by_pose @ self.cameras[batch_model.image_index] + by_point @ self.points[batch_model.point_index]
                 rows = rows + (lens @ shared.basis) @ self.intrinsics
                 whitened = (batch_model.whiten(array) * root[batch] for array in (rows, lens))

@@ -28,28 +28,22 @@ Kind = Literal["position", "rotation", "distance"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurand:
-    """A quantity whose uncertainty the budget states.
-
-    It is a face's position or rotation in the target frame (3 numbers, whose uncertainty is the root of the summed
-    variances), or a distance between two circles. ``name`` : the face, or ``a – b``; ``length_mm`` : length of a
-    distance, else None; ``jacobian`` : (r, 3c) by the circles, mm or rad; ``designed`` : (r, d) by the frame
-    circles that were not mapped.
-    """
+    """A face's position or rotation in the target frame, or a distance between two circles. The uncertainty of three
+    numbers is the root of the summed variances."""
 
     kind: Kind
-    name: str
+    name: str  # the face, or ``a – b``
     circles: tuple[CircleLabel, ...]
-    length_mm: float | None
-    jacobian: np.ndarray
-    designed: np.ndarray
+    length_mm: float | None  # of a distance, else None
+    jacobian: np.ndarray  # (r, 3c) by the circles, mm or rad
+    designed: np.ndarray  # (r, d) by the frame circles that were not mapped
 
     def __post_init__(self):
         freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
         freeze(self, "designed", (None, None), f"{self.name}: designed")
 
     def covariance(self, source: Source, designed_sigma_mm: float) -> np.ndarray:
-        """Returns the covariance (r, r) from one source. ``designed_sigma_mm`` matters only for the source of placed
-        circles."""
+        """Covariance (r, r) from one source; ``designed_sigma_mm`` matters only for the source of placed circles."""
         if source.key == PLACED:
             return designed_sigma_mm**2 * self.designed @ self.designed.T
         return self.jacobian @ source.covariance_mm2 @ self.jacobian.T
@@ -60,20 +54,15 @@ PLACED = "placed_circles"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """The uncertainty of one measurand, mm or rad.
-
-    ``contributions`` : by key of the source; ``standard`` : combined standard uncertainty; ``expanded`` : with k = 2;
-    ``coverage`` : simulated coverage of ``expanded``; ``freedom`` : effective degrees of freedom (Welch–Satterthwaite,
-    JCGM 100 G.4).
-    """
+    """The uncertainty of one measurand, mm or rad."""
 
     measurand: Measurand
-    contributions: dict[str, float]
+    contributions: dict[str, float]  # by key of the source
     covariance: np.ndarray
-    standard: float
-    expanded: float
-    coverage: float
-    freedom: float
+    standard: float  # combined standard uncertainty
+    expanded: float  # with k = 2
+    coverage: float  # simulated, of ``expanded``
+    freedom: float  # effective degrees of freedom (Welch–Satterthwaite, JCGM 100 G.4)
 
     def share(self, key: str) -> float:
         """Returns the share of one source in the variance."""
@@ -91,20 +80,16 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Budget:
-    """The uncertainty budget of a run.
-
-    ``circles_covariance_mm2`` : (c, 3, 3) by circle of ``joint``, target frame; ``conditions`` : for which lengths
-    hold. Their correction is not applied to the run's result.
-    """
+    """The uncertainty budget of a run."""
 
     joint: JointResult
     reference_face: str
     sources: tuple[Source, ...]
     rows: tuple[Row, ...]
-    circles_covariance_mm2: np.ndarray
+    circles_covariance_mm2: np.ndarray  # (c, 3, 3) by circle of ``joint``, target frame
     views: tuple[View, ...]
     statement: Statement
-    conditions: Conditions
+    conditions: Conditions  # for which lengths hold; their correction is not applied to the run's result
 
     def of_kind(self, kind: Kind) -> list[Row]:
         """Returns the rows of one kind."""
@@ -112,13 +97,7 @@ class Budget:
 
 
 def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
-    """Returns the budget of a finished run.
-
-    ``run`` : the run. It must be solved jointly, since a chain states no covariance. ``statement`` : stated sizes,
-    temperatures and fields. If None, those that ``board.toml`` states.
-
-    Raises InputError if the run was solved otherwise, or its folder lacks files.
-    """
+    """Returns the budget of a run that was solved jointly; without a statement, with what ``board.toml`` states."""
     if run.faces.solve != "joint" or not run.faces.eccentricity:
         raise InputError(
             "E-BUDGET-NO-COVARIANCE",
@@ -166,10 +145,7 @@ def budget(
     more: tuple[Source, ...] = (),
     camera_given: bool = True,
 ) -> Budget:
-    """Returns the budget of an adjustment. Arguments are as in :func:`stcal.sfm.budget.sources.sources_of`.
-
-    ``more`` : further rows.
-    """
+    """Returns the budget of an adjustment, as :func:`stcal.sfm.budget.sources.sources_of`; ``more``: further rows."""
     sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
     if own.circles_designed.shape[2]:
         sources += (_placed(own),)
@@ -207,8 +183,7 @@ def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> lis
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
-    """Returns, for every two faces and within each face, the two circles farthest apart. The longest distance comes
-    first."""
+    """Returns, for every two faces and within each, the two circles farthest apart, the longest distance first."""
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(labels):
         faces.setdefault(label.face, []).append(i)

@@ -220,10 +220,7 @@ class BudgetFile(ResultFile):
     def of(
         cls, budget: Budget, run: SavedRun, verified: Verified, tests: Sequence[LengthTest] = (), *others: SavedRun
     ) -> "BudgetFile":
-        """Returns the file of a run's budget.
-
-        ``verified`` : state of the run's files; ``others`` : further runs that the tests compare it with.
-        """
+        """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
         refused = any(is_refused(each) for each in (run, *others))
         parts = [LengthTestPart.of(test, refused) for test in tests]
         return cls.model_validate(_content(budget, run, verified) | {"length_tests": parts})

@@ -1,8 +1,5 @@
-"""Length test: distances between circles against stated lengths, or against a second calibration.
-
-Terms are those of VDI/VDE 2634 part 1 and ISO 10360. The length measurement error is the measured minus the reference
-length. E_n is its ratio to the expanded uncertainty of both (ISO 13528:2022, 9.7), at most 1 where they agree.
-"""
+"""Length test: distances between circles against stated lengths, or against a second calibration. Terms are those of
+VDI/VDE 2634 part 1 and ISO 10360; E_n is of ISO 13528:2022, 9.7, at most 1 where both agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -64,10 +61,7 @@ class LengthTest:
 
     @property
     def limit(self) -> float:
-        """Limit of the largest \\|E_n\\|: 1 for one length, more for many.
-
-        The probability that any of the lengths is beyond it by chance is then the same as for one length (Bonferroni).
-        """
+        """Limit of the largest E_n: 1 for one length, more for many, as more go beyond by chance (Bonferroni)."""
         return float(norm.isf(BY_CHANCE / 2 / len(self.lengths)) / COVERAGE_FACTOR)
 
     @property
@@ -77,14 +71,7 @@ class LengthTest:
 
 
 def against_stated(budget: Budget, path: Path) -> LengthTest:
-    """Tests the run against lengths of a CSV file.
-
-    Its columns are ``from``, ``to`` (circles as ``face:circle``), ``length_mm``, and ``sigma_mm``, the standard
-    uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact.
-
-    Raises InputError if the file is not a table of lengths, a circle is not in the run, a length or σ is invalid, or
-    the size of the run is not known.
-    """
+    """Tests the run against a CSV of ``from``, ``to`` (``face:circle``), ``length_mm`` and perhaps ``sigma_mm``."""
     _require_size(budget)
     table = read_table(path, WHAT)
     ends = list(zip(table.text("from"), table.text("to"), strict=True))
@@ -120,13 +107,7 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
 
 
 def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[BoardDesign]) -> LengthTest:
-    """Tests the lengths against a second calibration of the same target.
-
-    The lengths are the longest distances of every two faces, and within each face, between circles that both runs have.
-    ``boards`` : the boards of the two runs.
-
-    Raises InputError if the runs have no two circles of the target in common, or the size of one is not known.
-    """
+    """Tests the longest distances between circles that two calibrations of the same target share."""
     _require_size(budget)
     _require_size(other)
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]

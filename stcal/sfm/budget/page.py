@@ -110,6 +110,7 @@ def budget_report(file: BudgetFile) -> Document:
         for each in file.sources
     ]
     stated = [[each.body, each.key, f"{each.value:g}", each.origin] for each in file.stated]
+    tone = "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
     views = [[each.group, each.images, number(each.spread_deg, 0)] for each in file.views]
     hashes = [
         ["folder of the run", Path(file.run.folder).name],
@@ -200,7 +201,7 @@ def budget_report(file: BudgetFile) -> Document:
             ),
         ],
         banner=[
-            *([macro("answers", [("May the run be used?", file.use)], _tone(file))] if file.use else []),
+            *([macro("answers", [("May the run be used?", file.use)], tone)] if file.use else []),
             Table(
                 ["<Field", "<"],
                 [[HEADS.get(name, name.replace("_", " ")), value or NONE] for name, value in file.fields.items()],
@@ -237,11 +238,6 @@ def _no_certificate(file: BudgetFile) -> str:
     unstated = _unstated(file)
     camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""
     return f"this is not a certificate: nothing is stated of {', '.join(unstated)}; state it with --statement{camera}"
-
-
-def _tone(file: BudgetFile) -> str:
-    """Returns the tone of the run's own answer."""
-    return "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
 
 
 def as_exact(value: float, expanded: float) -> str:
@@ -357,10 +353,7 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         ("combined standard uncertainty u", [number(u.standard, 2) for u in columns.values()]),
         (f"expanded uncertainty U, k = {file.coverage_factor:g}", [significant(u.expanded) for u in columns.values()]),
         ("coverage of U, simulated, %", [number(100 * u.coverage, 1) for u in columns.values()]),
-        (
-            "effective degrees of freedom",
-            [_freedom(u.degrees_of_freedom) for u in columns.values()],
-        ),
+        ("effective degrees of freedom", [_freedom(u.degrees_of_freedom) for u in columns.values()]),
     ):
         rows.append([name, "", *values])
     return Table(heads, rows)

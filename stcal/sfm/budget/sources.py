@@ -58,26 +58,17 @@ class StatementFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """What the user states.
-
-    ``board``, ``target`` : their sizes; ``origin`` : the file that states a value, by ``board`` or ``target`` and key;
-    ``fields`` : fields of the head by name; ``one_thermometer`` : True if the temperatures of both err alike.
-    """
+    """What the user states."""
 
     board: StatedSize
     target: StatedSize
-    origin: dict[tuple[str, str], str]
-    fields: dict[str, str]
-    one_thermometer: bool = False
+    origin: dict[tuple[str, str], str]  # the file that states a value, by ``board`` or ``target`` and key
+    fields: dict[str, str]  # of the head by name
+    one_thermometer: bool = False  # True if the temperatures of both err alike
 
 
 def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
-    """Returns the statement of a run. The file overrides ``board.toml``, and ``given`` overrides fields of the file.
-
-    ``own`` : values stated in the run's ``board.toml``; ``path`` : file of ``--statement``; ``given`` : fields by name.
-
-    Raises InputError if the file is not a statement, or a field is too long.
-    """
+    """Statement of a run: ``own`` of its ``board.toml``, overridden by the file, whose fields ``given`` overrides."""
     file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
     sizes, origin = {}, {}
     for body, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
@@ -115,10 +106,7 @@ def _require_past(text: str, where: str) -> None:
 
 
 def fields_of(given: Sequence[str]) -> dict[str, str]:
-    """Parses ``NAME=VALUE`` into a dictionary.
-
-    Raises InputError if a text has no ``=``, or a name is given twice.
-    """
+    """Parses ``NAME=VALUE`` into a dictionary; an error without ``=``, or for a name given twice."""
     values: dict[str, str] = {}
     for text in given:
         name, sign, value = (word.strip() for word in text.partition("="))
@@ -138,21 +126,16 @@ REFERENCE_C = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """A row of the budget.
+    """A row of the budget."""
 
-    ``key`` : name in files; ``title`` : name in tables; ``evaluation`` : type A (statistics of this run) or B (other
-    knowledge); ``origin`` : where the input's σ comes from, explained in ``words``; ``sigma`` : the σ in ``unit``, None
-    if it is not one number; ``covariance_mm2`` : covariance (3c, 3c) of the circles due to this input alone.
-    """
-
-    key: str
-    title: str
-    evaluation: Literal["A", "B"]
-    origin: Origin
+    key: str  # name in files
+    title: str  # name in tables
+    evaluation: Literal["A", "B"]  # statistics of this run, or other knowledge
+    origin: Origin  # where the input's σ comes from, explained in ``words``
     words: str
-    sigma: float | None
+    sigma: float | None  # in ``unit``, None if it is not one number
     unit: str
-    covariance_mm2: np.ndarray
+    covariance_mm2: np.ndarray  # (3c, 3c) of the circles due to this input alone
 
     def __post_init__(self):
         freeze(self, "covariance_mm2", (None, None), f"{self.key}: covariance")
@@ -160,18 +143,14 @@ class Source:
 
 def sources_of(
     contributions: Contributions,
-    camera: Camera,
+    camera: Camera,  # as given to the run, with the covariance that its file states
     board: BoardDesign,
     flatness_mm: float | None,
-    refined: bool,
+    refined: bool,  # whether its intrinsics were adjusted
     statement: Statement,
-    camera_given: bool = True,
+    camera_given: bool = True,  # False if the camera was found from the photographs
 ) -> tuple[Source, ...]:
-    """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out.
-
-    ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
-    intrinsics were adjusted; ``camera_given`` : False if the camera was found from the photographs.
-    """
+    """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
     zero = np.zeros_like(contributions.joint.covariance_mm2)
     common = contributions.joint.board_common
     shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
@@ -282,8 +261,7 @@ def _scale(by_scale: np.ndarray, none: np.ndarray, statement: Statement) -> Sour
 
 
 def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
-    """Yields two rows: the temperature and the expansion coefficient. ``effect`` : (3c,) effect of a relative change of
-    size."""
+    """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
     zero = np.zeros((len(effect), len(effect)))
     warmer = warmer_k(stated)
     for key, title, sigma, factor, unit in (
@@ -302,11 +280,7 @@ def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: S
 
 
 def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> Source:
-    """Returns the row of an error that the temperatures of board and target have in common (JCGM 100, 5.2.2, r = 1).
-
-    A length is corrected by the difference of the expansions of both, so that such an error nearly cancels if their
-    coefficients are alike.
-    """
+    """Row of an error common to both temperatures (JCGM 100, 5.2.2, r = 1), nearly nil if bodies expand alike."""
     total, absent, sigmas = 0.0, [], []
     for body, stated, effect in bodies:
         sigma, rate = stated.temperature_sigma_k, stated.expansion_ppm_per_k
@@ -335,26 +309,18 @@ def reference_temperature_c(stated: StatedSize) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The temperature for which lengths and positions hold, and what they are corrected by for that.
+    """The temperature for which lengths and positions hold, and what they are corrected by for that."""
 
-    ``size_known`` : False if nothing of known size was in view; ``correction`` : relative, 0 for none;
-    ``temperature_c`` : of the target, None if it is not known; ``words`` : the same as a sentence without its stop.
-    """
-
-    size_known: bool
-    correction: float
-    temperature_c: float | None
-    words: str
+    size_known: bool  # False if nothing of known size was in view
+    correction: float  # relative, 0 for none
+    temperature_c: float | None  # of the target, None if it is not known
+    words: str  # the same as a sentence without its stop
 
 
 def conditions_of(statement: Statement, board: BoardDesign) -> Conditions:
-    """Returns the temperature for which lengths hold, and their correction for the stated expansion.
-
-    The board's grid is larger than its file says by its expansion. The target is larger than at its own reference
-    temperature by its own expansion. The second correction is made only with the first: it starts from the length at
-    the temperature of the photographs, which a board of unknown expansion does not tell. A size that is stated of the
-    target itself holds at its reference temperature (ISO 1), so that no expansion enters.
-    """
+    """Returns the temperature for which lengths hold, and their correction for the expansion of the board and, only
+    with it, of the target: that starts from the length at the photographs' temperature. A size stated of the target
+    itself holds at its reference temperature (ISO 1), so that no expansion enters."""
     target = statement.target
     if any(known.drawn for known in known_distances(board)):
         words = "Only the shape is known, as nothing of known size was in view: no length and no position holds in mm"

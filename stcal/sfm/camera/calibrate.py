@@ -59,23 +59,17 @@ CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class CameraCalibration(Brief):
-    """Result of calibrating one camera.
-
-    ``intrinsics`` : with covariance; ``views`` : views used; ``skipped`` : files and images without a board, and why;
-    ``rounds`` : number of detection rounds; ``projection`` : σ over the image; ``split`` : None with fewer than six
-    views; ``held_out`` : None with fewer than four; ``candidates`` : lens models that were tried, empty if a model was
-    given; ``warnings`` : problems that the σ may not show, and what to do about them.
-    """
+    """Result of calibrating one camera."""
 
     intrinsics: Intrinsics
     views: tuple[ImageObservations, ...]
-    skipped: tuple[Skipped, ...]
-    rounds: int
+    skipped: tuple[Skipped, ...]  # files and images without a board, and why
+    rounds: int  # of detection
     projection: ProjectionSigma
-    split: SplitHalf | None
-    held_out: HeldOut | None
-    warnings: tuple[str, ...]
-    candidates: tuple[Candidate, ...] = ()
+    split: SplitHalf | None  # None with fewer than six views
+    held_out: HeldOut | None  # None with fewer than four
+    warnings: tuple[str, ...]  # problems that the σ may not show, and what to do about them
+    candidates: tuple[Candidate, ...] = ()  # lens models that were tried, empty if a model was given
 
 
 @require_arguments
@@ -135,9 +129,11 @@ def calibrate_camera(
     settled = of_perspective = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
-            detection = _detect(
-                files, camera, colmap_model, target, board, ellipses, Path(cache), workers, progress, rounds
-            )
+            # No size is given: it comes from most of the images, and messages should say so.
+            lens = camera.focal, camera.centre, camera.distortion
+            model = CameraModel(*lens, colmap_model, None, None, "the images")
+            step, options = counted(progress, f"detect {rounds}", len(files)), ellipses or EllipseOptions()
+            detection = detect_files(files, model, target, board, options, Path(cache), workers, step, pictures=False)
             try:
                 views, skipped, result = _of_one_round(
                     files, not_images, detection, board, camera, colmap_model, before is None
@@ -161,8 +157,7 @@ def calibrate_camera(
 def camera_of_dots(
     files: Sequence[ImageFile], detection: DetectionResult, board: BoardDesign, start: Camera, colmap_model: str
 ) -> Intrinsics:
-    """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``; errors as
-    :func:`calibrate_camera`."""
+    """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``."""
     return _of_one_round(files, (), detection, board, start, colmap_model, True)[2]
 
 
@@ -170,14 +165,7 @@ def camera_of_labelled(
     images: Sequence[ImageObservations], board: BoardDesign, camera: Camera
 ) -> tuple[Intrinsics, Intrinsics]:
     """Returns the intrinsics by the labelled dots of the board alone, and an adjustment that keeps those of ``camera``.
-
-    The first begins at a lens that ``camera`` does not influence, and has the same model.
-
-    Raises
-    ------
-    DetectionError, DegenerateError, ConvergenceError
-        As :func:`calibrate_camera`.
-    """
+    The first begins at a lens that ``camera`` does not influence, and has the same model."""
     dots = [[k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)] for image in images]
     views = [image.select(own) for image, own in zip(images, dots, strict=True) if len(own) >= MIN_DOTS]
     require_views(views, (), ())
@@ -197,8 +185,7 @@ def _of_one_round(
     colmap_model: str,
     first: bool,
 ) -> tuple[list[ImageObservations], tuple[Skipped, ...], Intrinsics]:
-    """Returns the views of the board, what was skipped, and the adjusted intrinsics. ``first`` : the focal length of
-    ``camera`` is not known, and with it the depths of the dots, by which they are corrected for defocus."""
+    """Views of the board, what was skipped, and the intrinsics; in the ``first`` round depths are unknown."""
     views = board_views(detection.images, board, camera)
     if not first:
         views, _ = correct_defocus(views, camera, pattern_of_board(board))
@@ -211,10 +198,7 @@ def _of_one_round(
 
 
 def require_model(colmap_model: str) -> None:
-    """Checks that a lens model is supported.
-
-    Raises InputError: it is not. The message lists the supported models.
-    """
+    """Checks that a lens model is supported."""
     if colmap_model not in COLMAP_MODELS:
         raise InputError(
             "E-CAMERA-MODEL",
@@ -225,11 +209,8 @@ def require_model(colmap_model: str) -> None:
 def of_chosen_model(
     calibrate: Callable[[str], CameraCalibration], board: BoardDesign, workers: int | None
 ) -> CameraCalibration:
-    """Returns a calibration with the lens model selected by held-out views.
-
-    ``calibrate`` : calibrates with the model of the given name. Views are found with the usual perspective model, or,
-    if that does not fit, with the usual wide-angle model.
-    """
+    """Returns a calibration with the lens model selected by held-out views, which a usual model finds. ``calibrate``:
+    calibrates with the model of the given name."""
     try:
         first = calibrate(PERSPECTIVE)
     except (DegenerateError, ConvergenceError, DetectionError) as error:
@@ -250,10 +231,7 @@ def judged(
     settled: bool,
     board: BoardDesign,
 ) -> CameraCalibration:
-    """Returns a calibration with σ over the image, split-half check, held-out views and warnings.
-
-    ``settled`` : whether the detection rounds converged.
-    """
+    """Returns a calibration with its checks and warnings; ``settled``: whether the detection rounds converged."""
     projection = projection_sigma(result)
     split = split_half(result, views, board)
     unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
@@ -264,15 +242,6 @@ def judged(
         of_held_out = None
         warnings.append(f"no views could be held out, as the others alone are too few: {error}")
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, of_held_out, tuple(warnings))
-
-
-def _detect(
-    files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, progress, rounds: int
-) -> DetectionResult:
-    # No size is given: it comes from most of the images, and messages should say so.
-    model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
-    step = counted(progress, f"detect {rounds}", len(files))
-    return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step, pictures=False)
 
 
 def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:
@@ -288,10 +257,7 @@ def _without_board(detection: DetectionResult, views: Sequence[ImageObservations
 
 
 def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile], skipped: Sequence[Skipped]) -> None:
-    """Checks that there are enough views of the board.
-
-    Raises DetectionError: there are none. Raises DegenerateError: there are fewer than three.
-    """
+    """Checks that there are enough views of the board."""
     if len(views) >= MIN_VIEWS:
         return
     images = {file.name for file in files}  # other files are skipped too, and explain nothing
@@ -310,10 +276,7 @@ def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile]
 
 
 def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -> None:
-    """Checks that the views determine the focal length and that the lens model fits them.
-
-    Raises DegenerateError: one of them is not so.
-    """
+    """Checks that the views determine the focal length and that the lens model fits them."""
     relative = float((result.sigma()[0] / result.camera.focal[0]).max())
     if relative > MAX_FOCAL_SIGMA:
         raise DegenerateError(
@@ -337,8 +300,7 @@ def residual_rms_px(result: Intrinsics) -> float:
 
 
 def weighted_rms_px(result: Intrinsics) -> float:
-    """Returns the RMS of the residuals per coordinate with the weights of the adjustment, px. A few gross errors, which
-    weigh little, do not change it."""
+    """Returns the RMS residual per coordinate, px, with the adjustment's weights, which gross errors hardly change."""
     weight = np.concatenate(result.weights())
     return float(np.sqrt(np.average((result.residuals_px() ** 2).mean(axis=1), weights=weight)))
 
@@ -350,11 +312,7 @@ def _spread_deg(result: Intrinsics) -> float:
 
 
 def _next_move(before: Intrinsics, after: Intrinsics) -> float:
-    """Returns the predicted largest move of a parameter by another round of detection, in σ.
-
-    It is the last move, reduced by the ratio of the last move of projections to that of the first round, which began
-    without distortion.
-    """
+    """Returns the predicted largest move of a parameter by another round, in σ, as projections' moves decrease."""
     moved = model_parameters(after.camera, after.colmap_model) - model_parameters(before.camera, before.colmap_model)
     ideal = before.camera.normalised_from_pixel(image_grid(before.camera))
     bent_px = np.abs((before.camera.distort(ideal) - ideal) * before.camera.focal).max()

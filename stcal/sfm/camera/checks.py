@@ -38,17 +38,12 @@ MIN_REACH = 0.75
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectionSigma:
-    """σ of projections over the image.
+    """σ of projections over the image."""
 
-    ``xy_px`` : (n, 2) places in the image; ``sigma_px`` : (n,) σ per axis of the image of a known direction there, up
-    to a rotation of the camera, which poses absorb; ``reach`` : (4,) how far dots come towards the corners (top left,
-    top right, bottom left, bottom right), 1 at the corner; ``corner_sigma_px`` : (4,) σ in these corners.
-    """
-
-    xy_px: np.ndarray
-    sigma_px: np.ndarray
-    reach: np.ndarray
-    corner_sigma_px: np.ndarray
+    xy_px: np.ndarray  # (n, 2)
+    sigma_px: np.ndarray  # (n,) per axis, up to a rotation of the camera, which poses absorb
+    reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
+    corner_sigma_px: np.ndarray  # (4,)
 
     def __post_init__(self):
         for name in ("xy_px", "sigma_px", "reach", "corner_sigma_px"):
@@ -57,17 +52,13 @@ class ProjectionSigma:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplitHalf:
-    """Comparison of the intrinsics from every second view with those from the other views, on the same boards.
+    """Comparison of the intrinsics from every second view with those from the other views, on the same boards."""
 
-    ``difference`` : (q,) of the parameters, and ``sigma`` : (q,) its σ; ``p_value`` : of the χ² of all q;
-    ``largest_px`` : largest difference of a projection over the image; ``largest_sigma_px`` : its σ per axis.
-    """
-
-    difference: np.ndarray
+    difference: np.ndarray  # (q,) of the parameters
     sigma: np.ndarray
-    p_value: float
-    largest_px: float
-    largest_sigma_px: float
+    p_value: float  # of the χ² of all q
+    largest_px: float  # difference of a projection over the image
+    largest_sigma_px: float  # per axis
     verdict: Verdict
 
 
@@ -78,12 +69,8 @@ def image_grid(camera: Camera) -> np.ndarray:
 
 
 def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Returns the derivative (n, 2, q) of the images of fixed directions at :func:`image_grid` by the parameters.
-
-    The part that a rotation of the camera can absorb is removed.
-
-    Raises DegenerateError: the distortion folds the image over.
-    """
+    """Returns the derivative (n, 2, q) of the images of fixed directions at :func:`image_grid` by the parameters,
+    without the part that a rotation of the camera absorbs."""
     try:
         ideal = camera.normalised_from_pixel(image_grid(camera))
     except ConvergenceError as error:
@@ -117,10 +104,7 @@ def projection_sigma(result: Intrinsics) -> ProjectionSigma:
 
 
 def split_half(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> SplitHalf | None:
-    """Compares both halves of the views; None with fewer than six views.
-
-    One adjustment with a camera for each half accounts for the dots that the halves have in common.
-    """
+    """Compares both halves of the views by one adjustment with two cameras; None with fewer than six views."""
     if len(views) < 2 * MIN_HALF:
         return None
     both = of_two_halves(result, views, board)
@@ -170,16 +154,12 @@ CLIP_SIGMAS = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Residuals of views that were not used by the calibration; only the poses of these views were fitted.
+    """Residuals of views that were not used by the calibration; only the poses of these views were fitted."""
 
-    ``residuals_px`` and ``in_sigma`` : by view, (n, 2), px and in the detected centres' σ; ``factor`` : median factor
-    by which residuals of the calibrations exceed these σ; ``folds`` : number of parts.
-    """
-
-    residuals_px: tuple[np.ndarray, ...]
-    in_sigma: tuple[np.ndarray, ...]
-    factor: float
-    folds: int
+    residuals_px: tuple[np.ndarray, ...]  # by view, (n, 2)
+    in_sigma: tuple[np.ndarray, ...]  # the same in the detected centres' σ
+    factor: float  # median, by which residuals of the calibrations exceed these σ
+    folds: int  # number of parts
 
     def rms_px(self, factor: float | None = None) -> float:
         """Returns the RMS per coordinate without gross errors; ``factor`` replaces the factor of this object."""
@@ -194,18 +174,14 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A lens model that was compared with others.
-
-    ``parameters`` : their number; ``rms_px`` : RMS of held-out views; ``worse`` : their mean square minus that of the
-    best model, in σ², and ``worse_sigma`` its standard error; ``why`` : why it could not be tried, or ``""``.
-    """
+    """A lens model that was compared with others."""
 
     model: str
-    parameters: int
-    rms_px: float | None
-    worse: float | None
-    worse_sigma: float | None
-    why: str = ""
+    parameters: int  # their number
+    rms_px: float | None  # of held-out views
+    worse: float | None  # their mean square minus that of the best model, in σ²
+    worse_sigma: float | None  # its standard error
+    why: str = ""  # it could not be tried
 
 
 def held_out(
@@ -236,13 +212,7 @@ def choose_model(
     views: Sequence[ImageObservations], board: BoardDesign, known: Intrinsics, workers: int | None = None
 ) -> tuple[str, tuple[Candidate, ...]]:
     """Returns the simplest lens model that predicts held-out views as well as the best one, and all candidates.
-
-    ``views`` : dots of the board, found with about the right camera; ``board`` : BoardDesign; ``known`` : intrinsics of
-    any model that fits; start of all models of the same projection; ``workers`` : number of processes; one per core if
-    None.
-
-    Raises StcalError: no model can be calibrated with four fifths of the views.
-    """
+    ``known``: intrinsics of any model that fits, at which models of the same projection start."""
     starts = [(views, board, known.camera, model) for model in CANDIDATES]
     fitted = dict(zip(CANDIDATES, run_in_order(_fitted, starts, workers), strict=True))
     factors = {m: entry.factors.centres for m, entry in fitted.items() if isinstance(entry, Intrinsics)}

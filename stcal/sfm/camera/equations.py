@@ -22,15 +22,11 @@ BENT_P = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardShape:
-    """Design places of a folder's dots, and the prior of their deviations.
+    """Design places of a folder's dots, and the prior of their deviations."""
 
-    ``places`` : (n, 3) mm; ``bow`` : (3n, m) orthonormal, second-order bends of the board out of its plane;
-    ``bow_sigma_mm`` : σ of the amplitude of each bend. All other deviations are independent with the board's σ.
-    """
-
-    places: np.ndarray
-    bow: np.ndarray
-    bow_sigma_mm: float
+    places: np.ndarray  # (n, 3) mm
+    bow: np.ndarray  # (3n, m) orthonormal, second-order bends of the board out of its plane
+    bow_sigma_mm: float  # of the amplitude of each bend; all else deviates with the board's σ
 
     @classmethod
     def of(cls, places: np.ndarray) -> "BoardShape":
@@ -60,10 +56,7 @@ class BoardShape:
         return cost_of_dots, float(bends @ bends) / (sigma_mm**2 + self.bow_sigma_mm**2)
 
     def redundancy(self, board: Reduction, covariance: np.ndarray, sigma_mm: float) -> float:
-        """Returns the redundancy of the observations of the dots without the bends.
-
-        ``board`` : reduction of the dots; ``covariance`` : of the unknowns that are kept.
-        """
+        """Returns the redundancy of the dots without the bends; ``covariance``: of the unknowns that are kept."""
         inverse, from_kept = board.inverse[0], board.from_kept[0]
         bent = from_kept.T @ self.bow
         taken = np.trace(inverse) + np.sum((from_kept @ covariance) * from_kept)
@@ -73,10 +66,7 @@ class BoardShape:
     def flat_by_chance(
         self, xyz: np.ndarray, board: Reduction, covariance: np.ndarray, sigma_mm: float
     ) -> "BoardShape":
-        """Returns the shape without bends if the bends of ``xyz`` (n, 3) are insignificant, else itself.
-
-        Other arguments as in :meth:`redundancy`.
-        """
+        """Returns the shape without bends if those of ``xyz`` (n, 3) are insignificant, else itself."""
         bends = self.bow.T @ (xyz - self.places).ravel()
         bent = board.from_kept[0].T @ self.bow
         spread = self.bow.T @ board.inverse[0] @ self.bow + bent.T @ covariance @ bent
@@ -99,14 +89,10 @@ START_DAMPING = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Unknowns of a calibration.
+    """Unknowns of a calibration."""
 
-    ``models`` : views of one folder's board by one camera each; ``camera_of`` : of each model. Models of one folder
-    share their points.
-    """
-
-    models: tuple[MetricModel, ...]
-    camera_of: tuple[int, ...]
+    models: tuple[MetricModel, ...]  # of one folder's board by one camera each; those of a folder share points
+    camera_of: tuple[int, ...]  # of each model
     cameras: tuple[Camera, ...]
 
     def boards(self) -> dict[str, list[int]]:
@@ -139,10 +125,7 @@ class State:
         return np.concatenate([normalised(m, self.cameras[k]) for m, k in each])
 
     def redundancy(self, kept: int) -> int:
-        """Returns the redundancy: observed coordinates minus unknowns of poses minus the ``kept`` unknowns.
-
-        The dots add as many observations as unknowns.
-        """
+        """Observed coordinates minus unknowns of poses minus ``kept``; dots are observed as often as unknown."""
         poses = sum(len(m.images) for m in self.models)
         return sum(2 * len(m.image_index) for m in self.models) - 6 * poses - kept
 
@@ -165,13 +148,10 @@ OF_OBSERVATIONS = ("point_index", "keypoint", "measured_px", "shift_px", "covari
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """Constants of one minimisation.
+    """Constants of one minimisation."""
 
-    By camera, ``basis`` : (16, q) and ``weight`` : (q, q) of the vague prior about ``start``.
-    """
-
-    basis: tuple[np.ndarray, ...]
-    weight: tuple[np.ndarray, ...]
+    basis: tuple[np.ndarray, ...]  # by camera, (16, q)
+    weight: tuple[np.ndarray, ...]  # by camera, (q, q) of the vague prior about ``start``
     start: tuple[Camera, ...]
     shape: dict[str, BoardShape]
     sigma_mm: float
@@ -217,9 +197,9 @@ def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
     block, block_right, cross = [], [], []
     for i in rows:
         model, k = state.models[i], state.camera_of[i]
-        camera, xyz = state.cameras[k], model.xyz_camera()
+        camera = state.cameras[k]
         by_pose, by_point = projection_jacobians(model, camera)
-        by_kept = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ setting.basis[k]
+        by_kept = model.by_parameters(camera) @ setting.basis[k]
         root = np.sqrt(robust_weights(model, camera, setting.huber))[:, None]
         a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_kept))
         equations = equations_of_poses(model, a, c, e, normalised(model, camera) * root)
@@ -291,8 +271,7 @@ class Normal:
         }
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step of the kept unknowns, then of the boards' dots, then of their poses; and the predicted
-        gain."""
+        """Returns the step of the kept unknowns, the boards' dots, and their poses; and the predicted gain."""
         kept_step = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
         gain = 2 * float(kept_step @ self.right) - float(kept_step @ self.normal @ kept_step)
         gain += sum(each.gain for each in (*self.boards, *self.poses))
@@ -314,10 +293,7 @@ class Normal:
 
 
 def minimum(state: State, setting: Setting) -> State:
-    """Returns the state of least cost. Only the kept unknowns are damped; dots and poses are optimal for each step.
-
-    Raises ConvergenceError: no minimum is reached.
-    """
+    """Returns the state of least cost. Only the kept unknowns are damped; dots and poses are optimal for each step."""
     solution = minimise(
         state,
         lambda at: Normal.of(at, setting),

@@ -37,15 +37,9 @@ def start_camera(width: int, height: int, colmap_model: str) -> Camera:
 
 
 def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
-    """Returns ``camera`` with the focal length estimated from the homographies of the boards.
-
-    If the homographies give no plausible focal length, as those of a few corners or of boards that face the camera do,
-    it is the one of :data:`TRIED_FOCALS` with which the boards fit best. The camera is unchanged for equidistant
-    lenses, as their rays depend on the focal length.
-
-    Zhang (2000), sec. 3.1, with square pixels and known principal point: the two axes of each board are orthogonal
-    and equally long, which is linear in 1/f². Lens distortion of ``camera`` is removed first.
-    """
+    """Returns ``camera`` with the focal length by the homographies (Zhang 2000, sec. 3.1, square pixels, known
+    principal point), or else the one of :data:`TRIED_FOCALS` that fits best; unchanged for equidistant lenses, whose
+    rays depend on it."""
     if camera.fisheye:
         return camera
     coefficients, constants = [], []
@@ -64,8 +58,7 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
 
 
 def _best_of_several(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
-    """Returns ``camera`` with the focal length, of several, with which the boards fit best: by the mean over views of
-    the RMS distance from their dots, so that no view outweighs the others."""
+    """``camera`` with the focal length of several that fits best: by the mean over views of the RMS distance."""
     largest = sorted(observations, key=len)[-TRIED_VIEWS:]
     cameras = [replace(camera, focal=np.full(2, share * max(camera.width, camera.height))) for share in TRIED_FOCALS]
 
@@ -81,10 +74,7 @@ def _best_of_several(observations: Sequence[ImageObservations], board: BoardDesi
 
 
 def start_pose(image: ImageObservations, board: BoardDesign, camera: Camera) -> Rigid:
-    """Returns camera_from_board of one view.
-
-    Raises DegenerateError: the dots do not determine the pose.
-    """
+    """Returns camera_from_board of one view; an error if the dots do not determine it."""
     pose = camera_from_plane(_homography(image, board, camera))
     return refine_planar_pose(pose, board.places_mm(image.labels)[:, :2], camera.normalised_from_pixel(image.centre_px))
 
@@ -94,12 +84,8 @@ def _homography(image: ImageObservations, board: BoardDesign, camera: Camera) ->
 
 
 def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Camera) -> list[ImageObservations]:
-    """Returns the dots of every image that shows the board, numbered consistently in all images of a folder.
-
-    A plain board looks the same after half a turn, and if a strip is hidden, rows may be numbered off by one. A wrong
-    numbering only breaks the match between the dots and their individual deviations from the grid. The numbering is
-    therefore selected by these deviations, which a good ``camera`` shows best.
-    """
+    """Returns the dots of every image that shows the board, numbered consistently in all images of a folder. A wrong
+    numbering only breaks the match to deviations from the grid: by these, as ``camera`` shows them, it is selected."""
     views = []
     for image in images:
         sighting = image.detection.board
@@ -177,26 +163,19 @@ class SigmaFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intrinsics:
-    """Intrinsics of c cameras after the adjustment.
-
-    ``covariance`` : (cq, cq) of the parameters of ``colmap_model``, camera by camera; ``models`` : views of one
-    folder's board by one camera, mm, board frame; ``camera_of`` : camera of each model; ``huber`` : length of a
-    normalised residual beyond which its weight decreases; ``settled`` : whether σ and eccentricities converged within
-    :data:`MAX_ROUNDS`; ``restarted`` : whether the descent from the start did not end, and began again with the focal
-    length alone; ``solution`` : state and setting from which solutions of some of the views start.
-    """
+    """Intrinsics of c cameras after the adjustment."""
 
     cameras: tuple[Camera, ...]
     colmap_model: str
-    covariance: np.ndarray
-    models: tuple[MetricModel, ...]
-    camera_of: tuple[int, ...]
+    covariance: np.ndarray  # (cq, cq) of the parameters of ``colmap_model``, camera by camera
+    models: tuple[MetricModel, ...]  # of one folder's board by one camera, mm, board frame
+    camera_of: tuple[int, ...]  # of each model
     factors: SigmaFactors
-    huber: float
+    huber: float  # length of a normalised residual beyond which its weight decreases
     redundancy: int
-    settled: bool
-    solution: tuple[State, Setting]
-    restarted: bool = False
+    settled: bool  # whether σ and eccentricities converged within :data:`MAX_ROUNDS`
+    solution: tuple[State, Setting]  # from which solutions of some of the views start
+    restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
 
     @property
     def camera(self) -> Camera:
@@ -225,11 +204,9 @@ def model_parameters(camera: Camera, colmap_model: str) -> np.ndarray:
 
 
 def vague_prior(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Returns the covariance (q, q) of a prior that any lens fulfils. It only keeps the normal matrix regular.
-
-    σ: focal length 100 %; principal point a quarter of the longer side; each distortion coefficient the value that
-    moves the image's corner by its distance from the middle (tangential: by a tenth of it).
-    """
+    """Returns the covariance (q, q) of a prior that any lens fulfils, for a regular normal matrix: focal length 100 %,
+    principal point a quarter of the side; distortion moves the corner by its distance from the middle (tangential: a
+    tenth)."""
     side = max(camera.width, camera.height)
     reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
     radial = reach ** -np.array([2.0, 4, 6])
@@ -244,19 +221,11 @@ def adjust_intrinsics(
     board: BoardDesign,
     start: Camera,
     colmap_model: str,
-    camera_of_view: Sequence[int] | None = None,
-    factors: SigmaFactors | None = None,
-    held: bool = False,
+    camera_of_view: Sequence[int] | None = None,  # for a comparison of cameras 0, 1, … on the same boards
+    factors: SigmaFactors | None = None,  # of σ; estimated if None
+    held: bool = False,  # intrinsics stay at ``start``, and ``covariance`` is (0, 0)
 ) -> Intrinsics:
-    """Adjusts the intrinsics from ``start``.
-
-    ``views`` : at least three views, with dots of the board only; ``camera_of_view`` : camera of each view, for a
-    comparison of cameras 0, 1, … on the same boards; ``factors`` : known factors of σ; estimated if None; ``held`` : if
-    True, intrinsics stay at ``start``, only poses and boards are adjusted, and ``covariance`` is (0, 0).
-
-    Raises ConvergenceError: no minimum is reached. Raises DegenerateError: the dots of a view do not determine its
-    pose.
-    """
+    """Adjusts the intrinsics from ``start`` by at least three views, with dots of the board only."""
     basis = intrinsic_basis(colmap_model)[:, : 0 if held else None]
     state = _start_state(views, camera_of_view or [0] * len(views), board, start)
     c = len(state.cameras)
@@ -304,10 +273,7 @@ they end, in σ²: no parameter is then off by more than a third of its σ."""
 
 def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
     """Returns the intrinsics from some of the views of ``result``: by steps from the solution of all, with its weights,
-    and the factors of σ by one step of their own.
-
-    Raises ConvergenceError, DegenerateError: as :func:`adjust_intrinsics`, which solves where the steps do not settle.
-    """
+    and the factors of σ by one step of their own; by :func:`adjust_intrinsics` where the steps do not settle."""
     state, setting = result.solution
     last = _stepped(state.only({view.name for view in views}), setting)
     if last is None:
@@ -316,10 +282,7 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
 
 
 def of_two_halves(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
-    """Returns the intrinsics of two cameras, of which each took every second view of the same boards.
-
-    Raises ConvergenceError, DegenerateError: as :func:`of_some_views`.
-    """
+    """Returns the intrinsics of two cameras, of which each took every second view of the same boards."""
     state, setting = result.solution
     half = [i % 2 for i in range(len(views))]
     halves = state.in_two({view.name: k for view, k in zip(views, half, strict=True)})
@@ -347,13 +310,7 @@ def _stepped(state: State, setting: Setting) -> Normal | None:
 def _adjusted(
     state: State, setting: Setting, board: BoardDesign, colmap_model: str, known: SigmaFactors | None
 ) -> Intrinsics:
-    """Alternates minimisation and estimation of σ and eccentricity until these converge.
-
-    ``state``, ``setting`` : start; the models of the state have the detected centres' σ; ``known`` : factors of σ;
-    estimated if None.
-
-    Raises ConvergenceError: no minimum is reached.
-    """
+    """Alternates minimisation and estimation of σ and eccentricity; ``known``: factors of σ, estimated if None."""
     detected_covariance, factors = [m.covariance_px2 for m in state.models], known or SigmaFactors()
     last: Normal | None = None
     settled = False

@@ -4,15 +4,7 @@ import numpy as np
 
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.report.camera import distortion_figure
-from stcal.report.document import (
-    Document,
-    Section,
-    Table,
-    alarms,
-    page_only,
-    plot,
-    plots,
-)
+from stcal.report.document import Document, Section, Table, alarms, page_only, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
 from stcal.sfm.camera.calibrate import CameraCalibration

@@ -32,16 +32,12 @@ MAD_EFFICIENCY = 0.37
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Radii:
-    """Radii of the target's circles and the board's dots, over all images and groups.
-
-    ``labels`` ; ``design_mm`` : (c,); ``ratio`` : (c,) measured over designed, median; ``size_px`` : (c,) designed
-    radius in the images, geometric mean of the ellipse's axes, median.
-    """
+    """Radii of the target's circles and the board's dots: medians over all images and groups."""
 
     labels: tuple[Label, ...]
-    design_mm: np.ndarray
-    ratio: np.ndarray
-    size_px: np.ndarray
+    design_mm: np.ndarray  # (c,)
+    ratio: np.ndarray  # (c,) measured over designed
+    size_px: np.ndarray  # (c,) designed radius in the images, geometric mean of the ellipse's axes
 
     def __post_init__(self):
         for name in ("design_mm", "ratio", "size_px"):
@@ -71,12 +67,9 @@ def measure_radii(
     images: Sequence[ImageObservations],
     design_mm: dict[Label, float],
     camera: Camera,
-    rim_mm: Mapping[Label, float],
+    rim_mm: Mapping[Label, float],  # heights of the rims that the result allows for, which hide a part of the circles
 ) -> Radii:
-    """Computes radii from the areas of the ellipses and the positions and planes of the circles.
-
-    ``rim_mm`` : heights of the rims that the result allows for, which hide a part of the circles.
-    """
+    """Computes radii from the areas of the ellipses and the positions and planes of the circles."""
     by_name = {image.name: image for image in images}
     ratio: dict[Label, list[np.ndarray]] = {}
     size: dict[Label, list[np.ndarray]] = {}
@@ -136,16 +129,11 @@ KINDS = {"circles": ("circles of the faces", "the faces lie"), "dots": ("dots of
 
 def rim_check(
     rims: Mapping[str, Rim],
-    sigma_mm: float | None,
-    allowed_mm: Mapping[str, float | None],
+    sigma_mm: float | None,  # largest σ of a face's position; a rim that moves the faces by less does no harm
+    allowed_mm: Mapping[str, float | None],  # the height that the result allows for; None: that estimated here
     has_circles: bool = True,
 ) -> Check:
-    """Tests whether circles lie behind a rim, from the change of their radii with tilt.
-
-    ``rims`` : by kind of circle; ``sigma_mm`` : largest σ of a face's position; a rim that moves the faces by less
-    than this is seen and does no harm; ``allowed_mm`` : by kind of circle, the height that the result allows for, None
-    if it uses the height estimated here, and 0 for other kinds; ``has_circles`` : False if there are only corners.
-    """
+    """Tests whether circles lie behind a rim, from the change of their radii with tilt."""
     key, title = "rim", "Rim in front of the circles"
     if not has_circles:
         return impossible(key, title, "corners alone, which have no rim", "")
@@ -178,10 +166,7 @@ def rim_check(
 
 
 def size_by_radii(radii: Radii) -> Size | None:
-    """Returns the slope of measured over designed radii of the target's circles, minus 1.
-
-    The result is None if all radii are alike, or if there are fewer than ``MIN_PEERS`` circles.
-    """
+    """Slope of measured over designed radii of the target's circles, minus 1; None if it is not determined."""
     is_circle = np.array([isinstance(label, CircleLabel) for label in radii.labels], bool)
     size = radii.size_px[is_circle]
     design = radii.design_mm[is_circle]
@@ -205,11 +190,7 @@ PITCH = "Scale of the board against the target's design"
 
 
 def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]:
-    """Tests the dots of every group against the grid, and the scale of each row and column against the rest.
-
-    The grid is tested as a whole with its stated σ. If the whole board is worse than stated, its rows and columns are
-    judged by its actual deviations.
-    """
+    """Tests the dots of every group against the grid, and the scale of each row and column against the rest."""
     whole, lines = [], []
     for network in networks:
         dots = np.array([i for i, label in enumerate(network.model.labels) if isinstance(label, DotLabel)])
@@ -233,11 +214,8 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
 
 
 def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
-    """Returns dots minus grid after a similarity, their weight matrix, and their cells (d, 2).
-
-    The differences are (3d,) mm, board frame. The weight matrix is the inverse of their covariance (pseudo), with the
-    noise of this group, so that a noisy image is not taken for a bent board.
-    """
+    """Returns dots minus grid after a similarity, (3d,) mm, their weight matrix with the group's noise, and their
+    cells."""
     labels = [network.model.labels[i] for i in dots]
     cells = dot_cells(labels)
     design = board.places_mm(labels)
@@ -276,16 +254,8 @@ def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redun
 
 
 def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii, has_board: bool = True) -> Check:
-    """Tests the measured size of the target against its design.
-
-    If the pitch of the board is wrong as a whole, everything else is too large or too small, and no residual shows it.
-
-    Positions: a similarity maps the design to the circles of each face, and its residuals give the σ of their
-    placement. Radii: the slope of measured over designed radii, which a constant bias of the edges does not change. The
-    weighted mean of both is tested, with 100 ppm as σ of the target's own size, in addition to that of the result. A
-    wrong pitch scales both alike; radii that contradict the positions are wrong themselves, and are left out.
-    Without a board (``has_board``) the result has its size from printed faces or known distances.
-    """
+    """Tests the measured size of the target, by positions and by radii of circles, against its design, with its own σ
+    of 100 ppm: no residual shows a wrong pitch. Radii that contradict the positions are left out."""
     if target.up_to_scale:
         return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
     positions, of_radii = _size_by_positions(calibrated, target), size_by_radii(radii)

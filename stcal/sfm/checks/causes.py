@@ -1,10 +1,5 @@
-"""Causes of the whole set: each is fitted as a hypothesis, and the one that explains most with fewest parameters is
-named first.
-
-A cause that all images share makes many checks fail, which each name something else. A hypothesis is a set of further
-parameters of the free networks (score test). It explains the part by which it reduces the squared residuals beyond
-chance.
-"""
+"""Causes of the whole set: further parameters of the free networks (score test). The hypothesis that explains most of
+the squared residuals beyond chance with fewest parameters is named first."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -43,21 +38,14 @@ LEAST_SHIFT_PX = 3.0
 
 @dataclass(frozen=True, slots=True)
 class _Cause:
-    """A hypothesis.
-
-    ``name``, ``remedy`` in words; ``size`` : its size in words, from the estimates (q,) and their σ; ``columns`` : (n,
-    2, q) derivatives of the projections of a network over σ; ``scope`` : one set of parameters for all images, or one
-    for each group or image; ``whole`` : True if the first parameter is 1 where the hypothesis is true, and so is not
-    free, or 0 or 1 in each image; ``direction`` : (p, q) derivatives of the camera's parameters, None of what is no
-    matter of the camera file.
-    """
-
     name: str
     remedy: str
-    size: Callable[[np.ndarray, np.ndarray], str]
-    columns: Callable[[Network], np.ndarray]
+    size: Callable[[np.ndarray, np.ndarray], str]  # its size in words, from the estimates (q,) and their σ
+    columns: Callable[[Network], np.ndarray]  # (n, 2, q) derivatives of the projections over σ
     scope: str = "all"
+    # the first parameter is 1 where the hypothesis is true, or 0 or 1 in each image, and so not free
     whole: bool = False
+    # (p, q) derivatives of the camera's parameters; None: no matter of the camera file
     direction: np.ndarray | None = None
 
 
@@ -73,15 +61,8 @@ class _Fitted:
 def whole_set_cause(
     networks: Sequence[Network], camera: Camera, moved: bool = False, from_file: bool = True, most_left: float = 1.0
 ) -> Check | None:
-    """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals.
-
-    The residuals beyond chance are those that the most flexible hypothesis explains. Of all hypotheses that explain
-    ``EXPLAINS_ALL`` of it, less what chance may do, the one with fewest parameters is named.
-
-    ``moved`` : whether the target seems to have moved, and no few images are the culprits; ``from_file`` : False if the
-    camera was found from the same photographs, so that no file can be wrong; ``most_left`` : largest factor on the
-    residuals that a cause may leave.
-    """
+    """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals. What
+    is beyond chance is what the most flexible hypothesis explains."""
     possible = [cause for cause in _hypotheses(camera) if from_file or cause.direction is None]
     fitted = [f for cause in possible if (f := _fit(cause, networks)) is not None]
     if not fitted:
@@ -123,21 +104,7 @@ def whole_set_cause(
 
 
 def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_model: str) -> Check | None:
-    """Returns a failed check that names what of a camera file is wrong; None if no hypothesis on the file explains it.
-
-    Unlike :func:`whole_set_cause` it begins at the true camera, so that the file may be far off.
-
-    Parameters
-    ----------
-    camera
-        The camera of the file.
-    found
-        The camera of the photographs.
-    covariance : (q, q)
-        Covariance of the parameters of ``found``.
-    colmap_model
-        COLMAP's camera model, which has these parameters.
-    """
+    """Returns a failed check that names what of a camera file is wrong against the true camera, or None."""
     to_model = np.linalg.pinv(intrinsic_basis(colmap_model))
     weight = np.linalg.inv(covariance)
     off = to_model @ (found.parameters() - camera.parameters())
@@ -247,10 +214,7 @@ def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
 
 
 def _explained_by_one(networks: Sequence[Network], left: float) -> float:
-    """Returns how much leaving out one image explains, at most.
-
-    ``left`` : squared residual per degree of freedom that remains unexplained.
-    """
+    """Returns how much leaving out one image explains, at most; ``left``: unexplained square per degree of freedom."""
     most = 0.0
     for network in networks:
         for image in range(len(network.model.images)):
@@ -288,7 +252,7 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     removed = -camera.parameters()[:, None] * (np.arange(len(unit)) > 3)[:, None]
 
     def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
-        return lambda network: network.model.whiten(_by_parameters(network, camera) @ direction)
+        return lambda network: network.model.whiten(network.model.by_parameters(camera) @ direction)
 
     def of_file(name: str, remedy: str, size: Size, direction: np.ndarray, whole: bool = False) -> _Cause:
         return _Cause(name, remedy, size, by(direction), whole=whole, direction=direction)
@@ -369,11 +333,6 @@ def _turned(camera: Camera, quarters: int) -> np.ndarray:
         parameters[12:16] = s3, s4, -s1, -s2
         size = size[::-1]
     return parameters
-
-
-def _by_parameters(network: Network, camera: Camera) -> np.ndarray:
-    xyz = network.model.xyz_camera()
-    return camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
 
 
 def _by_row(network: Network) -> np.ndarray:

@@ -26,16 +26,12 @@ MOVED_REMEDY = "sort the images into groups in which nothing moved, or take them
 
 @dataclass(frozen=True, slots=True)
 class Guilt:
-    """Result of a search among suspects, which are the images of a group, or groups.
+    """Result of a search among suspects, which are the images of a group, or groups."""
 
-    ``where`` : what the suspects are in, for sentences; ``culprits`` : smallest set of suspects without which
-    the result is sound, empty if another set cures it as well, or if half of all suspects or more are needed;
-    ``rivals`` : suspects of which leaving out any one cures the result.
-    """
-
-    where: str
+    where: str  # what the suspects are in, for sentences
+    # smallest set without which the result is sound; empty if another set cures it too, or half are needed
     culprits: tuple[str, ...] = ()
-    rivals: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()  # suspects of which leaving out any one cures the result
 
     def words(self) -> str:
         """Returns why no culprit is named, empty if one is."""
@@ -47,10 +43,7 @@ class Guilt:
 
 
 def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None], where: str) -> Guilt:
-    """Returns the culprits among suspects.
-
-    ``worst`` : returns the suspect that the others contradict most if some are left out, None if the rest is sound.
-    """
+    """Culprits; ``worst`` gives whom the others contradict most if some are left out, None if all is sound."""
     out: list[int] = []
     while (next_one := worst(out)) is not None:
         out.append(next_one)
@@ -72,21 +65,7 @@ def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None
 
 
 def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[int], count: int, where: str) -> Guilt:
-    """Returns the images of a group that further parameters of their own cure.
-
-    Parameters
-    ----------
-    network
-        The free network of the group.
-    columns : (n, 2, q)
-        Derivatives of the projections by the parameters, over σ.
-    suspects
-        Images that may have them.
-    count
-        Number of values tested, for the limit.
-    where
-        What the images are in, for sentences.
-    """
+    """Returns the images that further parameters, ``columns`` (n, 2, q) over σ, cure, of ``count`` values tested."""
     n, _, q = columns.shape
     images, place = len(network.model.images), network.model.image_index
     apart = np.zeros((n, 2, images, q))
@@ -123,11 +102,8 @@ def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[
 
 
 def moved_apart(model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign) -> bool:
-    """Whether the observations of a group that contradict one another agree if faces and board are taken by themselves.
-
-    Then the camera is right, and target and board moved relative to each other between the images. Where the camera is
-    wrong, the dots and circles by themselves do not agree to their σ either.
-    """
+    """Whether contradicting observations of a group agree if faces and board are taken by themselves: then the camera
+    is right, and target and board moved relative to each other."""
     on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])[model.point_index]
     try:
         radius = {**target.radius_of(), **board.radius_of()}

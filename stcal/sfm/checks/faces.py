@@ -51,15 +51,7 @@ class Again:
         return run_in_order(_adjusted, jobs, 1)
 
     def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
-        """Returns the poses of ``faces`` by the adjustment of a part of the models, and that adjustment.
-
-        The poses are in the frame of the first face.
-
-        Raises
-        ------
-        StcalError
-            The adjustment has no result, or it does not determine the faces.
-        """
+        """Returns the poses of ``faces``, in the frame of the first one, by the adjustment of a part of the models."""
         if isinstance(joint, StcalError):
             raise joint
         whole = self.calibration.target
@@ -95,11 +87,7 @@ def _difference(a: Rigid, b: Rigid) -> np.ndarray:
 
 
 def halves_check(again: Again) -> Check:
-    """Compares the results from two halves of the images; each half has every second image of every group.
-
-    The difference is tested against the sum of both covariances. The board's own deviations are common to both halves,
-    which makes the test a little milder.
-    """
+    """Compares two halves of the images, alternate ones of every group; the board's deviations are common to both."""
     key, title = "halves", "Two halves of the images against each other"
     models, reference = again.joint.models, again.calibration.target.reference_face
     fewest = min(models, key=lambda model: len(model.images))
@@ -131,11 +119,8 @@ def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy
 
 
 def groups_check(again: Again, networks: Sequence[Network]) -> Check:
-    """Compares the result without one group with the whole result, for each group that all faces can spare.
-
-    The covariance of the change is the difference of the two covariances, as of a nested adjustment. A group is named
-    only if the others agree without it, and do not if another one is left out instead.
-    """
+    """Compares the result without one group with the whole, with the covariance of a nested adjustment. A group is
+    named only if the others agree without it, and do not if another one is left out instead."""
     key, title = "groups", "The result without each group"
     calibration = again.calibration
     models, whole = again.joint.models, calibration.target
@@ -221,10 +206,7 @@ def _linked(members: list[set[str]], start: str) -> set[str]:
 
 
 def loops_check(again: Again) -> Check:
-    """Compares two ways to one face through different groups, with each group adjusted alone with its board.
-
-    The difference is tested against the covariances of the single steps.
-    """
+    """Compares two ways to one face through different groups, with each group adjusted alone with its board."""
     key, title = "loops", "Ways to a face through different groups"
     calibration = again.calibration
     pairs = [
@@ -283,12 +265,8 @@ def _along(steps: _Steps, way: FaceChain) -> tuple[Rigid, np.ndarray]:
 
 
 def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
-    """Tests σ₀ of the joint adjustment: what one target, the board's σ and flat faces add to the residuals.
-
-    The increase over the free networks is compared with its expectation (F test of nested models). The verdict is at
-    least suspicious if the adjustment has not settled, which is no matter of chance: contradictory observations make
-    its last steps slow.
-    """
+    """Tests what one target, the board's σ and flat faces add to the residuals (F test of nested models). An adjustment
+    that has not settled is suspicious: contradictory observations make its last steps slow."""
     key, title = "agreement", "Groups, board and faces against one another"
     extra, freedom, free = _added(joint, networks)
     if freedom < 1:
@@ -313,11 +291,8 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
 def flatness_check(
     networks: Sequence[Network], flatness_mm: float | None, printed: Collection[str] = (), factor: float = 1.0
 ) -> Check:
-    """Tests the distance of each circle from the plane of the other circles of its face.
-
-    It is taken from the free networks of all groups that see the circle, and tested against its σ and the stated
-    flatness. ``printed`` : ids of faces of known shape, whose flatness is ``factor`` times the stated one.
-    """
+    """Tests the distance of each circle from the plane of the other circles of its face in all free networks.
+    ``printed``: ids of faces of known shape, whose flatness is ``factor`` times the stated one."""
     key, title = "flatness", "Each point against the plane of its face"
     if flatness_mm is None:
         return impossible(key, title, "the run was asked not to use flatness", "state it with --flatness")
@@ -351,10 +326,7 @@ def flatness_check(
 
 
 def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Returns labels, heights (k,), mm, over any plane, positive outwards, and their weight matrix.
-
-    The weight matrix is the same for all planes.
-    """
+    """Returns labels, heights (k,), mm, over any plane, positive outwards, and their weight matrix."""
     model = network.model
     xyz = model.xyz_model[members]
     towards = np.mean([pose.inverse().translation for pose in model.camera_from_model], axis=0) - xyz.mean(0)

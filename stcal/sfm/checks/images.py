@@ -48,18 +48,11 @@ def camera_check(
     networks: Sequence[Network],
     camera: Camera,
     calibration: Calibration,
-    prior: CameraPrior | None,
-    given: bool = True,
+    prior: CameraPrior | None,  # of the intrinsics if they were refined
+    given: bool = True,  # False if the camera was found from the photographs
 ) -> Check:
-    """Tests whether the intrinsics are those of the images.
-
-    If the intrinsics are as given, changes of them are tested in the residuals of all free networks, all at once
-    (score test). If they were refined, their distance from the given ones is tested against the stated σ.
-
-    ``prior`` : prior of the intrinsics if they were refined. The stated σ of a camera file does not excuse intrinsics
-    that were held fixed, as the σ of the faces do not include it. ``given`` : False if the camera was found from the
-    photographs, so that there is nothing to test.
-    """
+    """Tests whether the intrinsics are those of the images: in the residuals of all free networks (score test) if they
+    are as given, by their distance from the given ones if they were refined."""
     key, title = "camera", "Intrinsics against the images"
     if not given:
         reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
@@ -78,7 +71,8 @@ def camera_check(
     else:
         tested = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
         tested = "THIN_PRISM_FISHEYE" if camera.fisheye else tested
-        normal, right = summed(networks, lambda n: _by_intrinsics(n, calibration.camera, tested))
+        basis, found = intrinsic_basis(tested), calibration.camera
+        normal, right = summed(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
         test = solve_score(normal, right)
         estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(tested)
     redundancy = sum(n.redundancy.sum() for n in networks)
@@ -98,12 +92,6 @@ def _names(colmap_model: str) -> list[str]:
     return [PARAMETER_NAMES[i] for i in basis.argmax(0)]
 
 
-def _by_intrinsics(network: Network, camera: Camera, colmap_model: str) -> np.ndarray:
-    xyz = network.model.xyz_camera()
-    by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ intrinsic_basis(colmap_model)
-    return network.model.whiten(by_intrinsics)
-
-
 def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Returns :meth:`~stcal.sfm.adjust.network.Network.score` of parameters that all groups have in common."""
     normal, right = zip(*(n.score(columns(n)) for n in networks), strict=True)
@@ -111,11 +99,7 @@ def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
 
 
 def field_check(networks: Sequence[Network], camera: Camera) -> Check:
-    """Tests for a residual field that is the same in all images: x and y are each a cubic of the place in the image.
-
-    Wrong intrinsics cause such a field, too. A field that they do not explain is due to a lens or sensor that the
-    camera model does not describe. A field of 0.002 px RMS is allowed, as any images have one.
-    """
+    """Tests for a residual field that is the same in all images, cubics in x and y that no intrinsics explain."""
     key, title = "residual-field", "Residuals over the image"
 
     def columns(network: Network) -> np.ndarray:
@@ -142,11 +126,7 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
 
 
 def sigma_check(networks: Sequence[Network], factor: float) -> Check:
-    """Tests σ₀ of the images alone: residuals of the free networks over the centres' own σ.
-
-    The σ of the result include this factor, so that only a large factor is a fault: the model does not describe the
-    images.
-    """
+    """Tests σ₀ of the images alone; the σ of the result include it, so that only a large factor is a fault."""
     key, title = "centres", "Residuals against the centres' own σ"
     low, high = SIGMA_LIMITS
     verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
@@ -161,10 +141,7 @@ def sigma_check(networks: Sequence[Network], factor: float) -> Check:
 
 
 def image_check(networks: Sequence[Network]) -> Check:
-    """Tests the squared residuals of every image, over their expectation, against those of its group's other images.
-
-    The test is an F test with exact redundancies.
-    """
+    """Tests the squared residuals of every image against those of its group's other images (F test)."""
     trials = []
     for network in networks:
         square, redundancy = network.square_by_image()
@@ -182,14 +159,7 @@ def image_check(networks: Sequence[Network]) -> Check:
 
 
 def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> Check:
-    """Compares the σ of centres, and the blur, of every image with those of its group's other images.
-
-    The σ are compared circle by circle. The spread of the log ratios is not known and is estimated robustly from the
-    images themselves. It is at least so large that no ratio below 1.5, which costs an image half of its weight, is
-    reported.
-
-    ``blur_px`` : blur of the edges by image, may be empty.
-    """
+    """Compares the σ of centres, circle by circle, and the blur of every image with its group's other images."""
     sigma: dict[str, float] = {}
     blur: dict[str, float] = {}
     for network in networks:
@@ -207,12 +177,8 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
 def evenness_check(
     networks: Sequence[Network], images: Sequence[ImageObservations], camera: Camera, round_: bool = True
 ) -> Check:
-    """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe.
-
-    Their centres would be off in the same way in all views, which no residual shows. Detection describes the variation
-    by a wider model, with a larger σ. The value of a trial is the error that this avoids, in µm at the circle. One
-    centre in a hundred may be uneven by chance (binomial tail). ``round_`` : whether there are circles or dots.
-    """
+    """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe. Their
+    centres would be off alike in all views; a value is the error that the wider model avoids, µm at the circle."""
     key, title = "evenness", "Brightness within the circles"
     if not round_:
         return impossible(key, title, "corners alone, which have no rim", "")
@@ -250,13 +216,8 @@ def _dull(values: dict[str, float], unit: str) -> list[Trial]:
 
 
 def moved_check(networks: Sequence[Network]) -> Check:
-    """Tests whether the target moved relative to the board, one image against all others.
-
-    In every image all faces together may be shifted and turned against the board. Whether this motion is needed is a
-    test with six degrees of freedom. The residuals that it leaves, in the image and in its whole group, are the
-    yardstick if they are too large for the σ: an image that is noisy seems to move too, and so do its neighbours, which
-    share its points.
-    """
+    """Tests whether the target moved relative to the board, one image against all others. The yardstick is the residual
+    that the motion leaves in the image and its group: a noisy image seems to move too."""
     trials: list[Trial] = []
     tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in networks:
@@ -310,11 +271,8 @@ def _motion(network: Network, on_face: np.ndarray) -> np.ndarray:
 
 
 def with_culprits(check: Check, guilt: Sequence[Guilt], remedy: str, causes: str) -> Check:
-    """Returns the check with the names of the culprits alone, and what to do about them.
-
-    ``remedy`` : for culprits, of which the first is taken out; ``causes`` : what makes such a fault and what to do, if
-    no culprit is known.
-    """
+    """Returns the check with the names of the culprits alone, and the ``remedy`` for the first of them; if no culprit
+    is known, ``causes`` says what makes such a fault and what to do."""
     names = tuple(name for own in guilt for name in own.culprits)
     names = tuple(sorted(names, key=check.names.index)) if set(names) <= set(check.names) else names
     open_ones = [words for own in guilt if (words := own.words())]
@@ -345,12 +303,8 @@ MANY = 5
 def labels_check(
     networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
 ) -> Check:
-    """Tests every observation against all others.
-
-    Observations that were left out already do no harm and are named. Observations that were kept but are beyond chance
-    (squared residual over its own covariance: Baarda's data snooping) are named, too; their weight is reduced. Labels
-    of one image that are at each other's places are a fault: other labels may be exchanged without being noticed.
-    """
+    """Tests every observation against all others by its own covariance (Baarda's data snooping), and names those left
+    out. Labels at each other's places are a fault: others may be exchanged without being noticed."""
     remedy = (
         "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
         "that was left out does no harm where other images show it"
@@ -398,7 +352,8 @@ def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]
     count = Counter(o.image for o in outliers)
     found = []
     for network in networks:
-        names = [*network.model.images, *(n for n in count if _of_group(n, network) and n not in network.model.images)]
+        of_group = [name for name in count if name.rpartition("/")[0] == network.model.group]
+        names = list(dict.fromkeys([*network.model.images, *of_group]))
 
         def worst(out: Collection[int], names: list[str] = names) -> int | None:
             many = [i for i, name in enumerate(names) if i not in out and count[name] >= MANY]
@@ -407,10 +362,6 @@ def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]
         if worst(()) is not None:
             found.append(culprits(names, worst, f"group {network.model.group}"))
     return found
-
-
-def _of_group(image: str, network: Network) -> bool:
-    return image.rpartition("/")[0] == network.model.group
 
 
 def _trials(networks: Sequence[Network]) -> list[Trial]:

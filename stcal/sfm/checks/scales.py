@@ -23,21 +23,16 @@ MOST_PRINT_FACTOR = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """A source of the scale: ``log_scale`` of the model over the known size, its derivative by the points, (3p,), and
-    the variance of the known size."""
+    """A source of the scale."""
 
     name: str
-    log_scale: float
-    gradient: np.ndarray
-    variance: float
+    log_scale: float  # of the model over the known size
+    gradient: np.ndarray  # (3p,) of ``log_scale`` by the points
+    variance: float  # of the known size
 
 
 def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: float) -> Check:
-    """Tests each source of the scale against the mean of all, in the free network of a group.
-
-    A face that was printed at another scale, a distance that was measured wrongly, or a board of another pitch stands
-    out: each network has one scale. ``print_factor`` : factor on the σ of printed faces.
-    """
+    """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
     key, title = "scales", "Scales against one another"
     remedy = (
         "one print, distance or board has another size than stated: measure a side of each print and correct "
@@ -82,8 +77,7 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
 
 
 def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float] | None:
-    """Returns the one source whose size contradicts all others, which agree, and its size over the stated one; None
-    without one."""
+    """Returns the one source that contradicts all others, which agree, and its size over the stated one."""
     off: dict[str, list[float]] = {}
     for network in networks:
         sources = _sources(network, board, 1.0)

@@ -18,14 +18,7 @@ from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.checks.board import KINDS, board_checks, measure_radii, pitch_check, radius_checks, rim_check
 from stcal.sfm.checks.causes import whole_set_cause
-from stcal.sfm.checks.faces import (
-    Again,
-    agreement_check,
-    flatness_check,
-    groups_check,
-    halves_check,
-    loops_check,
-)
+from stcal.sfm.checks.faces import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
 from stcal.sfm.checks.images import (
     camera_check,
     evenness_check,
@@ -59,28 +52,21 @@ IN_PAIRS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Input of the checks.
+    """Input of the checks."""
 
-    ``models`` : adjusted models of the single groups, without unit; ``outliers`` : observations left out of the models;
-    ``images`` : all observations; ``camera`` : as given; ``prior`` : of the intrinsics if they were refined;
-    ``blur_px`` : blur of the edges by image, may be empty; ``rim`` : whether rims are estimated for the result;
-    ``camera_given`` : False if there is no camera file and the camera was found from the photographs; ``cause`` : the
-    cause of the whole set if it is known already.
-    """
-
-    models: tuple[WorldModel, ...]
+    models: tuple[WorldModel, ...]  # adjusted models of the single groups, without unit
     outliers: tuple[Outlier, ...]
     images: tuple[ImageObservations, ...]
-    camera: Camera
+    camera: Camera  # as given
     target: TargetDesign
     board: BoardDesign
     options: AdjustOptions
     calibration: Calibration
-    prior: CameraPrior | None
+    prior: CameraPrior | None  # of the intrinsics if they were refined
     blur_px: dict[str, float]
-    rim: bool = False
-    camera_given: bool = True
-    cause: Check | None = None
+    rim: bool = False  # whether rims are estimated for the result
+    camera_given: bool = True  # False if the camera was found from the photographs
+    cause: Check | None = None  # of the whole set if it is known already
 
     def radius_mm(self) -> dict[Label, float]:
         """Returns the radii of all circles and dots, without the corners of printed faces."""
@@ -99,8 +85,7 @@ class Evidence:
 
 
 def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, Mapping[str, float | None]]:
-    """Returns the rims by kind of circle; the largest σ of a face's position, mm, None if it is not known; and by kind
-    the height that the result allows for, None if it is to be estimated."""
+    """Returns rims by kind, the largest σ of a face's position, mm, and the heights allowed for by kind."""
     rims = find_rims(evidence.calibration.models, evidence.images, evidence.radius_mm(), evidence.calibration.camera)
     known = [np.sqrt(np.diag(c)[3:].max()) for c in evidence.calibration.target.face_covariance.values()]
     if evidence.rim:
@@ -111,31 +96,23 @@ def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, Mapping[str
 
 
 def _before_circles_mm(evidence: Evidence, rims: Mapping[str, Rim], check: Check) -> dict[Label, float]:
-    """Returns the heights of the rims in front of circles and dots, by label: as estimated where the result allows for
-    that or ``check`` finds another rim than stated, else as stated."""
+    """Heights of the rims in front of circles and dots: estimated if allowed for or found, else as stated."""
     stated = {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
     of_label = {label: "dots" if isinstance(label, DotLabel) else "circles" for label in evidence.radius_mm()}
     found = {kind for kind in rims if evidence.rim or KINDS[kind][0] in check.names}
     return {k: rims[kind].height_mm if kind in found else stated.get(k, 0.0) for k, kind in of_label.items()}
 
 
-def _bend(evidence: Evidence) -> tuple[set[str], float]:
-    """Returns the faces of known shape, and the factor on the flatness of these."""
-    joint = evidence.calibration.joint
-    return {face.id for face in faces_of_known_shape(evidence.board)}, 1.0 if joint is None else joint.bend_factor
-
-
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
-    """Returns all checks of a run in the order of the report, the cause of the whole set before them if one failed.
-
-    ``progress`` is called with (``check``, done, total).
-    """
+    """Returns all checks in the order of the report, the cause of the whole set before them if one failed."""
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     rims, sigma_mm, allowed = _rims(evidence)
     of_rims = rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
     before_mm = _before_circles_mm(evidence, rims, of_rims)
     radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
+    joint, known_faces = calibration.joint, {face.id for face in faces_of_known_shape(board)}
+    factors = (1.0, 1.0) if joint is None else (joint.print_factor, joint.bend_factor)
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior, evidence.camera_given),
         lambda: field_check(networks, camera),
@@ -150,13 +127,11 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
         lambda: radius_checks(radii),
         lambda: of_rims,
-        lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
+        lambda: flatness_check(networks, evidence.options.flatness_mm, known_faces, factors[1]),
         lambda: control_check(evidence, networks),
     )
     if isinstance(board, ScaleReference):  # the target tells its size itself
-        joint = calibration.joint
-        factor = 1.0 if joint is None else joint.print_factor
-        makers += (lambda: scales_check(networks, board, factor),)
+        makers += (lambda: scales_check(networks, board, factors[0]),)
     step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
     checks: list[Check] = []
     for make in makers:
@@ -194,12 +169,8 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
 
 
 def control_check(evidence: Evidence, networks: list[Network]) -> Check:
-    """Compares the run with a control without eccentricity, and tests the correction of the eccentricity.
-
-    The control is chained with three-point frames. It shows how far off the faces of a program without the correction
-    are, and how little the residuals of that program show it. In the test, the correction is scaled by a factor, with
-    all else free. The factor is 1 up to chance, and 0 if the centres are not those of ellipses.
-    """
+    """Compares the run with a control without eccentricity, chained with three-point frames, and tests the correction:
+    a factor on it is 1 up to chance, and 0 if the centres are not those of ellipses."""
     key = "control"
     if not evidence.radius_mm():
         return impossible(key, CONTROL, "corners alone, which have no eccentricity", "")

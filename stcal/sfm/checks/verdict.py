@@ -1,9 +1,5 @@
-"""Definition of a check, and separation of chance from fault: every verdict is a test of significance.
-
-A check tests one or many values against their σ. The probability of the worst value by chance, times the number of
-values tested (Bonferroni), gives the verdict. A report has about fifteen checks. With the limits below, one sound run
-in seventy shows something suspicious, and one in seven thousand a failure.
-"""
+"""Definition of a check; every verdict is a test of significance: the probability of the worst value by chance, times
+the number of values tested (Bonferroni). One sound run in seventy shows something suspicious."""
 
 import shlex
 from collections.abc import Sequence
@@ -33,17 +29,13 @@ SHOWN = 8
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One tested value.
+    """One tested value."""
 
-    ``name`` : image, label, face, group, row …; ``value`` and ``limit`` in ``unit``: beyond the limit the value is
-    suspicious; ``probability`` : of as much or more by chance, None if the value is not tested.
-    """
-
-    name: str
+    name: str  # image, label, face, group, row …
     value: float
-    limit: float | None
+    limit: float | None  # in ``unit``; beyond it the value is suspicious
     unit: str
-    probability: float | None
+    probability: float | None  # of as much or more by chance, None if the value is not tested
 
     def words(self) -> str:
         """Returns value and limit as text."""
@@ -181,19 +173,13 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
 
 
 def without_image(name: str) -> str:
-    """Returns the option that excludes an image from a run.
-
-    Images should be excluded one at a time, the worst first, as it may be the reason why others stand out.
-    """
+    """Returns the option that excludes an image from a run."""
     return f"--exclude {shlex.quote(name)}"
 
 
 def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
-    """Returns the checks in the order in which to read them, the worst first.
-
-    Among equal verdicts the cause of the whole set comes first, then those that name an image: it may be the reason why
-    the others fail. Those that cannot name the cause come last.
-    """
+    """Returns the checks in the order in which to read them: the worst first, and of equal verdicts the cause of the
+    whole set, then those that name an image, last those that cannot name the cause."""
     later = {verdict: not_first(check.key for check in checks if check.verdict == verdict) for verdict in ORDER}
 
     def place(check: Check) -> tuple:

@@ -27,14 +27,8 @@ as a face that the group is named after."""
 
 
 def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, one_folder: bool = False) -> list[str]:
-    """Returns notes on faces that are not where the rough poses of the design have them.
-
-    Parameters
-    ----------
-    target_from_face : poses of the faces by id, mm
-    design : design of the target; faces without a rough pose are not compared
-    one_folder : whether photographs in one folder were taken to be of one setting of target and board
-    """
+    """Returns notes on faces that are not where the rough poses of the design have them; ``one_folder``: whether
+    photographs in one folder were taken to be of one setting of target and board."""
     rough = {face: pose for face, pose in design.rough_poses().items() if face in target_from_face}
     if len(rough) < 2:
         return []
@@ -104,10 +98,7 @@ def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDes
 def misplaced_images(
     observations: Sequence[ImageObservations], notes: Mapping[str, Sequence[str]], design: TargetDesign
 ) -> list[str]:
-    """Returns notes on images that show the faces after which another group is named, and not those of their own.
-
-    ``notes`` : by name of the image, in which faces are named that were read and left out.
-    """
+    """Returns notes on images that show the faces after which another group is named, also by ``notes``."""
     ids = [face.id for face in design.faces]
     named = {image.group: faces_in_name(image.group, ids) for image in observations}
     found = []

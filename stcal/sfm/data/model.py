@@ -19,24 +19,17 @@ from stcal.labels import CircleLabel, Label, parse_labels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservations:
-    """n labelled circles of one image.
-
-    ``centre_px`` : (n, 2) ellipse centres in the original image, OpenCV pixel origin; ``centre`` : (n, 2) and
-    ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2) covariances
-    of ``centre_px``; ``uneven_px`` : (n, 2) shift of the centres that uneven brightness would have caused, zero by
-    default and if no uneven brightness was detected; ``blur_px`` : (n,) standard deviation of the blur across each rim,
-    zero by default and where it is not known.
-    """
+    """n labelled circles of one image."""
 
     name: str
     group: str
     labels: tuple[Label, ...]
-    centre_px: np.ndarray
-    centre: np.ndarray
-    shape: np.ndarray
-    covariance_px2: np.ndarray
-    uneven_px: np.ndarray = None  # type: ignore[assignment]
-    blur_px: np.ndarray = None  # type: ignore[assignment]
+    centre_px: np.ndarray  # (n, 2) ellipse centres in the original image, OpenCV pixel origin
+    centre: np.ndarray  # (n, 2) of the ideal ellipse in normalised coordinates
+    shape: np.ndarray  # (n, 2, 2) of the same
+    covariance_px2: np.ndarray  # (n, 2, 2) of ``centre_px``
+    uneven_px: np.ndarray = None  # type: ignore[assignment]  # (n, 2) shift that uneven brightness would have caused
+    blur_px: np.ndarray = None  # type: ignore[assignment]  # (n,) standard deviation across each rim, zero if unknown
 
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
@@ -92,27 +85,18 @@ def detections_csv(observations: list[ImageObservations]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Centres:
-    """n measured ellipses.
+    """n measured ellipses."""
 
-    ``centre_px`` : (n, 2) centre of the ideal ellipse, distorted into the original image (OpenCV pixel origin);
-    ``centre`` : (n, 2) the same in normalised ideal coordinates; ``shape`` : (n, 2, 2) shape of the ellipse in these
-    coordinates, rim = centre + shape @ unit circle; ``covariance_px2`` : (n, 2, 2) covariance of ``centre_px``;
-    ``blur_px`` : (n,); ``contrast`` : (n,) grey values, inside minus outside; ``noise`` : (n,) robust σ of a pixel
-    about the model, grey values; ``rim`` : (n,) share of the rim that follows the model; ``uneven_px`` : (n, 2) shift
-    of the centre that uneven brightness would have caused, zero if no uneven brightness was detected; ``ok`` : (n,)
-    True if the ellipse is usable.
-    """
-
-    centre_px: np.ndarray
-    centre: np.ndarray
-    shape: np.ndarray
-    covariance_px2: np.ndarray
+    centre_px: np.ndarray  # (n, 2) of the ideal ellipse, distorted into the original image (OpenCV pixel origin)
+    centre: np.ndarray  # (n, 2) the same in normalised ideal coordinates
+    shape: np.ndarray  # (n, 2, 2) in these coordinates, rim = centre + shape @ unit circle
+    covariance_px2: np.ndarray  # (n, 2, 2) of ``centre_px``
     blur_px: np.ndarray
-    contrast: np.ndarray
-    noise: np.ndarray
-    rim: np.ndarray
-    uneven_px: np.ndarray
-    ok: np.ndarray
+    contrast: np.ndarray  # (n,) grey values, inside minus outside
+    noise: np.ndarray  # (n,) robust σ of a pixel about the model, grey values
+    rim: np.ndarray  # (n,) share of the rim that follows the model
+    uneven_px: np.ndarray  # (n, 2) shift that uneven brightness would have caused
+    ok: np.ndarray  # (n,) True if the ellipse is usable
 
     def __post_init__(self):
         n = len(self.centre_px)
@@ -164,26 +148,19 @@ class Outlier:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupModel:
-    """m images, p points and n observations of one group: the common base of models with and without a unit.
-
-    ``images`` : (m,) names; ``camera_from_model`` : (m,) poses; ``labels`` : (p,); ``xyz_model`` : (p, 3),
-    frame and unit are defined by :class:`WorldModel` and :class:`MetricModel`;
-    ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) index among the image's observations;
-    ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) eccentricity, measured ellipse centre minus image of
-    the circle's centre, zero until it is known; ``covariance_px2`` : (n, 2, 2) covariances of the measured centres.
-    """
+    """m images, p points and n observations of one group: the common base of models with and without a unit."""
 
     group: str
-    images: tuple[str, ...]
-    camera_from_model: tuple[Rigid, ...]
-    labels: tuple[Label, ...]
-    xyz_model: np.ndarray
-    image_index: np.ndarray
-    point_index: np.ndarray
-    keypoint: np.ndarray
-    measured_px: np.ndarray
-    shift_px: np.ndarray
-    covariance_px2: np.ndarray
+    images: tuple[str, ...]  # (m,) names
+    camera_from_model: tuple[Rigid, ...]  # (m,)
+    labels: tuple[Label, ...]  # (p,)
+    xyz_model: np.ndarray  # (p, 3), see :class:`WorldModel` and :class:`MetricModel`
+    image_index: np.ndarray  # (n,)
+    point_index: np.ndarray  # (n,)
+    keypoint: np.ndarray  # (n,) index among the image's observations
+    measured_px: np.ndarray  # (n, 2) ellipse centres
+    shift_px: np.ndarray  # (n, 2) eccentricity: ellipse centre minus image of the circle's centre, zero until known
+    covariance_px2: np.ndarray  # (n, 2, 2) of the measured centres
 
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
@@ -229,6 +206,11 @@ class GroupModel:
         xyz = self.xyz_model[self.point_index]
         return np.einsum("nij,nj->ni", rotation[self.image_index], xyz) + translation[self.image_index]
 
+    def by_parameters(self, camera: Camera) -> np.ndarray:
+        """Returns the derivatives of the projections (px) by the camera's parameters, (n, 2, 16)."""
+        xyz = self.xyz_camera()
+        return camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
+
     def residuals_px(self, camera: Camera) -> np.ndarray:
         """Returns the residuals, corrected minus projected, (n, 2)."""
         return self.corrected_px() - camera.project(self.xyz_camera())
@@ -258,8 +240,7 @@ class GroupModel:
         return {key: np.array(indices) for key, indices in members.items()}
 
     def normals(self) -> np.ndarray:
-        """Returns the normal of each point's face or board, (p, 3); zero where too few points of it are in the model,
-        as may be of a face with corners."""
+        """Returns the normal of each point's face or board, (p, 3); zero where the model has too few points of it."""
         normal = np.zeros((len(self.labels), 3))
         for members in self.points_by_face().values():
             with suppress(DegenerateError):
@@ -267,10 +248,7 @@ class GroupModel:
         return normal
 
     def without(self: "M", drop: np.ndarray) -> "M":
-        """Returns the model without the observations of mask ``drop``.
-
-        Points that fewer than two images then observe, and images that observe fewer than six points, are removed too.
-        """
+        """Returns the model without the observations of mask ``drop``, then points of one image and images of five."""
         keep = ~drop
         while True:
             points = np.bincount(self.point_index[keep], minlength=len(self.labels))

@@ -30,18 +30,14 @@ BORDER_POINTS = 33
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pattern:
-    """The n circles of one plane according to the design.
+    """The n circles of one plane according to the design."""
 
-    ``plane`` : face id or ``board``; ``labels``; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,); ``polarity``; ``side`` : 1
-    if the circles are seen from the side that the plane's Z points to, −1 if they are seen from the other side.
-    """
-
-    plane: str
+    plane: str  # face id or ``board``
     labels: Sequence[Label]
-    xy_mm: np.ndarray
-    radius_mm: np.ndarray
+    xy_mm: np.ndarray  # (n, 2)
+    radius_mm: np.ndarray  # (n,)
     polarity: Polarity
-    side: Literal[1, -1]
+    side: Literal[1, -1]  # 1 if the circles are seen from the side that the plane's Z points to, else −1
 
     def xyz_mm(self) -> np.ndarray:
         """Returns the centres, (n, 3), in the plane's frame."""
@@ -63,13 +59,10 @@ def in_view(
     pattern: Pattern,
     camera_from_plane: Rigid,
     camera: Camera,
-    border: np.ndarray,
+    border: np.ndarray,  # of :func:`ideal_border`; beyond it a lens model may fold back
     max_tilt_rad: float = MAX_TILT_RAD,
 ) -> np.ndarray:
-    """Returns the mask of the circles that face the camera and lie in the image with their whole rim.
-
-    ``border`` : result of :func:`ideal_border`; beyond this border a lens model may fold back.
-    """
+    """Returns the mask of the circles that face the camera and lie in the image with their whole rim."""
     axes = camera_from_plane.rotation
     xyz = camera_from_plane @ pattern.xyz_mm()
     cosine = -pattern.side * (xyz @ axes[:, 2]) / np.linalg.norm(xyz, axis=1)
@@ -88,8 +81,7 @@ def in_view(
 def images_px(
     pattern: Pattern, camera_from_plane: Rigid, camera: Camera, circles: np.ndarray | slice = slice(None)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ellipses that the circles project to in the original image, px: centres (n, 2) and symmetric shapes
-    (n, 2, 2). Lens distortion of the shapes is of first order."""
+    """Ellipses that circles project to, px: centres (n, 2), shapes (n, 2, 2) with distortion of first order."""
     xyz = camera_from_plane @ pattern.xyz_mm()[circles]
     centre, shape = circle_images(xyz, camera_from_plane.rotation[:, :2], pattern.radius_mm[circles])
     distorted, by_ideal = camera.distort_jacobian(centre)
@@ -114,18 +106,12 @@ NEAREST_MM = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleImages:
-    """n circles in h poses, seen by an ideal camera of focal length 1.
+    """n circles in h poses, seen by an ideal camera of focal length 1."""
 
-    ``centre`` : (h, n, 2) centres of the ellipses, normalised coordinates; ``depth`` : (h, n) depth of the circles'
-    centres, mm, zero or negative behind the camera, where all other values are meaningless; ``by_pose`` : (h, n, 2, 6)
-    derivative of ``centre`` by the left perturbation of camera_from_target (rad, mm); ``by_circle`` : (h, n, 2, 3)
-    derivative by the circles' centres in the target frame, per mm, normals fixed.
-    """
-
-    centre: np.ndarray
-    depth: np.ndarray
-    by_pose: np.ndarray
-    by_circle: np.ndarray
+    centre: np.ndarray  # (h, n, 2) of the ellipses, normalised coordinates
+    depth: np.ndarray  # (h, n) of the circles' centres, mm; where it is not positive, nothing else has a meaning
+    by_pose: np.ndarray  # (h, n, 2, 6) by the left perturbation of camera_from_target (rad, mm)
+    by_circle: np.ndarray  # (h, n, 2, 3) by the circles' centres in the target frame, per mm, normals fixed
 
     def of(self, rows) -> "CircleImages":
         """Returns the images in the poses of the indices or mask ``rows``."""
@@ -135,11 +121,8 @@ class CircleImages:
 def project_circles(
     xyz: np.ndarray, normal: np.ndarray, radius_mm: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> CircleImages:
-    """Project circles, centres (n, 3), normals (n, 3), radii (n,), target frame, mm, by h poses camera_from_target.
-
-    ``rotation`` : (h, 3, 3); ``translation`` : (h, 3). The derivatives include the eccentricity of
-    :func:`stcal.geometry.plane.circle_image_offset`.
-    """
+    """Projects circles, centres and normals (n, 3), radii (n,), target frame, mm, by h poses camera_from_target, (h, 3,
+    3) and (h, 3); derivatives include the eccentricity."""
     back = np.swapaxes(rotation, 1, 2)
     rotated, axis = xyz @ back, normal @ back
     centre = rotated + translation[:, None]
@@ -172,11 +155,8 @@ MOST_OFF = 0.05
 
 
 def measured_pitch_mm(images: Sequence[ImageObservations], board: BoardDesign) -> float | None:
-    """Returns the distance of neighbouring dots, mm, if their radius in the board file is right.
-
-    The homography of each image's grid gives the step between neighbours in units of the dot's ellipse radius; the
-    result is the median over all dots. None if no image shows enough dots, or they are corners without extent.
-    """
+    """Returns the distance of neighbouring dots, mm, by their radius in the board file: the median over all dots of the
+    step by the image's homography, in units of the ellipse. None if too few dots, or corners, are seen."""
     if board.radius_mm <= POINT_RADIUS_MM:
         return None
     radius, pitches = board.radius_of(), []

@@ -1,9 +1,5 @@
-"""Detection of the dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered.
-
-A plain board looks the same after half a turn (a square one after a quarter), and a hidden strip may leave open
-which rows or columns are seen. A reading therefore carries every numbering that fits the image; the group decides
-(``stcal.sfm.detect.labels``).
-"""
+"""Detection of the dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered. A
+plain board looks the same after half a turn: a reading carries every numbering that fits the image."""
 
 from dataclasses import dataclass, replace
 
@@ -40,24 +36,16 @@ MAX_UNEXPLAINED = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardReading:
-    """One board in one image.
+    """One board in one image."""
 
-    ``candidates`` : (n,) the dots found; ``numberings`` : (k, n, 2) row and column of each, one array for each
-    numbering that the image admits, the likeliest first; ``homographies`` : (k, 3, 3) from the board plane (mm) into
-    normalised coordinates; ``unlikely`` : (u, n, 2) further numberings, that hold where dots are covered.
-    """
-
-    candidates: np.ndarray
-    numberings: np.ndarray
-    homographies: np.ndarray
-    unlikely: np.ndarray
+    candidates: np.ndarray  # (n,) the dots found
+    numberings: np.ndarray  # (k, n, 2) row and column, by numbering that the image admits, the likeliest first
+    homographies: np.ndarray  # (k, 3, 3) from the board plane (mm) into normalised coordinates
+    unlikely: np.ndarray  # (u, n, 2) further numberings, that hold where dots are covered
 
 
 def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardReading]:
-    """Finds the boards in the image and returns the one with the most dots first.
-
-    ``image_corners`` : (4, 2) corners of the image in normalised ideal coordinates, in order around it.
-    """
+    """Finds the boards and returns the one with the most dots first; ``image_corners``: (4, 2) normalised, ideal."""
     if len(candidates) < MIN_SIDE**2:
         return []
     links, steps = _links(candidates, board)
@@ -95,10 +83,8 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the dots one pitch away from each candidate, in the directions on which most neighbours agree.
-
-    There are four directions, six on a hexagonal board. Distances are taken in coordinates that map the candidate to a
-    circle of the board's radius. Returns (n, 4 or 6) indices or −1, and (n, 2, 2) whose columns are the two steps."""
+    """Returns (n, 4 or 6) neighbours one pitch away, −1 for none, in the directions on which most agree, and (n, 2, 2)
+    steps. Distances are taken in coordinates that map the candidate to a circle of the board's radius."""
     n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
     neighbours = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
@@ -217,12 +203,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 
 
 def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
-    """Returns the reading with the numberings that put the board's dots with a hole where the image shows holes.
-
-    A dot has a hole if its middle differs from its body by a large share of the contrast of bodies to the board.
-
-    ``grey`` : (height, width) 8-bit image; ``camera`` : its camera.
-    """
+    """Reading with the numberings that put the board's dots with a hole where the 8-bit image shows holes."""
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     cells = board.cells()
@@ -282,13 +263,12 @@ def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Placement:
-    """One placement of the board over n dots: ``unexplained`` : number of dots outside of it, or expected and missing;
-    ``inside`` : (n,) those on it; ``cells`` : (n, 2) their row and column; ``index`` : (n,) of the candidates."""
+    """One placement of the board over n dots."""
 
-    unexplained: int
-    inside: np.ndarray
-    cells: np.ndarray
-    index: np.ndarray
+    unexplained: int  # number of dots outside of it, or expected and missing
+    inside: np.ndarray  # (n,) those on it
+    cells: np.ndarray  # (n, 2) their row and column
+    index: np.ndarray  # (n,) of the candidates
 
 
 def _place(
@@ -326,10 +306,7 @@ def _place(
 
 
 def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Returns the shifts (k, 2) of cells (n, 2) that leave at most ``MAX_UNEXPLAINED`` of them outside of the board at
-    each end of each axis, row by row.
-
-    n is larger than ``MAX_UNEXPLAINED``."""
+    """Shifts (k, 2) of cells (n, 2) that leave at most ``MAX_UNEXPLAINED`` < n outside at each end of an axis."""
     if len(cells) > size.prod() + MAX_UNEXPLAINED:
         return np.zeros((0, 2), int)
     in_order = np.sort(cells, axis=0)

@@ -1,8 +1,5 @@
-"""Labels for photographs of the board alone. No face shows how a plain board is numbered, so the camera's motion does.
-
-A plain board looks the same after half a turn (a square one after a quarter). Within a group its images are numbered so
-that the camera turns least from each image to its nearest neighbour. The numbering of the first image is a convention.
-"""
+"""Labels for photographs of the board alone: the camera's motion numbers a plain board, which looks the same after half
+a turn. The numbering of a group's first image is a convention."""
 
 import numpy as np
 
@@ -22,10 +19,7 @@ UNNUMBERED = "left out, show the whole board, or a face with it"
 
 
 def is_board_alone(detection: DetectionResult) -> bool:
-    """Returns whether the photographs show the board and nothing that could be a face.
-
-    No image may have a face, and outside of boards half of the images must have fewer outlines than identify a face.
-    """
+    """Returns whether no image has a face, and half of them too few outlines outside of boards for one."""
     detections = [detection_of_image.detection for detection_of_image in detection.images]
     if not any(detection_of_image.boards for detection_of_image in detections) or any(
         detection_of_image.faces or detection_of_image.open_faces for detection_of_image in detections
@@ -88,10 +82,7 @@ def _is_symmetry(difference: Rigid, board: BoardDesign) -> bool:
 
 
 def _numbered(views: list[list[PlaneView] | str]) -> tuple[dict[int, PlaneView], dict[int, str]]:
-    """Returns the numbering of each image, and the reasons why others have none.
-
-    Images are numbered one after the other: next is the image whose camera turns least from a numbered one.
-    """
+    """Returns the numbering of each image, and why others have none; next is what turns least from a numbered one."""
     reasons = {i: numberings for i, numberings in enumerate(views) if isinstance(numberings, str) and numberings}
     open_images = {i: numberings for i, numberings in enumerate(views) if not isinstance(numberings, str)}
     if not open_images:

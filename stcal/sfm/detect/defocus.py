@@ -37,53 +37,40 @@ TOLD_PX = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Focus:
-    """Blur in one image.
-
-    ``image`` : its name; ``focused_mm`` : distance of the plane of focus along the optical axis, None if the image does
-    not determine it; ``depth_mm`` : depths of the nearest and the farthest circle; ``blur_px`` : blur (σ) at these;
-    ``shift_px`` : largest correction of a centre, 0 if none is needed; ``note`` : blur that defocus does not explain,
-    in words; empty by default.
-    """
+    """Blur in one image."""
 
     image: str
-    focused_mm: float | None
-    depth_mm: tuple[float, float]
-    blur_px: tuple[float, float]
-    shift_px: float
-    note: str = ""
+    focused_mm: float | None  # distance of the plane of focus along the optical axis, None if it is not determined
+    depth_mm: tuple[float, float]  # of the nearest and the farthest circle
+    blur_px: tuple[float, float]  # (σ) at these
+    shift_px: float  # largest correction of a centre
+    note: str = ""  # blur that defocus does not explain, in words
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Views:
-    """The circles of one image whose plane has a pose: ``rows`` : (n,) among the image's circles; ``inverse_depth`` :
-    (n,) 1/mm; ``gradient`` : (n, 2) of the inverse depth by the ideal image coordinates, 1/(mm·px); ``blur2`` : (n,)
-    px²; ``response`` : (n,) of the centre, and its ``sigma`` : (n,) as a share."""
+    """The n circles of one image whose plane has a pose."""
 
     rows: np.ndarray
-    inverse_depth: np.ndarray
-    gradient: np.ndarray
-    blur2: np.ndarray
-    response: np.ndarray
+    inverse_depth: np.ndarray  # 1/mm
+    gradient: np.ndarray  # (n, 2) of the inverse depth by the ideal image coordinates, 1/(mm·px)
+    blur2: np.ndarray  # px²
+    response: np.ndarray  # of the centre, as a share, as its ``sigma``
     sigma: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Law:
     """Law of the squared blur: c₀ + c₁ u + c₂ u², u the inverse depth about its mean, ``about``, in units of ``unit``.
-
-    This is σ₀² + a² (1/z − 1/z_f)²: the variance of a uniform disc, the image of the pupil, is proportional to the
-    square of its radius, and this to the difference of the inverse depths (thin lens). ``covariance`` : (3, 3) of the
-    coefficients; ``scatter`` : robust σ of the residuals, px²; ``plain`` : the same about a constant;
-    ``significant`` : whether depth explains the blur better than a constant does.
-    """
+    This is σ₀² + a² (1/z − 1/z_f)²: the variance of a uniform disc, the image of the pupil (thin lens)."""
 
     coefficients: np.ndarray
     covariance: np.ndarray
     about: float
     unit: float
-    scatter: float
-    plain: float
-    significant: bool
+    scatter: float  # robust σ of the residuals, px²
+    plain: float  # the same about a constant
+    significant: bool  # whether depth explains the blur better than a constant does
 
     def slope(self, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the derivative of the squared blur by the inverse depth, px²·mm, and its σ."""
@@ -108,25 +95,9 @@ class _Law:
 def correct_defocus(
     images: Sequence[ImageObservations], camera: Camera, patterns: Mapping[str, Pattern]
 ) -> tuple[list[ImageObservations], tuple[Focus, ...]]:
-    """Returns the images with centres at which a lens with blur that is the same everywhere would show them.
-
-    Out of focus, blur varies with depth, and so across a tilted circle: a fit with one blur for each circle moves
-    towards the blurrier side. The uncertainty of the correction is added to the covariances.
-
-    Parameters
-    ----------
-    images
-        Labelled circles with their blur.
-    camera
-        Camera of the images.
-    patterns
-        Patterns of the faces and the board, by the plane of a label.
-
-    Returns
-    -------
-    images, focus
-        In the order of the images; ``focus`` only of images with enough circles.
-    """
+    """Returns the images with centres at which a lens with the same blur everywhere would show them, and their blur.
+    Out of focus, blur varies across a tilted circle, and its fit with one blur moves towards the blurrier side.
+    ``patterns``: of the faces and the board, by the plane of a label."""
     focal_px = float(np.sqrt(camera.focal.prod()))
     views = [_views_of(image, patterns, focal_px) for image in images]
     laws = _laws(views)
@@ -176,11 +147,8 @@ def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_p
 
 
 def _laws(views: Sequence[_Views]) -> list[_Law | None]:
-    """Returns the law of each image, None of those with too few circles.
-
-    The curvature a² is a property of lens and aperture: that of each image is drawn towards the mean of all by as much
-    as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7).
-    """
+    """Returns the law of each image, None of those with too few circles. Each a² is drawn towards the mean of all by as
+    much as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7)."""
     enough = [circles for circles in views if len(circles.rows) >= MIN_CIRCLES]
     if not enough:
         return [None] * len(views)

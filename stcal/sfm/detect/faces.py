@@ -1,9 +1,5 @@
-"""Faces of the target: the pattern is found in the face plane, after a homography, and the face named there.
-
-Zhang & Wei (2017) walk along directions in the image and decide by scalar products, which perspective distorts. Here
-two neighbouring candidates that may be two neighbouring circles of a design determine a map of the plane. The map is
-extended to all circles of a face, and all readings of the same candidates compete. A face is named only if one reading
-explains more circles than every other.
+"""Faces of the target: two neighbouring candidates that may be two circles of a design determine a map of the plane,
+which is extended to all circles of a face. A face is named only if one reading explains more circles than every other.
 """
 
 from dataclasses import dataclass
@@ -61,44 +57,34 @@ class FaceReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """Faces in one image: ``faces`` : unambiguously named; a face in view twice has two readings; ``refused`` :
-    readings of each pattern without a name."""
+    """Faces in one image; a face in view twice has two readings."""
 
-    faces: tuple[FaceReading, ...]
-    refused: tuple[tuple[FaceReading, ...], ...]
+    faces: tuple[FaceReading, ...]  # unambiguously named
+    refused: tuple[tuple[FaceReading, ...], ...]  # readings of each pattern without a name
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """p distinct pairs of neighbouring circles of a design, each with the s circles nearest to the first, and the u
-    occurrences of the pairs on faces.
+    """p distinct pairs of neighbouring circles of a design, each with the s circles nearest to the first."""
 
-    ``offset`` : (p, s, 2) places of these circles relative to the first; ``radius`` : (p, s), beginning with the first
-    circle; ``there`` : (p, s) mask, as small faces have fewer circles; ``second`` : (p,) index of the pair's second
-    circle; ``uses`` : (p + 1,) start of each pair's rows in the next two; ``face`` : (u,) number of the face;
-    ``circles`` : (u, s) numbers of the circles in it, −1 if there is none.
-    """
-
-    offset: np.ndarray
-    radius: np.ndarray
-    there: np.ndarray
-    second: np.ndarray
-    uses: np.ndarray
-    face: np.ndarray
-    circles: np.ndarray
+    offset: np.ndarray  # (p, s, 2) places relative to the first
+    radius: np.ndarray  # (p, s)
+    there: np.ndarray  # (p, s) mask, as small faces have fewer circles
+    second: np.ndarray  # (p,) index of the pair's second circle
+    uses: np.ndarray  # (p + 1,) start of each pair's rows in the next two
+    face: np.ndarray  # (u,) number of the face
+    circles: np.ndarray  # (u, s) numbers of the circles in it, −1 if there is none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Starts:
-    """n hypotheses, the best supported first: ``origin`` : (n,) first outline; ``face`` : (n,) number of the face;
-    ``circles`` : (n, s) of this face; ``candidates`` : (n, s) that match these circles, −1 if there is none; ``rows`` :
-    hypotheses by face, circle and candidate."""
+    """n hypotheses, the best supported first."""
 
-    origin: np.ndarray
-    face: np.ndarray
-    circles: np.ndarray
-    candidates: np.ndarray
-    rows: dict[tuple[int, int, int], np.ndarray]
+    origin: np.ndarray  # (n,) first outline
+    face: np.ndarray  # (n,) number of the face
+    circles: np.ndarray  # (n, s) of this face
+    candidates: np.ndarray  # (n, s) that match these circles, −1 if there is none
+    rows: dict[tuple[int, int, int], np.ndarray]  # by face, circle and candidate
 
     @classmethod
     def of(cls, origin: np.ndarray, face: np.ndarray, circles: np.ndarray, candidates: np.ndarray) -> "_Starts":
@@ -128,8 +114,7 @@ class _Starts:
         return index
 
     def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
-        """Returns a hypothesis and ``wanted`` ones behind it, no two of which are likely to grow to the same
-        reading."""
+        """Returns a hypothesis and ``wanted`` ones behind it that are not likely to grow to the same reading."""
         left, chosen = wanted.copy(), []
         left[:rank], left[rank] = False, True
         while len(chosen) < AT_ONCE and left.any():
@@ -195,10 +180,7 @@ class FaceFinder:
         self.target = target
 
     def find(self, candidates: Candidates) -> FaceFinding:
-        """Finds all faces among the candidates.
-
-        The mirror image of a face may look like another face; only the group can tell.
-        """
+        """Finds all faces among the candidates; the mirror image of a face may look like another one."""
         readings: list[FaceReading] = []
         if len(candidates) < MIN_NAMING or not self.target.faces:
             return _decide(readings, self.target)
@@ -294,10 +276,7 @@ def _turn(step_plane: np.ndarray, step_image: np.ndarray) -> np.ndarray:
 
 
 def _support(candidates: Candidates, pairs: _Pairs, pair: np.ndarray, xy: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Returns the candidates near the affine prediction of the circles around the first: (h, s), −1 if there is none.
-
-    ``pair`` : (h,) pairs of the design; ``xy`` : (h, 2) first candidate; ``linear`` : (h, 2, 2) map of the plane
-    """
+    """Candidates near the affine prediction of the circles around the first: (h, s), −1 if there is none."""
     offset, radius = pairs.offset[pair], pairs.radius[pair]
     predicted = xy[:, None] + offset @ np.swapaxes(linear, 1, 2)
     _, nearest = candidates.tree.query(predicted)

@@ -61,15 +61,14 @@ Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, Ellip
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedImage:
-    """One file with its detection; ``digest`` of its content; ``thumbnail`` a small JPEG, ``thumbnail_scale`` its size
-    over the image's; ``reused`` whether the detection was kept from an earlier run."""
+    """One file with its detection."""
 
     file: ImageFile
     detection: ImageDetection
-    digest: str
-    thumbnail: bytes
-    thumbnail_scale: float
-    reused: bool
+    digest: str  # of its content
+    thumbnail: bytes  # a small JPEG
+    thumbnail_scale: float  # its size over the image's
+    reused: bool  # whether the detection was kept from an earlier run
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,28 +88,12 @@ def detect_files(
     options: EllipseOptions,
     cache: Path,
     workers: int | None = None,
-    progress: Callable[[str], None] | None = None,
-    detector: Detector | None = None,
-    forms: bool = True,
-    pictures: bool = True,
+    progress: Callable[[str], None] | None = None,  # called with the name of each finished file, in any order
+    detector: Detector | None = None,  # reads one image; that of this package if None
+    forms: bool = True,  # whether a photograph in several forms, such as PNG and JPEG, counts once
+    pictures: bool = True,  # whether a small picture of each image is kept, for overlays
 ) -> DetectionResult:
-    """Detects circles in all files; unusable files are skipped and listed.
-
-    Parameters
-    ----------
-    cache : folder for results by content
-    progress : called with the name of each finished file, in any order
-    detector : function that reads one image; that of this package if None
-    forms : whether a photograph in several forms, such as PNG and JPEG, counts once; files of equal content always do
-    pictures : whether a small picture of each image is kept, for overlays
-
-    Raises
-    ------
-    InputError
-        No file is usable; the message names the first one and its reason. Or a file is gone meanwhile.
-    DetectionError
-        A process that worked on an image was ended from outside.
-    """
+    """Detects circles in all files; unusable files are skipped and listed. It is an error if no file is usable."""
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options, pictures)
@@ -137,10 +120,7 @@ def detect_files(
 
 
 def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) -> DetectionResult:
-    """Returns detections of corners, made with a camera without distortion, converted to another camera.
-
-    Corners of tags move, see :func:`stcal.boards.faces.shift_by_curves`.
-    """
+    """Returns corners of tags, made with a camera without distortion, as another camera sees them."""
     images = []
     for image in detection.images:
         centres = image.detection.centres
@@ -242,13 +222,7 @@ def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedI
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
-    """Returns the content of a file and its grey image, or why it cannot be used; ``size_from`` : source of the size.
-
-    Raises
-    ------
-    InputError
-        The file is gone.
-    """
+    """Returns the content of a file and its grey image, or why it cannot be used; ``size_from``: source of the size."""
     try:
         data = file.read()
     except OSError as error:
@@ -340,10 +314,7 @@ def look_again(
     cache: Path,
     workers: int | None = None,
 ) -> dict[str, SecondLook]:
-    """Measures the circles that are predicted in images; returns results by name, cached ones included.
-
-    An image that can no longer be read is left as it was after the first look; one that is gone is an error.
-    """
+    """Measures the circles that are predicted in images, by name; an image that cannot be read any more has none."""
     looks: dict[str, SecondLook] = {}
     pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
     paths: list[Path] = []
@@ -397,11 +368,9 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
 def _without_copies(
     outcomes: list[DetectedImage | Skipped], forms: bool, grouped: bool
 ) -> tuple[list[DetectedImage], list[Skipped]]:
-    """Returns the images without copies of photographs, and the files that are skipped.
-
-    A copy adds no information, but would count as a further observation. Of files with equal content, the one with the
-    plainest name is kept; of one photograph in several ``forms``, the lossless one. With ``grouped``, a photograph in
-    two groups is of one of them only, and nothing tells of which."""
+    """Returns the images without copies of photographs, which add no information, and the files that are skipped. Of
+    equal content the plainest name stays, of several ``forms`` the lossless one; with ``grouped``, nothing tells which
+    of two groups a photograph is of."""
     if grouped:
         misplaced = _in_two_groups([outcome for outcome in outcomes if isinstance(outcome, DetectedImage)])
         outcomes = [misplaced.get(o.file.name, o) if isinstance(o, DetectedImage) else o for o in outcomes]
@@ -442,9 +411,7 @@ def _plainness(file: ImageFile) -> tuple[bool, bool, int]:
 
 
 def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, DetectedImage]]:
-    """Yields pairs of images in different forms whose circles are at the same places, to some px.
-
-    A camera that does not move takes such pairs too, but all in the same form."""
+    """Yields pairs in different forms with circles at the same places; a camera that does not move has equal forms."""
     kinds = [each.file.path.suffix.lower()[:4].replace(".jpe", ".jpg") for each in images]
     if len(set(kinds)) < 2:
         return
@@ -470,13 +437,7 @@ def _same_pixels(one: ImageFile, two: ImageFile) -> bool:
 
 
 def require_upright(images: tuple[DetectedImage, ...]) -> None:
-    """Raises an error for a set of mirrored images.
-
-    Raises
-    ------
-    DetectionError
-        More than half of the images with a face are mirrored.
-    """
+    """Raises an error if more than half of the images with a face are mirrored."""
     mirrored = [image for image in images if image.detection.mirrored]
     upright = [image for image in images if image.detection.faces and not image.detection.mirrored]
     if mirrored and len(mirrored) > len(upright):

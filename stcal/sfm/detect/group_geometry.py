@@ -26,18 +26,14 @@ target. A design deviates by tenths of a step, a wrong numbering by a whole one.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrangement:
-    """Rigid arrangement of the planes of a group, with the poses of its images.
+    """Rigid arrangement of the planes of a group, with the poses of its images; readings by image."""
 
-    ``group_from_plane`` : by plane; ``camera_from_group`` : by image. By image, too: ``views`` : accepted readings;
-    ``contradicted`` : readings that do not fit; ``open`` : boards with several numberings that fit; ``foreign`` :
-    readings of a plane that other groups, or its rough pose, have elsewhere.
-    """
-
-    group_from_plane: dict[str, Rigid]
-    camera_from_group: dict[int, Rigid]
-    views: dict[int, tuple[PlaneView, ...]]
-    contradicted: dict[int, tuple[Readings, ...]] = field(default_factory=dict)
-    open: dict[int, tuple[Readings, ...]] = field(default_factory=dict)
+    group_from_plane: dict[str, Rigid]  # by plane
+    camera_from_group: dict[int, Rigid]  # by image
+    views: dict[int, tuple[PlaneView, ...]]  # accepted readings
+    contradicted: dict[int, tuple[Readings, ...]] = field(default_factory=dict)  # readings that do not fit
+    open: dict[int, tuple[Readings, ...]] = field(default_factory=dict)  # boards with several numberings that fit
+    # readings of a plane that other groups, or its rough pose, have elsewhere
     foreign: dict[int, tuple[PlaneView, ...]] = field(default_factory=dict)
 
     def without(self, planes: set[str]) -> "Arrangement":
@@ -56,17 +52,7 @@ class Arrangement:
 
 
 def arrange(images: Sequence[list[Readings]], step_mm: float, focal_px: float) -> Arrangement:
-    """Returns the arrangement that explains most circles of one group.
-
-    Parameters
-    ----------
-    images
-        Readings of every image.
-    step_mm
-        Distance between neighbouring circles, the least error of a wrong reading.
-    focal_px
-        Focal length of the camera.
-    """
+    """Arrangement that explains most circles; ``step_mm`` between circles is the least error of a wrong reading."""
     total = sum(len(views[0].rows) for readings in images for views in readings if views[0].named)
     best = Arrangement({}, {}, {})
     for i, reading in _seeds(images):
@@ -82,8 +68,7 @@ def arrange(images: Sequence[list[Readings]], step_mm: float, focal_px: float) -
 
 
 def as_drawn(found: Arrangement, rough_poses: Mapping[str, Rigid]) -> Arrangement:
-    """Returns the arrangement without the faces that are turned by more than ``MAX_TURN_RAD`` against the others from
-    how their rough poses have them; the faces that agree and have the most circles stay."""
+    """Arrangement without faces turned by more than ``MAX_TURN_RAD`` against most others from their rough poses."""
     circles = Counter(view.plane for views in found.views.values() for view in views for _ in view.rows)
     turn = {
         p: (pose @ rough_poses[p].inverse()).rotation for p, pose in found.group_from_plane.items() if p in rough_poses
@@ -94,12 +79,9 @@ def as_drawn(found: Arrangement, rough_poses: Mapping[str, Rigid]) -> Arrangemen
 
 
 def across_groups(groups: Sequence[Arrangement], reach_mm: float) -> list[Arrangement]:
-    """Compares the arrangements of all groups, as the faces of a target have the same relative poses in all of them.
-
-    A face is removed from a group in which its place differs from that in most groups, and the last face with the
-    others: alone it has no place to differ from, and the images may be mirrored. A face is added to a group if
-    its place is known from other groups, even if no image of the group has a reading of it: the second look decides.
-    """
+    """Compares the arrangements, as faces have the same relative poses in all groups. A face that most groups have
+    elsewhere is removed, and the last face with the others: alone it may be mirrored. A face known from other groups is
+    added; the second look decides."""
     faces = [_as_faces(group) for group in groups]
     best: Arrangement = Arrangement({}, {}, {})
     for i, view in _seeds(faces):
@@ -141,10 +123,7 @@ def _as_faces(group: Arrangement) -> list[Readings]:
 
 
 def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
-    """Returns readings to start from, with all alternatives: the board of an image, or its largest face.
-
-    The readings of the most reliable image come first.
-    """
+    """Returns readings to start from, the most reliable image first: the board of an image, or its largest face."""
     candidates = []
     for i, readings in enumerate(images):
         boards = [views for views in readings if views[0].plane == BOARD]
@@ -188,11 +167,7 @@ def _with_seed(readings: list[Readings], view: PlaneView, known: dict[str, Rigid
 
 
 def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
-    """Returns the pose of an image and the readings that agree with it, or None.
-
-    The pose with the most planes is taken, and of these the one with the most faces. The result is None if the image
-    has no known plane, or several poses fit equally well.
-    """
+    """Pose of an image with the most planes, then faces, and the readings that agree; None if several fit."""
     best, best_score, rivals = None, (0, 0, 0), 0
     for views in readings:
         for view in views:
@@ -255,10 +230,7 @@ def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]
 
 
 def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
-    """Returns poses of unknown planes, each at the place with the largest area in the placed images.
-
-    A second target in the background may be seen as often, but is smaller.
-    """
+    """Poses of unknown planes, each at the place with the largest area: a target in the background is smaller."""
     new = {}
     for plane, found in _unknown_planes(images, placed, known, named=True).items():
         support = _together(found, reach_mm) @ np.array([view.area for _, view, _ in found])
@@ -267,10 +239,7 @@ def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid
 
 
 def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float):
-    """Returns a plane that no image alone can name, and its pose, or an empty dict.
-
-    At least two images must agree on its place, and more than for any other plane that the same circles may be.
-    """
+    """Plane that no image alone names, and its pose, if two images agree, and more than on any other; or {}."""
     ranked = []
     for plane, found in _unknown_planes(images, placed, known, named=False).items():
         together = _together(found, reach_mm)
@@ -285,8 +254,7 @@ def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rig
 
 
 def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], named: bool):
-    """Returns (image, view, group_from_plane) by unknown plane, of the placed images' readings that are named, or of
-    those that are not named and agree with no known plane."""
+    """Returns (image, view, group_from_plane) by unknown plane of readings, ``named`` or at odds with known planes."""
     unknown: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
     for i, (pose, agreed) in placed.items():
         for views in images[i]:

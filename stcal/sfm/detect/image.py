@@ -31,19 +31,14 @@ have up to 130. A fine checkerboard has tens of thousands, and time and memory g
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageReading:
-    """Interpretation of the outlines in one image, before their centres are measured.
-
-    ``found`` : all outlines by polarity; ``boards`` : the board with the most dots first; ``free`` : the largest
-    ``MAX_FREE`` outlines of the target's polarity outside of boards; ``faces`` : faces among the free outlines;
-    ``mirrored`` : faces that appear mirrored; ``untried`` : number of outlines beyond ``MAX_FREE``.
-    """
+    """Interpretation of the outlines in one image, before their centres are measured."""
 
     found: dict[Polarity, Ellipses]
-    boards: tuple[BoardReading, ...]
-    free: Ellipses
+    boards: tuple[BoardReading, ...]  # the one with the most dots first
+    free: Ellipses  # the largest ``MAX_FREE`` outlines of the target's polarity outside of boards
     faces: FaceFinding
     mirrored: tuple[FaceReading, ...]
-    untried: int = 0
+    untried: int = 0  # number of outlines beyond ``MAX_FREE``
 
     def face_ids(self) -> set[str]:
         """Returns the ids of the named faces."""
@@ -56,13 +51,9 @@ def read_image(
     target: TargetDesign,
     board: BoardDesign | None,
     options: EllipseOptions,
-    aside: np.ndarray | None = None,
+    aside: np.ndarray | None = None,  # (k, 2) px, polygon whose outlines are left out
 ) -> ImageReading:
-    """Finds outlines of one polarity or both in an 8-bit image, and the boards and faces among them.
-
-    If the board, or enough faces for an image of a group, are not recognised, fainter outlines are used too. Outlines
-    in the polygon ``aside`` : (k, 2) px are left out.
-    """
+    """Finds outlines in an 8-bit image, and boards and faces among them; fainter outlines if too few are recognised."""
     reading = _read_once(grey, camera, target, board, options, aside)
     wanted = min(len(target.faces), 1 if board is None else 2)
     short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
@@ -115,11 +106,7 @@ def _outside(ellipses: Ellipses, polygon: np.ndarray | None) -> Ellipses:
 def detect_target(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
-    """Finds and measures all points of the target in one grey image; dots of the board are only set aside.
-
-    Otherwise it is :func:`detect_image`. Half of the time goes into the dots, and the pose of a target has no use for
-    them.
-    """
+    """Does as :func:`detect_image`, but only sets the dots of the board aside: they take half of the time."""
     return detect_image(image, camera, target, board, options, dots=False)
 
 
@@ -131,16 +118,8 @@ def detect_image(
     options: EllipseOptions,
     dots: bool = True,
 ) -> ImageDetection:
-    """Finds and measures all points of the target and the board in one grey image of the camera's size.
-
-    Circles are searched where the design has any, outside of a board of corners; corners of printed faces and of such a
-    board are used as found.
-
-    Raises
-    ------
-    InputError
-        The image is not grey, not of 8 or 16 bits, or not of the camera's size.
-    """
+    """Finds and measures all points of the target and the board in one grey image of 8 or 16 bits. Circles are searched
+    outside of a board of corners; corners are used as found."""
     require_grey(image, (camera.width, camera.height))
     image = np.ascontiguousarray(image)
     circles, printed = target.with_faces(printed=False), target.with_faces(printed=True)
@@ -198,8 +177,7 @@ def _detect_circles(
     aside: np.ndarray | None = None,
     dots: bool = True,
 ) -> ImageDetection:
-    """Finds and measures all circles of the target and, with ``dots``, the board in one grey image of the camera's
-    size; those in the polygon ``aside`` are left out."""
+    """Finds and measures all circles of the target and, with ``dots``, the board outside of the polygon ``aside``."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
     grey = grey_fine(image)
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards if dots else ()

@@ -1,8 +1,4 @@
-"""Labels of all circles.
-
-Readings of single images are compared with the arrangement of their group. A second look then searches the circles that
-must be in view according to the group.
-"""
+"""Labels of all circles: readings of images are compared with the arrangement of their group, then a second look."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -61,14 +57,9 @@ MIN_CONFIRMED = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledImage:
-    """Observations of one image, and notes on what was excluded.
-
-    ``focus`` : its blur, from which the observations are corrected; None if it has too few circles or is not corrected.
-    """
-
     observations: ImageObservations
-    notes: tuple[str, ...]
-    focus: Focus | None = None
+    notes: tuple[str, ...]  # on what was excluded
+    focus: Focus | None = None  # from which the observations are corrected; None if it has too few circles
 
     def plus(self, labels: Sequence[Label], centres: Centres, notes: Sequence[str]) -> "LabelledImage":
         """Returns the image with further circles and notes."""
@@ -226,11 +217,7 @@ def label_images(
     cache: Path,
     workers: int | None = None,
 ) -> list[LabelledImage]:
-    """Returns the labelled circles of all images, in the order of their groups.
-
-    Corners of printed faces name themselves; circles are named by image and group. ``cache`` : folder for what the
-    second look measures.
-    """
+    """Returns the labelled circles of all images, in the order of their groups."""
     circles = target.with_faces(printed=False)
     if len(circles.faces) == len(target.faces):
         return _label_circles(detection, target, board, options, cache, workers)
@@ -295,10 +282,7 @@ def _label_circles(
 
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
-    """Returns the labelled circles of all images, in the order of their groups, without a second look.
-
-    The group numbers plain boards, and readings that contradict it are excluded.
-    """
+    """Labels all images as :func:`label_images`, without a second look."""
     groups = [named for _, named in _groups(detection)]
     focal_px = float(np.sqrt(detection.camera.focal.prod()))
     return [each for found, _ in label_groups(groups, target, board, focal_px) for each in found]
@@ -322,10 +306,7 @@ def _without_outlying(
 
 
 def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[LabelledImage]:
-    """Adds the circles of the second look to a group's images, and removes faces that it does not confirm.
-
-    A face is not confirmed if a single image shows it, and other images that must show it do not.
-    """
+    """Adds the circles of the second look, and removes faces of a single image that others must show and do not."""
     images = []
     for image in group:
         look = looks.get(image.observations.name)
@@ -400,12 +381,7 @@ def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
 
 
 def _labelled(
-    name: str,
-    group: str,
-    detection: ImageDetection,
-    readings: list[Readings],
-    arrangement: Arrangement,
-    image: int,
+    name: str, group: str, detection: ImageDetection, readings: list[Readings], arrangement: Arrangement, image: int
 ) -> LabelledImage:
     if detection.mirrored:
         note = (

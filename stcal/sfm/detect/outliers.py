@@ -33,26 +33,8 @@ MAX_ROUNDS = 10
 def outlying_circles(
     arrangement: Arrangement, images: Sequence[ImageObservations], patterns: dict[str, Pattern], focal_px: float
 ) -> tuple[Arrangement, dict[int, dict[Label, str]]]:
-    """Finds circles that contradict the others of their group, and adjusts the arrangement without them.
-
-    Parameters
-    ----------
-    arrangement
-        Arrangement of the group, near its minimum.
-    images
-        All labelled circles of the group's images.
-    patterns
-        Circles of each plane.
-    focal_px
-        Focal length of the camera.
-
-    Returns
-    -------
-    arrangement
-        Adjusted arrangement; the same object if no circle is outlying.
-    outlying
-        Reasons by image and label.
-    """
+    """Finds circles that contradict the others of their group; returns the arrangement adjusted without them, the same
+    object if there are none, and reasons by image and label."""
     circles = _Circles.of(arrangement, images, patterns, focal_px)
     if not len(circles.rows):
         return arrangement, {}
@@ -75,17 +57,13 @@ def outlying_circles(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Circles:
-    """n circles of a group, and its arrangement as stacks.
+    """n circles of a group, and its arrangement as stacks."""
 
-    ``rows`` : image and label of each; ``image``, ``plane`` : (n,) places in the arrangement; ``xyz_mm`` : (n, 3) in
-    the plane; ``centre_px`` : (n, 2) images of the circles' centres, ideal, without eccentricity; ``sigma_px`` : (n,).
-    """
-
-    rows: list[tuple[int, Label]]
-    image: np.ndarray
+    rows: list[tuple[int, Label]]  # image and label of each
+    image: np.ndarray  # (n,) place in the arrangement, as ``plane``
     plane: np.ndarray
-    xyz_mm: np.ndarray
-    centre_px: np.ndarray
+    xyz_mm: np.ndarray  # (n, 3) in the plane
+    centre_px: np.ndarray  # (n, 2) images of the circles' centres, ideal, without eccentricity
     sigma_px: np.ndarray
     focal_px: float
     camera_from_group: PoseStack
@@ -157,8 +135,7 @@ class _Circles:
         )
 
     def off_px(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the deviations of centres from their places, (n, 2) px, and their derivatives (n, 2, 2) by the
-        place in the plane, px/mm."""
+        """Returns centres minus their places, (n, 2) px, and derivatives (n, 2, 2) by the place in the plane, px/mm."""
         rotation, xyz = self._placed()
         ideal = xyz[:, :2] / xyz[:, 2:]
         by_point = np.zeros((len(xyz), 2, 3))

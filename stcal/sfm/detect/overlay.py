@@ -41,10 +41,7 @@ def kept_overlay(
     notes: int,
     left_out: frozenset[Label] = frozenset(),
 ) -> bytes:
-    """Returns the JPEG of :func:`draw_overlay`, that of an earlier run with the same content if the ``cache`` has it.
-
-    ``digest`` : of the image that the thumbnail shows
-    """
+    """JPEG of :func:`draw_overlay`, or that of an earlier run if the ``cache`` has it by the image's ``digest``."""
     stated = CACHE_VERSION, made_by(), cv2.__version__, digest, scale, observations.name, observations.labels
     stated = *stated, faces, notes, sorted(left_out)
     hasher = hashlib.sha256("\0".join(map(repr, stated)).encode("utf-8", "backslashreplace"))
@@ -60,23 +57,14 @@ def kept_overlay(
 
 def draw_overlay(
     thumbnail: bytes,
-    scale: float,
+    scale: float,  # size of the thumbnail over the image's
     observations: ImageObservations,
-    faces: list[str],
+    faces: list[str],  # all face ids, for colours that stay the same over the images
     focal_px: np.ndarray,
-    notes: int,
-    left_out: Collection[Label] = (),
+    notes: int,  # number of things left out, for the caption
+    left_out: Collection[Label] = (),  # crossed by a white ×: the adjustment does not use them
 ) -> bytes:
-    """Returns a JPEG with every measured ellipse and its label, and the name of each face within its pattern, or above
-    it where there is no room.
-
-    Parameters
-    ----------
-    thumbnail : JPEG of the image, ``scale`` its size over the image's
-    faces : all face ids, for colours that stay the same over the images
-    notes : number of things left out, for the caption
-    left_out : labels of the circles that the adjustment does not use; a white ×, explained at the bottom, crosses them
-    """
+    """Returns a JPEG with every measured ellipse and its label, and the name of each face."""
     picture = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise InputError(

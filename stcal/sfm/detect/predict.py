@@ -52,17 +52,13 @@ REMEDIES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictedCircles:
-    """n circles that are in view in one image.
-
-    ``labels`` ; ``centre_px`` : (n, 2) and ``shape_px`` : (n, 2, 2) of their ellipses; ``polarity`` of each; ``wanted``
-    : (n,) those that have no label yet.
-    """
+    """n circles that are in view in one image."""
 
     labels: tuple[Label, ...]
-    centre_px: np.ndarray
-    shape_px: np.ndarray
+    centre_px: np.ndarray  # (n, 2)
+    shape_px: np.ndarray  # (n, 2, 2)
     polarity: tuple[Polarity, ...]
-    wanted: np.ndarray
+    wanted: np.ndarray  # (n,) those that have no label yet
 
     def __post_init__(self):
         n = len(self.labels)
@@ -77,10 +73,7 @@ class PredictedCircles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondLook:
-    """Result of a second look.
-
-    ``labels``, ``centres`` : measured circles; ``missed`` : reason by label of the others.
-    """
+    """Result of a second look: the measured circles, and reasons of the others."""
 
     labels: tuple[Label, ...]
     centres: Centres
@@ -96,10 +89,7 @@ def predict_circles(
     camera: Camera,
     max_tilt_rad: float = MAX_TILT_RAD,
 ) -> PredictedCircles | None:
-    """Predicts the circles in view of an image from the arrangement; None if the arrangement lacks the image.
-
-    Circles tilted by more than ``max_tilt_rad`` are left out. Circles that are not in ``seen`` are wanted.
-    """
+    """Predicts the circles in view of an image, None if the arrangement lacks it; those not in ``seen`` are wanted."""
     pose = arrangement.camera_from_group.get(image)
     if pose is None:
         return None
@@ -124,11 +114,8 @@ def predict_circles(
 
 
 def contradictions(predicted: PredictedCircles, observed: ImageObservations, camera: Camera) -> dict[Label, str]:
-    """Returns circles of the first look whose size contradicts the other circles of their plane, with the reasons.
-
-    Such a circle is partly hidden, or something else. A common size ratio of a plane's circles is attributed to the
-    design and accepted.
-    """
+    """Returns circles, with reasons, whose size contradicts others of their plane: partly hidden, or something else. A
+    common size ratio of a plane's circles is attributed to the design and accepted."""
     place = {label: i for i, label in enumerate(predicted.labels)}
     rows = np.array([k for k, label in enumerate(observed.labels) if label in place], int)
     predicted_rows = np.array([place[observed.labels[k]] for k in rows], int)
@@ -155,12 +142,7 @@ def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera
 
 
 def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], blur_px: float) -> tuple[str, str]:
-    """Returns why a measured ellipse is not the expected one of ``shape_px``: the key of its remedy, and the reason;
-    both empty if it is the expected one.
-
-    ``off_px`` : distance from the expected place; ``stretch`` : largest and smallest ratio of its size to the expected
-    one; ``blur_px`` : standard deviation of the blur of its rim.
-    """
+    """Returns why a measured ellipse is not the expected one: the key of its remedy and the reason; empty if it is."""
     largest, smallest = singular_values(shape_px)
     if blur_px > MAX_BLUR * smallest:
         return "blur", f"blurred by {blur_px:.2g} px, {MAX_BLUR * float(smallest):.2g} px allowed by its smaller radius"
@@ -274,11 +256,8 @@ def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles)
 
 
 def common_shift(grey: np.ndarray, predicted: PredictedCircles) -> np.ndarray:
-    """Returns the common shift of the circles of an 8-bit image from their predicted places, (2,) px.
-
-    It is accurate to a fraction of a radius. The image and discs at the predicted places, both reduced and high-pass
-    filtered, are correlated (Lewis 1995, Fast normalized cross-correlation).
-    """
+    """Returns the common shift, (2,) px, of the circles of an 8-bit image from their places, to a fraction of a radius,
+    by correlation with high-pass filtered discs (Lewis 1995, Fast normalized cross-correlation)."""
     radius = float(np.sqrt(np.linalg.det(predicted.shape_px)).mean() ** 0.5)
     scale = min(1.0, COARSE_RADIUS_PX / radius)
     margin = int(np.ceil(SEARCH * radius * scale))

@@ -52,34 +52,23 @@ MAX_MISFIT = 0.25
 
 @dataclass(frozen=True, slots=True)
 class PublishedPattern:
-    """Pattern of the published rules, by circle ids.
+    """Pattern of the published rules, by circle ids."""
 
-    ``lines`` : circles along X, Y and the diagonal from the ``origin`` on, as (id, distance in steps); ``a``, ``b`` :
-    small circles beside the origin; ``c`` : small circle that names the face, beside ``last``, at ``c_radii`` radii of
-    it; ``names`` : face id by (sign of the scalar, of the vector product) with the diagonal; ``step_radii`` : distance
-    from the origin to ``a`` in radii of the origin; ``small`` : ratio of the areas of small and large circles.
-    """
-
-    origin: str
+    origin: str  # of the directions, with the small circles ``a`` and ``b`` beside it
     a: str
     b: str
-    c: str
+    c: str  # small circle that names the face, beside ``last``, at ``c_radii`` radii of it
     last: str
+    # circles along X, Y and the diagonal from the ``origin`` on: (id, distance in steps)
     lines: tuple[tuple[tuple[str, float], ...], ...]
-    names: dict[tuple[int, int], str]
-    step_radii: float
+    names: dict[tuple[int, int], str]  # face id by (sign of the scalar, of the vector product) with the diagonal
+    step_radii: float  # distance from the origin to ``a`` in radii of the origin
     c_radii: float
-    small: float
+    small: float  # ratio of the areas of small and large circles
 
     @classmethod
     def of(cls, target: TargetDesign) -> "PublishedPattern":
-        """Returns the pattern of a design.
-
-        Raises
-        ------
-        InputError
-            If the design does not have that form.
-        """
+        """Returns the pattern of a design; an error if it has another form."""
         try:
             return cls._of(target)
         except (LookupError, ValueError) as error:
@@ -176,29 +165,8 @@ def _cross(u: np.ndarray, v: np.ndarray) -> float:
 def detect_published(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
-    """Finds all circles of the target and the board in one grey image of the camera's size by the published rules.
-
-    Parameters
-    ----------
-    image
-        Image (h, w), grey, 8 or 16 bits.
-    camera
-        Camera with its intrinsics, px.
-    target, board
-        Designs; no board is sought if None.
-    options
-        ``min_diameter_px``, ``max_diameter_px`` and ``min_axis_ratio`` are the rules' two tests.
-
-    Returns
-    -------
-    ImageDetection
-        Centres of ellipses fitted to contours, px, all with the same σ.
-
-    Raises
-    ------
-    InputError
-        If the design does not have the published form.
-    """
+    """Finds all circles of the target and the board in one grey image by the published rules, all with the same σ.
+    Diameters and axis ratio in ``options`` are the rules' two tests."""
     pattern = PublishedPattern.of(target)
     grey = cv2.GaussianBlur(grey_8bit(image), (SMOOTHING_PX, SMOOTHING_PX), 0)
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
@@ -265,8 +233,7 @@ class _Rules:
         self.area = candidates.radius**2
 
     def find(self, free: np.ndarray) -> tuple[list[tuple[str, np.ndarray, np.ndarray]], list[str]]:
-        """Returns (face id, rows among the candidates, circles of the design) by face, and notes on rejected
-        patterns."""
+        """(face id, rows among the candidates, circles of the design) by face, and notes on rejected patterns."""
         free = free.copy()
         faces, notes = [], []
         for origin in np.argsort(-self.area, kind="stable").tolist():
@@ -306,10 +273,7 @@ class _Rules:
         return {self.pattern.a: first, self.pattern.b: second}
 
     def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
-        """Labels the large circles along the three directions, and returns the reason if one is missing, else "".
-
-        The step along the diagonal is the sum of the other two.
-        """
+        """Labels the large circles along the three directions; returns the reason if one is missing, else ""."""
         origin = circles[self.pattern.origin]
         at = self.found.xy[origin]
         step_x, step_y = (self.found.xy[circles[circle]] - at for circle in (self.pattern.a, self.pattern.b))
@@ -338,10 +302,7 @@ class _Rules:
         return ""
 
     def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceDesign, np.ndarray, str]:
-        """Returns the face named by circle c, the rows of its circles in the design's order, and a note on the name.
-
-        If there is no such face, the reason is returned.
-        """
+        """Face named by circle c, the rows of its circles in the design's order, and a note; or why there is none."""
         pattern = self.pattern
         last = circles[pattern.last]
         labelled = set(circles.values())

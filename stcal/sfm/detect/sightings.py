@@ -24,12 +24,11 @@ MIN_POSE_CIRCLES = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceSighting:
-    """A face in an image: its id, ``rows`` : (n,) indices of its circles among the image's centres, ``circles`` : (n,)
-    their indices in the design."""
+    """A face in an image."""
 
     face: str
-    rows: np.ndarray
-    circles: np.ndarray
+    rows: np.ndarray  # (n,) indices of its circles among the image's centres
+    circles: np.ndarray  # (n,) their indices in the design
 
     def labels(self, design: FaceDesign) -> tuple[CircleLabel, ...]:
         """Returns the labels of its circles."""
@@ -51,35 +50,26 @@ def open_face_note(circles: int, faces: Iterable[str]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSighting:
-    """A board in an image.
+    """A board in an image."""
 
-    ``rows`` : (n,) indices of its dots among the image's centres; ``numberings`` : (k, n, 2) row and column of each dot
-    in each of the k numberings that fit the image, the likeliest first; ``unlikely`` : (u, n, 2) further numberings
-    that require covered dots inside the image; the group may confirm them.
-    """
-
-    rows: np.ndarray
-    numberings: np.ndarray
+    rows: np.ndarray  # (n,) indices of its dots among the image's centres
+    numberings: np.ndarray  # (k, n, 2) row and column of each dot in each numbering, the likeliest first
+    # (u, n, 2) that require covered dots inside the image; the group may confirm them
     unlikely: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 2), int))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageDetection:
-    """Result of detection in one image.
-
-    ``centres`` : the measured circles; ``faces`` and ``boards`` : their readings, boards with the most dots first; a
-    face or the board may occur more than once; ``open_faces`` : patterns without a name; ``mirrored`` : ids of faces
-    that appear mirrored; ``notes`` : exclusions with reasons; ``candidates`` : number of outlines; ``printed`` : faces
-    with a board or tags, which name themselves; their corners are among the centres, without extent.
-    """
+    """Result of detection in one image; a face or the board may occur more than once."""
 
     centres: Centres
     faces: tuple[FaceSighting, ...]
-    boards: tuple[BoardSighting, ...] = ()
-    mirrored: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    candidates: int = field(default=0)
-    open_faces: tuple[OpenFace, ...] = ()
+    boards: tuple[BoardSighting, ...] = ()  # the one with the most dots first
+    mirrored: tuple[str, ...] = ()  # ids of faces
+    notes: tuple[str, ...] = ()  # exclusions with reasons
+    candidates: int = field(default=0)  # number of outlines
+    open_faces: tuple[OpenFace, ...] = ()  # patterns without a name
+    # faces with a board or tags, whose corners are among the centres, without extent
     printed: tuple[FaceSighting, ...] = ()
 
     @property
@@ -108,23 +98,17 @@ class ImageDetection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneView:
-    """One reading of n circles of an image as circles of one plane.
+    """One reading of n circles of an image as circles of one plane."""
 
-    ``plane`` : face id or ``board``; ``rows`` : (n,) indices among the image's centres; ``xy_mm`` : (n, 2) in the
-    plane; ``xy`` : (n, 2) measured, normalised; ``area`` : sum of the ellipses' areas over π, normalised;
-    ``camera_from_plane`` : pose from these circles alone; ``named`` : whether the image alone identifies the plane;
-    ``likely`` : whether missing circles of the plane are outside of the image rather than covered.
-    """
-
-    plane: str
+    plane: str  # face id or ``board``
     labels: tuple[Label, ...]
-    rows: np.ndarray
-    xy_mm: np.ndarray
-    xy: np.ndarray
-    area: float
-    camera_from_plane: Rigid
-    named: bool = True
-    likely: bool = True
+    rows: np.ndarray  # (n,) indices among the image's centres
+    xy_mm: np.ndarray  # (n, 2) in the plane
+    xy: np.ndarray  # (n, 2) measured, normalised
+    area: float  # sum of the ellipses' areas over π, normalised
+    camera_from_plane: Rigid  # from these circles alone
+    named: bool = True  # whether the image alone identifies the plane
+    likely: bool = True  # whether missing circles are outside of the image rather than covered
 
     def xyz_mm(self) -> np.ndarray:
         """Returns the circles' centres, (n, 3), in the plane's frame."""
@@ -141,10 +125,7 @@ Readings = list[PlaneView]
 
 
 def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
-    """Returns the readings of one image with their poses.
-
-    Patterns with too few circles for a pose are omitted, and those that are in view twice: one may be a reflection.
-    """
+    """Returns the readings of one image with poses; not of patterns in view twice, one of which may be a reflection."""
     readings = []
     ids = [each.face for each in detection.faces]
     for each in (each for each in detection.faces if ids.count(each.face) == 1):
@@ -198,10 +179,7 @@ def _pose(xy_mm: np.ndarray, xy: np.ndarray) -> Rigid | None:
 
 
 def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
-    """Returns by face the sets of its circles (indices in the design) that another reading explains as well.
-
-    Circles name a face only if no such set contains all of them.
-    """
+    """Returns by face the sets of its circles that another reading explains as well; such a set names no face."""
     key = tuple((f.id, f.xy_mm.tobytes(), f.radius_mm.tobytes()) for f in target.faces)
     return _confusable(key)
 
@@ -220,11 +198,8 @@ def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
 
 
 def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
-    """Returns the largest number of circles of a face that coincide with circles of another, or with its own after a
-    turn.
-
-    The face is moved rigidly or, if ``mirrored``, turned over. 0 if fewer than ``MIN_COMMON`` coincide.
-    """
+    """Returns the largest number of circles that coincide with another face, or with the own after a turn; 0 below
+    ``MIN_COMMON``. The face is moved rigidly or, if ``mirrored``, turned over."""
     xy = np.asarray(face.xy_mm) * [-1 if mirrored else 1, 1]
     same = face.id == other.id and not mirrored
     found = common_circles(xy, face.radius_mm, other.xy_mm, other.radius_mm, same)
@@ -238,10 +213,7 @@ def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
 
 
 def likeness_notes(target: TargetDesign) -> list[str]:
-    """Returns notes about faces that only one circle distinguishes, and about mirror images among the faces.
-
-    Tags name the faces that they are printed on, and no reflection is read as a tag.
-    """
+    """Returns notes about faces that only one circle distinguishes, and mirror images; tags name themselves."""
     target = target.with_faces(printed=False)
     near = [telling for face in target.faces for other in target.faces for telling in _telling(face, other)]
     notes = []
@@ -305,9 +277,7 @@ def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
 
 
 def mirrored_as(face: FaceDesign, other: FaceDesign) -> tuple[np.ndarray, ...]:
-    """Returns the circles of a face's mirror image that pass for circles of another, see
-    :func:`~stcal.lookalikes.mirrored_circles`.
-    """
+    """Returns the circles of a face's mirror image that pass for circles of another."""
     return _mirrored_as(*(a.tobytes() for a in (face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)))
 
 

@@ -24,13 +24,7 @@ from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
-from stcal.sfm.mapping.models import (
-    ReadModel,
-    find_models,
-    open_model,
-    read_model,
-    write_reconstruction,
-)
+from stcal.sfm.mapping.models import ReadModel, find_models, open_model, read_model, write_reconstruction
 from stcal.sfm.report.judgement import judged
 from stcal.sfm.runs.crosscheck import (
     CameraDifference,
@@ -136,7 +130,8 @@ def _compared(
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
             names = [image.name for image in group]
-            pair = _initial_pair(run, name, ids)
+            chosen = next(row for row in run.report["groups"] if row["name"] == name)["pairs"][0]
+            pair = ids[chosen["first"]], ids[chosen["second"]]
             work = folder / f"group{index}"
             options = mapper_options(native, names, pair)
             _require_enough(name, pair, ids, run)
@@ -168,11 +163,8 @@ def _require_enough(group: str, pair: tuple[int, int], ids: dict[str, int], run:
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
-    """Returns our thresholds as options of the native mapper.
-
-    These are all of its ``Mapper.*`` options that pycolmap has, except negative values, with which newer versions ask
-    for an automatic choice.
-    """
+    """Returns our thresholds as options of the native mapper: all of pycolmap's except negative values, which newer
+    versions take as a request for an automatic choice."""
     options = pipeline_options(names, pair)
     chosen = {}
     for name in sorted(native.mapper_options):
@@ -185,11 +177,6 @@ def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]
                 chosen[name] = str(int(setting)) if isinstance(setting, bool) else repr(setting)
     seed = next((o for o in ("random_seed", "default_random_seed") if o in native.mapper_options), None)
     return chosen | ({seed: str(options.random_seed)} if seed else {})
-
-
-def _initial_pair(run: SavedRun, group: str, ids: dict[str, int]) -> tuple[int, int]:
-    pair = next(row for row in run.report["groups"] if row["name"] == group)["pairs"][0]
-    return ids[pair["first"]], ids[pair["second"]]
 
 
 def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun, ids) -> tuple[Path, ReadModel]:
@@ -350,10 +337,7 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
 
 
 def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, float]:
-    """Returns the differences of the cameras relative to the circles of their group, in σ of the cameras.
-
-    The two models of a group are aligned by all of their circles, which is the datum of the covariances.
-    """
+    """Differences of the cameras in their σ, relative to the circles of their group, the covariances' datum."""
     factors = run.sigma_factors()
     model_of_group = {model.group: model for model in b.models}
     sigmas = {}

@@ -41,19 +41,14 @@ def damaged(path: Path, sign: str) -> InputError:
 
 
 def require_whole(database: Path, copy: sqlite3.Connection) -> None:
-    """Checks every name, blob and reference of a database against the schema.
-
-    ``database`` : path of the database, for messages; ``copy`` : copy of its content, in the schema of our own
-    database.
-
-    Raises InputError if a row is damaged; the message names the first one.
-    """
+    """Checks every name, blob and reference of the ``copy`` of a database, in our schema."""
     for fault in _faults(copy):
         raise damaged(database, fault)
 
 
 def _faults(copy: sqlite3.Connection) -> Iterator[str]:
-    yield from _faulty_references(copy)
+    for table, row, parent, _ in copy.execute("PRAGMA foreign_key_check"):
+        yield f"row {row} of {table} refers to one that is not in {parent}"
     for image, name in copy.execute("SELECT image_id, name FROM images"):
         fault = name_fault(name) if isinstance(name, str) else "not a text"
         if fault:
@@ -76,11 +71,6 @@ def _faults(copy: sqlite3.Connection) -> Iterator[str]:
                 if _size(blob) != REAL * numbers:
                     yield f"{table} {row}: {column} of {_told(blob)}, {REAL * numbers} bytes or none needed"
     yield from _faulty_pairs(copy)
-
-
-def _faulty_references(copy: sqlite3.Connection) -> Iterator[str]:
-    for table, row, parent, _ in copy.execute("PRAGMA foreign_key_check"):
-        yield f"row {row} of {table} refers to one that is not in {parent}"
 
 
 def _faulty_matrices(copy: sqlite3.Connection, table: str, width: int, allowed: Sequence[int] | None) -> Iterator[str]:
@@ -124,13 +114,7 @@ def _told(blob: object) -> str:
 
 
 def require_of_run(database: Path, copy: sqlite3.Connection, run: SavedRun) -> None:
-    """Checks that the database holds the run's camera, images, centres, and the matches of their labels.
-
-    ``database``, ``copy :`` : as in :func:`require_whole`, which must have accepted the database; ``run`` : run with
-    the camera and the labelled, corrected centres.
-
-    Raises InputError if it differs from the run's files; the message names the first difference.
-    """
+    """Checks that a whole database holds the run's camera, images, centres, and the matches of their labels."""
     _require_camera(database, copy, run)
     ids = image_ids(run.observations)
     _require_keypoints(database, copy, run, ids)
@@ -201,16 +185,13 @@ CAMERA_SENSOR = 0
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """Summary of an exported database.
-
-    ``pairs`` : pairs of images with a two-view geometry; ``camera_models`` : COLMAP's names.
-    """
+    """Summary of an exported database."""
 
     path: Path
     schema: str
     images: int
-    pairs: int
-    camera_models: tuple[str, ...]
+    pairs: int  # of images with a two-view geometry
+    camera_models: tuple[str, ...]  # COLMAP's names
 
 
 @require_arguments
@@ -244,19 +225,8 @@ def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
 
 
 def copy_database(database: Path, out: Path, schema: str, run: SavedRun | None = None) -> Exported:
-    """Writes the content of ``database`` to ``out`` in the schema of another COLMAP version.
-
-    Ids, the order of keypoints, matches and pairs, and every blob stay the same. ``database`` is only read. Every blob,
-    name and reference in it must be valid; if ``run`` is given, the content must be that of the run's labels. ``out``
-    is compared with the database and with the published schema before it appears. It appears complete or not at all.
-
-    ``database`` : database of pycolmap 4.2 that no other program has open; ``schema`` : name of a schema of
-    :mod:`stcal.sfm.interop.schema`; ``run`` : run to which the database belongs.
-
-    Raises InputError if the schema is unknown; ``out`` exists or cannot be written; ``database`` is in use, damaged or
-    of another version; or it holds something that has no place in the schema. Raises StcalError if the written copy
-    differs from the database or the schema.
-    """
+    """Writes the content of ``database`` to ``out`` in the schema of another COLMAP version; ids, order and blobs stay.
+    All of it must be valid and, with ``run``, of the run's labels. ``out`` is compared with both before it appears."""
     database, out = Path(database), Path(out)
     wanted = find_schema(schema)
     if os.path.lexists(out):
@@ -314,13 +284,9 @@ def _read_table(connection: sqlite3.Connection, name: str, sql: str) -> SchemaTa
 
 
 def _open_unchanged(path: Path) -> sqlite3.Connection:
-    """Opens a database for reading, without any trace.
-
-    Raises InputError if another program has it open, or if it is no database.
-
-    SQLite makes side files beside a database in WAL mode even for a reader. ``immutable`` prevents it; it also skips
-    the locks, which in WAL mode nobody holds while there are no side files.
-    """
+    """Opens a database for reading, without any trace. Beside one in WAL mode SQLite makes side files even for a
+    reader. ``immutable`` prevents it; it also skips the locks, which in WAL mode nobody holds while there are no side
+    files."""
     try:
         with path.open("rb") as stream:
             header = stream.read(20)
@@ -407,10 +373,7 @@ def _require_known(database, copy, wanted: Schema, what: str, table: str, column
 
 
 def _require_no_rigs(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
-    """Checks that every rig is one camera and every frame one image, with the same ids.
-
-    Versions before 3.12 have no rigs and frames. Later versions make exactly these from their databases.
-    """
+    """Checks that every rig is one camera and every frame one image, as versions after 3.11 make of older databases."""
     extra_sensors = _count(copy, "SELECT 1 FROM rig_sensors")
     if extra_sensors:
         raise _no_place(database, wanted, f"a rig of more than one sensor ({extra_sensors} beside the first)", "3.12")
@@ -496,10 +459,7 @@ def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connectio
 
 
 def _publish(partial: Path, out: Path) -> None:
-    """Gives the finished file its name by a link.
-
-    Unlike a rename, a link never overwrites a file that appeared meanwhile.
-    """
+    """Gives the finished file its name by a link, which never overwrites a file that appeared meanwhile."""
     try:
         os.link(partial, out)
     except FileExistsError as error:

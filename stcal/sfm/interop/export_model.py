@@ -57,16 +57,12 @@ class ReportOfModel(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The points that an image shows.
-
-    ``labels`` : of n points; ``xyz`` : (n, 3) mm, target frame; ``xy_px`` : (n, 2) their keypoints, OpenCV pixel
-    origin.
-    """
+    """The n points that an image shows."""
 
     camera_from_target: Rigid
     labels: Sequence[Label]
-    xyz: np.ndarray
-    xy_px: np.ndarray
+    xyz: np.ndarray  # (n, 3) mm, target frame
+    xy_px: np.ndarray  # (n, 2) their keypoints, OpenCV pixel origin
 
     def off_px(self, camera: Camera) -> np.ndarray:
         """Returns the distances (n,) of keypoints from their projected points, px; infinite behind the camera."""
@@ -77,14 +73,7 @@ class View:
 
 
 def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: ReportOfModel) -> None:
-    """Checks the residual of every keypoint and the pose of every camera against the report.
-
-    ``path`` : path of the model, for messages; ``views`` : views by name of the image; ``camera`` : camera of the
-    model; ``report`` : report of the model's run.
-
-    Raises InputError if one deviates. The message names the point and image that exceed their limit most, and the
-    deviation.
-    """
+    """Checks residuals of keypoints and poses of cameras against the report, and names the worst point and image."""
     limits = {row.image: row for row in report.residuals_by_image}
     worst = (1.0, "")
     for image, view in views.items():
@@ -111,10 +100,7 @@ def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: R
 
 
 def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel) -> None:
-    """Checks the poses of the cameras against the report.
-
-    Residuals cannot show that a model was moved, turned or scaled as a whole.
-    """
+    """Checks the poses of the cameras: residuals cannot show that a model was moved, turned or scaled as a whole."""
     camera_of_image = {camera.image: camera for camera in report.scene.cameras}
     missing = sorted(camera_of_image.keys() ^ views.keys())
     if missing:
@@ -140,34 +126,26 @@ LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um"
 
 @dataclass(frozen=True, slots=True)
 class ExportedModel:
-    """Summary of an exported model.
-
-    ``path``, ``labels`` : written files; ``images``, ``points`` : counts; ``focal_px``, ``centre_px`` : ideal camera in
-    place of the run's, OpenCV pixel origin, None if the format holds the run's camera.
-    """
+    """Summary of an exported model."""
 
     path: Path
     labels: Path
     images: int
     points: int
-    focal_px: float | None
-    centre_px: tuple[float, float] | None
+    focal_px: float | None  # of an ideal camera in place of the run's; None if the format holds the run's camera
+    centre_px: tuple[float, float] | None  # OpenCV pixel origin
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """A point of the model.
-
-    ``group`` : name of its group, empty if several groups share it; ``xyz`` : (3,), target frame, mm; ``views`` :
-    (image id, keypoint).
-    """
+    """A point of the model."""
 
     id: int
-    group: str
+    group: str  # empty if several groups share it
     label: Label
-    xyz: list[float]
+    xyz: list[float]  # (3,), target frame, mm
     rgb: tuple[int, int, int]
-    views: tuple[tuple[int, int], ...]
+    views: tuple[tuple[int, int], ...]  # (image id, keypoint)
 
 
 @require_arguments
@@ -335,11 +313,8 @@ def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
 
 
 def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float) -> str:
-    """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm).
-
-    y points down, z forward, and measurements are relative to the principal point. MeshLab needs the spaces at the ends
-    of the first lines. A space in a name is written as a quotation mark.
-    """
+    """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, principal point zero.
+    MeshLab needs the spaces at the ends of the first lines. A space in a name is written as a quotation mark."""
     images = _images(reconstruction)
     place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["NVM_V3 ", " ", f"{len(images)}  "]
@@ -358,10 +333,7 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
 def _bundler(
     reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
 ) -> tuple[str, str]:
-    """Returns ``bundle.out`` and ``list.txt`` (Bundler's manual, section VI).
-
-    y points up, the camera looks along −z, and views are relative to the image's centre.
-    """
+    """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, view along −z, image centre zero."""
     images = _images(reconstruction)
     place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]

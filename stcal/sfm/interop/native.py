@@ -39,21 +39,15 @@ LOOK_SECONDS = 0.1
 
 @dataclass(frozen=True, slots=True)
 class NativeColmap:
-    """A native COLMAP program.
-
-    ``version`` : as the program states it, like ``3.8``; ``mapper_options`` : options of its mapper.
-    """
+    """A native COLMAP program."""
 
     program: Path
-    version: str
-    mapper_options: frozenset[str]
+    version: str  # as the program states it, like ``3.8``
+    mapper_options: frozenset[str]  # names
 
 
 def find_colmap(path: str | Path | None = None) -> NativeColmap:
-    """Returns the program at ``path``, or the one on the PATH.
-
-    Raises InputError if there is none, it is not COLMAP, or it fails or hangs when asked for its version.
-    """
+    """Returns the program at ``path``, or the one on the PATH."""
     executable = shutil.which("colmap" if path is None else str(path))
     if executable is None:
         where = "on the PATH" if path is None else f"at {path} that can be executed"
@@ -73,10 +67,7 @@ def find_colmap(path: str | Path | None = None) -> NativeColmap:
 
 
 def require_listable(names: list[str]) -> None:
-    """Refuses names that COLMAP's list of images would change, as its lines are stripped.
-
-    Raises InputError if a name begins or ends with a space.
-    """
+    """Refuses names that begin or end with a space: COLMAP strips the lines of its list of images."""
     for name in names:
         if name != name.strip(" "):
             raise InputError(
@@ -89,13 +80,8 @@ def require_listable(names: list[str]) -> None:
 def map_natively(
     native: NativeColmap, database: Path, folder: Path, names: list[str], options: dict[str, str], timeout_s: float
 ) -> None:
-    """Runs the mapper on the named images of a database and writes to ``folder/models``.
-
-    ``folder`` : new folder; the mapper's output goes to ``mapper.log`` there; ``options`` : values by name without
-    dashes; this version must have all of the names.
-
-    Raises MappingError if the program fails, or does not end in ``timeout_s`` seconds.
-    """
+    """Runs the mapper on the named images of a database and writes to ``models`` and ``mapper.log`` in a new folder.
+    ``options``: values by name without dashes, all of which this version must have."""
     models, images = folder / "models", folder / "images"
     for subfolder in (models, images):
         subfolder.mkdir(parents=True)
@@ -135,10 +121,7 @@ def _end(code: int, output: str) -> str:
 
 
 def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int | None, str]:
-    """Returns the exit code of a command, None after the time limit, and the last part of its output.
-
-    ``environment`` : added variables. The command needs no screen, and no process that it started outlives it.
-    """
+    """Exit code of a command, None after the time limit, and its last output; no child process outlives it."""
     try:
         process = subprocess.Popen(
             command,
@@ -166,10 +149,7 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
 
 
 def _listen(process: subprocess.Popen, pipe: IO[bytes], until: float) -> bytes:
-    """Returns the last part of a process's output, until it ends or the time is over.
-
-    The end of the process is watched, too, as a child of it may keep the pipe open.
-    """
+    """Returns the last output of a process until it ends, which is watched as a child may keep the pipe open."""
     output = b""
     with selectors.DefaultSelector() as selector:
         selector.register(pipe, selectors.EVENT_READ)
@@ -198,13 +178,7 @@ def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
 
 
 def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
-    """Returns scale and faces of unchanged models of the run's groups, group by group and chained.
-
-    ``solve`` : ``chain`` for our stages, ``paper`` for those of Zhang & Wei (2017).
-
-    Raises InputError if the models state different cameras. Raises ScaleError: if the board of a group is not in its
-    model. Raises MappingError if the reference face is in none of the models, or a face is not linked to it.
-    """
+    """Returns scale and faces of unchanged models of the run's groups, group by group and chained."""
     models: dict[str, WorldModel] = {}
     notes = []
     for source in read:

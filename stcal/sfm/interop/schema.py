@@ -86,19 +86,14 @@ class SchemaTable:
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """The database schema of a COLMAP version.
-
-    ``user_version`` : the stamp of the version's first release;
-    ``camera_models``, ``pair_configurations``, ``descriptor_types`` : name by number, as stored in ``cameras.model``,
-    ``two_view_geometries.config`` and ``descriptors.type`` (before 4.0 there is no such column: all are SIFT).
-    """
+    """The database schema of a COLMAP version."""
 
     name: str
-    user_version: int
+    user_version: int  # the stamp of the version's first release
     tables: dict[str, SchemaTable]
-    camera_models: dict[int, str]
-    pair_configurations: dict[int, str]
-    descriptor_types: dict[int, str]
+    camera_models: dict[int, str]  # name by number in ``cameras.model``
+    pair_configurations: dict[int, str]  # in ``two_view_geometries.config``
+    descriptor_types: dict[int, str]  # in ``descriptors.type``, a column from 4.0 on
 
     def following(self, name: str, *changed: SchemaTable, **others) -> "Schema":
         """Returns the schema of a later version, with changed tables added or replaced, and changed fields."""
@@ -242,21 +237,14 @@ _SAME_TABLES = {"4.1": "4.0"}
 
 
 def find_schema(name: str) -> Schema:
-    """Returns the schema of that name.
-
-    Raises InputError if it is not the name of a schema.
-    """
+    """Returns the schema of that name."""
     if name not in SCHEMAS:
         raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
     return SCHEMAS[name]
 
 
 def schema_of_version(version: str) -> str:
-    """Returns the name of the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and
-    writes.
-
-    Raises InputError if the version is no release, older than 3.8, or newer than the newest schema here.
-    """
+    """Returns the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and writes."""
     release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
     minor = release[1] if release else version
     name = _SAME_TABLES.get(minor, minor)

@@ -120,8 +120,7 @@ class DesignOptions(Brief):
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
     def least_radius_mm(self) -> float:
-        """Returns the least radius of circles that are found even where they are farthest away and most tilted, with a
-        margin."""
+        """Least radius of circles that are found even where they are farthest away and most tilted, with a margin."""
         camera = self.ideal_camera()
         least, _ = diameter_limits_px(camera.width * camera.height, EllipseOptions())
         px_per_mm = np.sqrt(camera.focal.prod()) / (FARTHER * self.distance_mm)
@@ -130,28 +129,19 @@ class DesignOptions(Brief):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
-    """The designed target and board.
-
-    ``radius_mm`` : radius of the smaller circles; ``least_mm`` : smallest radius that the camera sees well; ``cases`` :
-    number of cases of hidden circles that were tried; the faces were identified in all of them.
-    """
+    """The designed target and board."""
 
     options: DesignOptions
     pattern: MadeTarget
     board: BoardDesign
-    radius_mm: float
-    least_mm: float
-    cases: int
+    radius_mm: float  # of the smaller circles
+    least_mm: float  # smallest radius that the camera sees well
+    cases: int  # of hidden circles that were tried, in all of which the faces were identified
 
 
 def make_target(options: DesignOptions, progress: Callable[[int, int], None] | None = None) -> Made:
-    """Returns a board, and a pattern for each side of the box that is to have one.
-
-    ``options`` : DesignOptions; ``progress`` : called with (done, total), numbers of cases of hidden circles.
-
-    Raises InputError if circles are too small or too large for the camera, too few, or without room, or if a face is
-    not identified with some of its circles hidden.
-    """
+    """Returns a board, and a pattern for each side of the box that is to have one. ``progress`` is called with (done,
+    total) cases of hidden circles."""
     least = options.least_radius_mm()
     radius = options.radius_mm
     if radius is None:
@@ -179,8 +169,7 @@ def make_target(options: DesignOptions, progress: Callable[[int, int], None] | N
 def _named(
     options: DesignOptions, radius_mm: float, progress: Callable[[int, int], None] | None
 ) -> tuple[MadeTarget, int]:
-    """Returns the first pattern whose faces are all identified in every case of hidden circles, and the number of
-    cases."""
+    """Returns the first pattern whose faces are identified in every case of hidden circles, and the number of cases."""
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm, options.faces)
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):

@@ -26,16 +26,12 @@ leaves room to cut, fold and glue."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
-    """A side of the box.
-
-    ``width``, ``height`` : size of its plate, mm; ``box_from_plate`` : pose of the plate. The plate's origin is at the
-    lower left as seen from outside, Y points upwards, Z outwards.
-    """
+    """A side of the box."""
 
     name: str
-    width: float
+    width: float  # of its plate, mm
     height: float
-    box_from_plate: Rigid
+    box_from_plate: Rigid  # origin lower left as seen from outside, Y upwards, Z outwards
 
     @property
     def edge(self) -> float:
@@ -52,8 +48,7 @@ NAMES = ("front", "right", "back", "left", "top")
 
 
 def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES) -> list[Side]:
-    """Returns the sides with these names, in this order, of a box of this width, height and depth. The origin is in the
-    middle of the box, Z points upwards."""
+    """Returns the named sides of a box of this width, height and depth, whose middle is the origin, Z upwards."""
     w, h, d = size_mm
     x, y, z = np.eye(3)
     rows = (
@@ -78,10 +73,7 @@ def faces_of(text: str) -> tuple[str, ...]:
 
 
 def require_sides(names: Sequence[str], text: str) -> None:
-    """Refuses names of sides on which circles cannot lie together; ``text`` : the names in the message.
-
-    Raises InputError if a name is unknown or occurs twice, or if no two of the sides are neighbours.
-    """
+    """Refuses names of sides that are unknown, occur twice, or have no neighbour."""
     for name in names:
         if name not in NAMES:
             raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}")
@@ -96,10 +88,7 @@ def require_sides(names: Sequence[str], text: str) -> None:
 
 
 def size_of(text: str) -> tuple[float, float, float]:
-    """Parses ``W,H,D``, or ``WxHxD``, into width, height and depth in mm.
-
-    Raises InputError if the text is not three lengths.
-    """
+    """Parses ``W,H,D``, or ``WxHxD``, into width, height and depth in mm."""
     try:
         width, height, depth = map(float, re.split("[,x×]", text))
     except ValueError as error:
@@ -141,10 +130,7 @@ class MadeTarget:
 def make_pattern(
     sides: list[Side], circles: int, radius_mm: float, polarity: Polarity, seed: int | list[int], name: str
 ) -> MadeTarget:
-    """A face for each side, each named by its circles with any :data:`HIDDEN` of them hidden.
-
-    Raises InputError: too few circles, or no room for them.
-    """
+    """Returns a face for each side, named by its circles with any :data:`HIDDEN` of them hidden."""
     if circles < LEAST_CIRCLES:
         raise InputError(
             "E-MAKE-CIRCLES",
@@ -179,8 +165,7 @@ def make_pattern(
 
 
 def _likeness(face: FaceDesign, others: list[FaceDesign]) -> int:
-    """Returns the most circles that a face has in common with itself turned or mirrored, with another face, or with the
-    mirror image of another face."""
+    """Most circles in common with the face itself turned or mirrored, or another one or its mirror image."""
     pairs = [(face, False), (face, True), *((other, mirrored) for other in others for mirrored in (False, True))]
     return max(in_common(face, other, mirrored) for other, mirrored in pairs)
 
@@ -229,11 +214,7 @@ CONTRAST = 100.0
 def unnamed_cases(
     target: TargetDesign, camera: Camera, distance_mm: float, hidden: int, progress: Callable[[int, int], None] | None
 ) -> tuple[list[tuple[str, tuple[str, ...]]], int]:
-    """Returns the cases in which the finder does not read exactly the visible circles, and the number of all cases.
-
-    A case is the face and its hidden circles. The ellipses are noise-free images of the circles, in the form in which
-    outlines give them to the finder.
-    """
+    """Cases (face, hidden circles) whose visible circles the finder does not read, and the number of all."""
     finder = FaceFinder(target)
     failed, done = [], 0
     total = sum(comb(len(face.ids), hidden) for face in target.faces)

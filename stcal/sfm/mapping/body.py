@@ -1,8 +1,5 @@
-"""Placement of a body by its faces of known shape: poses of faces and images, and the camera if it is unknown.
-
-Each view of such a face gives its pose up to the reflection that a plane has (Schweighofer & Pinz 2006). Of the
-reflections, those are taken on which the images agree. One adjustment over faces and images follows.
-"""
+"""Placement of a body by its faces of known shape: poses of faces and images, and the camera if it is unknown. Of the
+two reflections of each view (Schweighofer & Pinz 2006) those are taken on which the images agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -52,18 +49,16 @@ FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
-    """n corners of known faces in the images: ``image``, ``face`` : (n,) indices into ``images`` and ``faces``;
-    ``corner`` : (n,) index among those of the face; ``xy_face`` : (n, 2) mm; ``xy_px`` : (n, 2); ``root`` : (n, 2, 2)
-    whitens residuals in px."""
+    """n corners of known faces in the images."""
 
     images: tuple[str, ...]
     faces: tuple[FaceDesign, ...]
-    image: np.ndarray
+    image: np.ndarray  # (n,) index into ``images``, as ``face`` into ``faces``
     face: np.ndarray
-    corner: np.ndarray
-    xy_face: np.ndarray
-    xy_px: np.ndarray
-    root: np.ndarray
+    corner: np.ndarray  # (n,) index among those of the face
+    xy_face: np.ndarray  # (n, 2) mm
+    xy_px: np.ndarray  # (n, 2)
+    root: np.ndarray  # (n, 2, 2) whitens residuals in px
 
     @classmethod
     def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "Corners":
@@ -99,18 +94,14 @@ class Corners:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """Poses of faces and images, and the camera.
-
-    ``body_from_face``, ``camera_from_body`` : by index in the corners, only the ``placed_faces`` and ``placed_images``
-    (masks) have a meaning; ``cost`` : of all corners of placed faces in placed images, in σ².
-    """
+    """Poses of faces and images by index in the corners, and the camera; only those of the masks have a meaning."""
 
     body_from_face: PoseStack
     camera_from_body: PoseStack
     camera: Camera
     placed_faces: np.ndarray
     placed_images: np.ndarray
-    cost: float = np.inf
+    cost: float = np.inf  # of all corners of placed faces in placed images, in σ²
 
     def xyz_camera(self, corners: Corners) -> np.ndarray:
         """Returns the corners in the frames of the cameras, (n, 3)."""
@@ -137,10 +128,7 @@ def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.nda
 
 
 def place_body(corners: Corners, camera: Camera) -> Body:
-    """Returns start values of all poses for a given camera.
-
-    Raises MappingError: no two faces are ever seen together.
-    """
+    """Returns start values of all poses for a given camera."""
     views = _Views.of(corners, camera)
     edges = [_edge(a, b, pairs, views) for (a, b), pairs in _pairs(views).items()]
     if not edges:
@@ -156,13 +144,12 @@ def place_body(corners: Corners, camera: Camera) -> Body:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Views:
-    """v views of a face in an image: ``image``, ``face`` : (v,); ``poses`` : (2v,) camera_from_face, both minima of
-    each view one after the other; ``cost`` : (v, 2)."""
+    """v views of a face in an image."""
 
     image: np.ndarray
     face: np.ndarray
-    poses: PoseStack
-    cost: np.ndarray
+    poses: PoseStack  # (2v,) camera_from_face, both minima of each view one after the other
+    cost: np.ndarray  # (v, 2)
 
     @classmethod
     def of(cls, corners: Corners, camera: Camera) -> "_Views":
@@ -234,15 +221,13 @@ def _pairs(views: _Views) -> dict[tuple[int, int], list[tuple[int, int]]]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relative:
-    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views: ``rotation`` : (4p, 3, 3);
-    ``a_place``, ``b_place`` : (4p, 3) of the origins of both faces, from the camera, in the axes of a; ``of_pair`` :
-    (4p,); ``excess`` : (4p,) cost over that of the best pose of the image."""
+    """Poses a_from_b of two faces in p images, 4 in each by the two minima of both views."""
 
-    rotation: np.ndarray
-    a_place: np.ndarray
-    b_place: np.ndarray
-    of_pair: np.ndarray
-    excess: np.ndarray
+    rotation: np.ndarray  # (4p, 3, 3)
+    a_place: np.ndarray  # (4p, 3) of the origin, from the camera, in the axes of a
+    b_place: np.ndarray  # (4p, 3)
+    of_pair: np.ndarray  # (4p,)
+    excess: np.ndarray  # (4p,) cost over that of the best pose of the image
 
     @classmethod
     def of(cls, pairs: list[tuple[int, int]], views: _Views) -> "_Relative":
@@ -288,19 +273,15 @@ def _edge(a: int, b: int, pairs: list[tuple[int, int]], views: _Views) -> _Edge:
 
 @dataclass(frozen=True, slots=True)
 class WrongSizes:
-    """Faces that are drawn at another size than the rest: ``factors`` by index of the face, true over stated size;
-    ``alike`` : number of the others whose sizes were compared."""
+    """Faces that are drawn at another size than the rest."""
 
-    factors: dict[int, float]
-    alike: int
+    factors: dict[int, float]  # true over stated size, by index of the face
+    alike: int  # number of the others whose sizes were compared
 
 
 def wrong_sizes(corners: Corners, camera: Camera) -> WrongSizes:
-    """Returns the faces whose stated size contradicts those of most others, from the views alone.
-
-    A face drawn too large by a factor seems farther away by it. Face b is at the same place d in the frame of a in all
-    images: q R_aᵀ t_b − R_aᵀ t_a = d with the sizes' ratio q, linear in q and d.
-    """
+    """Returns the faces whose stated size contradicts those of most others: too large by q, a face seems farther by q.
+    Face b is at the same place d in the frame of a in all images: q R_aᵀ t_b − R_aᵀ t_a = d."""
     views = _Views.of(corners, camera)
     ratios: list[tuple[int, int, float, float]] = []
     for (a, b), pairs in _pairs(views).items():
@@ -329,8 +310,7 @@ def wrong_sizes(corners: Corners, camera: Camera) -> WrongSizes:
 
 
 def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, float]:
-    """Returns the faces of another size than the median of those linked to them, with their factors, from logarithms b
-    over a with their σ."""
+    """Factors of faces that differ from the median of those linked to them, from log ratios (a, b, log, σ)."""
     a, b = (np.array([ratio[k] for ratio in ratios], int) for k in range(2))
     value, sigma = (np.array([ratio[k] for ratio in ratios], float) for k in (2, 3))
     rows = np.eye(faces)[b] - np.eye(faces)[a]
@@ -354,10 +334,7 @@ def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, f
 
 
 def _tree(views: _Views, edges: list[_Edge], faces: int) -> tuple[PoseStack, np.ndarray]:
-    """Returns body_from_face along the edges that most images agree on, and the mask of the faces that are linked.
-
-    The frame of the body is that of the face with most views.
-    """
+    """Returns body_from_face along the edges that most images agree on, and a mask of the linked faces."""
     seen = np.bincount(views.face, minlength=faces)
     linked = {face for edge in edges for face in (edge.a, edge.b)}
     root = max(linked, key=lambda face: seen[face])
@@ -428,10 +405,8 @@ class _Equations:
 def adjust_body(
     start: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera, rounds: int = ROBUST_ROUNDS
 ) -> Body:
-    """Returns the body of least robust cost over all poses, and over the camera's parameters of ``basis`` (16, q).
-
-    ``prior`` : (q, q) weight matrix of these parameters about those of ``given``.
-    """
+    """Returns the body of least robust cost over all poses, and over the camera's parameters of ``basis`` (16, q),
+    which have the weight matrix ``prior`` (q, q) about those of ``given``."""
     body = start
     used = corners.select(body.used(corners))
     for _ in range(rounds):
@@ -516,8 +491,7 @@ def _minimum(body: Body, used: Corners, basis, prior, given: Camera, huber: floa
 
 
 def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:
-    """Returns body_from_face, each as that view of the face in a placed image has it which fits all of its corners
-    best, or as it was where none fits better."""
+    """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
     rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
     i = body.camera_from_body
     for face in np.flatnonzero(body.placed_faces)[1:]:
@@ -556,13 +530,8 @@ def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndar
 
 
 def contradictions(body: Body, corners: Corners) -> list[Outlier]:
-    """Returns the corners of placed printed faces in placed images that lie elsewhere than all others have them.
-
-    A finger over an edge moves two corners of a tag by a few tenths of a pixel, which free points follow: the four
-    corners of a tag hardly control one another, the rigid body does. Lengths are compared with those of all corners,
-    and with those of the same corner in other images, as a print that is off its design is no gross error. The limit
-    grows with the number of corners and with the tail that their lengths have.
-    """
+    """Returns the corners that lie elsewhere than the rigid body has them, with a limit by their number and their tail.
+    Lengths are compared with those of the same corner in other images too: a print that is off is no gross error."""
     printed = np.array([face.sigma_mm is not None for face in corners.faces])
     used = corners.select(body.used(corners) & printed[corners.face])
     length = np.minimum(body.lengths(used), 1e6)

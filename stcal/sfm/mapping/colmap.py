@@ -1,8 +1,5 @@
-"""COLMAP's bindings, imported only here. They install signal handlers; this module restores the previous ones.
-
-The system's own handlers are restored, of every signal and in whatever thread the import takes place. Python knows only
-some of them, and changes them in its main thread alone.
-"""
+"""COLMAP's bindings, imported only here. They install signal handlers; the system's own are restored, of every signal
+and in any thread: Python knows only some of them."""
 
 import ctypes
 import os

@@ -63,14 +63,11 @@ def write_database(
     path: str | Path,
     camera: Camera,
     observations: Sequence[ImageObservations],
-    pairs: np.ndarray,
+    pairs: np.ndarray,  # (n, 2) indices of the images to match
+    # (n, 2) by image, OpenCV pixel origin; by default the measured centres
     keypoints_px: Sequence[np.ndarray] | None = None,
 ) -> None:
-    """Writes a new database atomically: the file appears complete or not at all.
-
-    ``pairs`` : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.pairs.image_graph`; ``keypoints_px``
-    : one (n, 2) array for each image, OpenCV pixel origin; by default the measured centres.
-    """
+    """Writes a new database atomically: the file appears complete or not at all."""
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     remove_database(partial)
@@ -131,8 +128,7 @@ def _write(database, camera, observations, pairs, keypoints_px) -> None:
 def labels_csv(
     observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray], residual_px: Sequence[np.ndarray]
 ) -> str:
-    """Returns the text of ``labels.csv``: label, measured and corrected centre (float64), covariance and residual of
-    every (image, keypoint). Residuals of keypoints that are not in the result are nan, and their cells empty."""
+    """``labels.csv``, a row for each keypoint; residuals outside of the result are nan, and their cells empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = (

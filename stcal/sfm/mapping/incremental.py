@@ -25,11 +25,7 @@ MIN_RAY_ANGLE_RAD = np.radians(0.5)
 
 def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, max_error_px: float) -> WorldModel:
     """Returns the model with all images of the group that its points can resect, and with the circles that these add.
-
-    An image is placed if at least six of its labelled points, and at least a quarter of those that the model contains,
-    fit within ``max_error_px`` (RANSAC and refinement of pycolmap on ideal coordinates). Circles that the model lacks
-    are then triangulated from all placed images. All observations of placed images are used.
-    """
+    An image needs six labelled points, and a quarter of the model's, that fit within ``max_error_px``."""
     xyz = dict(zip(model.labels, model.xyz_model, strict=True))
     poses = dict(zip(model.images, model.camera_from_model, strict=True))
     for image in group:
@@ -116,16 +112,12 @@ LOG_ERRORS_ONLY = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapping:
-    """Result of mapping one group.
-
-    ``model`` : model of the group; ``outliers`` : observations with a large reprojection error; ``left_out`` : reason
-    by image name; ``seeded`` : how the initial pair was registered.
-    """
+    """Result of mapping one group."""
 
     model: WorldModel
-    outliers: tuple[Outlier, ...]
-    left_out: dict[str, str]
-    seeded: str
+    outliers: tuple[Outlier, ...]  # observations with a large reprojection error
+    left_out: dict[str, str]  # reason by image name
+    seeded: str  # how the initial pair was registered
 
 
 def map_group(
@@ -137,13 +129,8 @@ def map_group(
     pairs: list[PairScore],
     camera: Camera,
 ) -> Mapping:
-    """Maps one group of the database: COLMAP maps the ``skeleton``, the other images are resected by their labels.
-
-    The chosen pair seeds COLMAP. If COLMAP's checks reject it, the relative pose of the ranking is registered instead.
-
-    Raises MappingError: there is no model of two or more images. Raises InputError: there is no space for what COLMAP
-    writes beside the database.
-    """
+    """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
+    If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
     names = [image.name for image in group if image.name in skeleton]
     try:
         reconstruction, seeded = _mapped(database, scratch, group, names, ids, pairs[0])
@@ -292,10 +279,7 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
 def labelled_model(
     reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
 ) -> tuple[WorldModel, tuple[Outlier, ...]]:
-    """Returns a model with one point for each label and the observations that agree with it, and the outliers.
-
-    Images of the group that the reconstruction lacks are resected by their labels.
-    """
+    """Model with a point for each label, and the outliers; images that COLMAP lacks are resected by labels."""
     colmap_images = reconstruction.images  # COLMAP drops images that have nothing in common with the others
     registered = [
         image for image in group if ids[image.name] in colmap_images and colmap_images[ids[image.name]].has_pose

@@ -46,11 +46,8 @@ def to_reconstruction(
     ids: dict[str, int],
     camera: Camera,
 ) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
-    """Returns models that share one world in COLMAP's form, and (group, label) by point id.
-
-    Keypoints are all keypoints of each image, in the database's order, corrected if the model contains them. A circle
-    at the same place in two groups is one point with an empty group.
-    """
+    """Returns models that share one world in COLMAP's form, and (group, label) by point id; all keypoints, in the
+    database's order. A circle at the same place in two groups is one point with an empty group."""
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(colmap_camera(camera))
     by_name = {image.name: image for image in observations}
@@ -88,21 +85,13 @@ def write_model(
     ids: dict[str, int],
     camera: Camera,
 ) -> None:
-    """Writes models that share one world as COLMAP's binary files.
-
-    Raises InputError: the files do not contain what was to be written.
-    """
+    """Writes models that share one world as COLMAP's binary files, and reads them back."""
     folder.mkdir(parents=True, exist_ok=True)
     write_reconstruction(to_reconstruction(models, observations, ids, camera)[0], folder)
 
 
 def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, text: bool = False) -> None:
-    """Writes a model as COLMAP's files into an existing folder and reads it back.
-
-    COLMAP's writers do not report a full disk.
-
-    Raises InputError: the files do not contain what was to be written.
-    """
+    """Writes a model into an existing folder and reads it back: COLMAP's writers do not report a full disk."""
     try:
         (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
         written = _numbers(open_model(folder))
@@ -118,10 +107,7 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
 
 
 def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
-    """Returns the numbers of a model: cameras, poses, keypoints with point ids, points with track lengths.
-
-    Numbers are rounded to 12 digits, as text files lose the last digits.
-    """
+    """Returns cameras, poses, keypoints and points of a model to 12 digits, as text files lose the last ones."""
     cameras = [[i, *c.params] for i, c in sorted(reconstruction.cameras.items())]
     images, keypoints, points = [], [], []
     for i, image in sorted(reconstruction.images.items()):
@@ -136,19 +122,14 @@ def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadModel:
-    """A COLMAP model with labels: one :class:`WorldModel` for each group of its images, all in the model's world.
-
-    ``camera`` : camera of the model, possibly refined; ``unlabelled`` : number of points whose keypoints have no label
-    or several; ``split`` : number of labels with several points, of which the longest track is used; ``absent`` :
-    number of points that keypoints name but the model does not contain.
-    """
+    """A COLMAP model with labels, by group of images, all in the model's world."""
 
     path: Path
-    camera: Camera
+    camera: Camera  # of the model, possibly refined
     groups: tuple[WorldModel, ...]
-    unlabelled: int
-    split: int
-    absent: int
+    unlabelled: int  # number of points whose keypoints have no label or several
+    split: int  # number of labels with several points, of which the longest track is used
+    absent: int  # number of points that keypoints name but the model does not contain
 
     def in_mm(self) -> tuple[MetricModel, ...]:
         """Returns the groups of a model that was written in mm, like a run's ``target_model``."""
@@ -156,10 +137,7 @@ class ReadModel:
 
 
 def find_models(folder: str | Path) -> list[Path]:
-    """Returns the folders with a COLMAP model among this folder and its subfolders (the mapper writes 0, 1, …).
-
-    Raises InputError: no folder contains a model.
-    """
+    """Returns the folders with a COLMAP model among this folder and its subfolders (the mapper writes 0, 1, …)."""
     folder = Path(folder)
     models = []
     if folder.is_dir():
@@ -179,16 +157,9 @@ def read_model(
     observations: Sequence[ImageObservations],
     ids: dict[str, int],
     corrected_px: Sequence[np.ndarray],
-    corrected_again: bool = False,
+    corrected_again: bool = False,  # of ``target_model``, whose centres the joint adjustment corrected
 ) -> ReadModel:
-    """Reads a model that is based on the keypoints of the run's database. (image, keypoint) determines the label.
-
-    ``corrected_again`` : whether the model is the run's ``target_model``, whose centres were corrected for the
-    eccentricity by the poses of the joint adjustment, and so are slightly elsewhere; its centres are then those read.
-
-    Raises InputError: the model is damaged, has more than one camera, an image that is not in the run, or keypoints of
-    another database; or its poses and points do not fit the keypoints.
-    """
+    """Reads a model based on the keypoints of the run's database, where (image, keypoint) determines the label."""
     reconstruction = open_model(path)
     cameras = list(reconstruction.cameras.values())
     if len(cameras) != 1:
@@ -236,10 +207,7 @@ def read_model(
 
 
 def open_model(path: Path) -> pycolmap.Reconstruction:
-    """Opens a model's files with COLMAP.
-
-    Raises InputError: a file is damaged or missing.
-    """
+    """Opens a model's files; InputError if one is damaged or missing."""
     pycolmap.logging.minloglevel = LOG_NOTHING
     try:
         for name, skip in _RECORDS.items():
@@ -344,10 +312,7 @@ _RECORDS: dict[str, Callable[[_Walk], None]] = {
 
 
 def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
-    """Raises ValueError if the counts in a file do not fit its size.
-
-    pycolmap silently reads past the end of a file, for hours and until memory is full, or repeats the last numbers.
-    """
+    """Checks the counts in a file: pycolmap reads past its end, for hours and until memory is full."""
     walk = _Walk(read_bytes(file, MODEL_BYTES))
     try:
         for _ in range(walk.number("Q")):
@@ -365,10 +330,7 @@ def require_keypoints(
     corrected_px: np.ndarray,
     tolerance_px: float = KEYPOINT_TOLERANCE_PX,
 ) -> np.ndarray:
-    """Returns the model's keypoints (k, 2), which must be the run's, as only then (image, keypoint) determines a label.
-
-    Raises InputError: the number of keypoints differs, or a keypoint is elsewhere.
-    """
+    """Returns the model's keypoints (k, 2), which must be the run's: only then do they determine labels."""
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
         raise InputError(
@@ -403,10 +365,7 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
 
 
 def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
-    """Returns camera_from_model of an image of the model.
-
-    Raises InputError: the quaternion is far from unit length, or the translation is not finite.
-    """
+    """Returns camera_from_model of an image, which must be a finite rotation and translation."""
     pose = image.cam_from_world()
     length = math.hypot(*pose.rotation.quat)  # accepts any numbers without a warning
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
@@ -420,10 +379,7 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
 
 
 def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tuple[str, str]], int]:
-    """Returns (group, label) by point id, and the number of points without a unique label.
-
-    The group is empty for circles of the target, which are the same in all groups.
-    """
+    """Returns (group, label) by point id, an empty group for the target's circles, and the number of others."""
     label_of_point, unlabelled = {}, 0
     for point_id, point in reconstruction.points3D.items():
         names = set()

@@ -32,13 +32,9 @@ MIN_ANGLE_RAD = np.radians(1.0)
 
 @dataclass(frozen=True, slots=True)
 class PairOptions:
-    """Options of the choice of the initial pair.
+    """Options of the choice of the initial pair."""
 
-    ``max_angle_rad`` : largest median ray angle that is still safe. If None, 60°; if all pairs of a group exceed it,
-    the pair with the smallest angle is then used.
-    """
-
-    max_angle_rad: float | None = None
+    max_angle_rad: float | None = None  # largest safe median ray angle; None: 60°, or the smallest of a group beyond
 
     def __post_init__(self):
         require_fields(self, "options")
@@ -55,30 +51,19 @@ class PairOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairScore:
-    """Quality of one pair as the initial pair.
-
-    ``first``, ``second`` : image names; ``shared`` : number of common labels; ``median_angle_rad`` : median ray angle
-    of the triangulated points; ``in_front`` : share of the points in front of both cameras; ``forward`` : |t_z|/‖t‖;
-    ``second_from_first`` : relative pose with unit translation; ``verdict`` : ``chosen``, ``usable`` or why not usable.
-    """
+    """Quality of one pair of images as the initial pair."""
 
     first: str
     second: str
-    shared: int
-    median_angle_rad: float
-    in_front: float
-    forward: float
-    second_from_first: Rigid | None
-    verdict: str
+    shared: int  # number of common labels
+    median_angle_rad: float  # of the rays of triangulated points
+    in_front: float  # share of the points in front of both cameras
+    forward: float  # |t_z|/‖t‖
+    second_from_first: Rigid | None  # with unit translation
+    verdict: str  # ``chosen``, ``usable`` or why not usable
 
     def pose(self) -> Rigid:
-        """Returns ``second_from_first``.
-
-        Raises
-        ------
-        MappingError
-            The pair has no relative pose.
-        """
+        """Returns ``second_from_first``; an error if the pair has none."""
         if self.second_from_first is None:
             raise MappingError(
                 "E-MAPPING-NO-PAIR", f"pair {self.first}, {self.second}: no relative pose; take another pair"
@@ -89,12 +74,8 @@ class PairScore:
 def rank_pairs(
     group: list[ImageObservations], camera: Camera, options: PairOptions, board: BoardDesign | None = None
 ) -> list[PairScore]:
-    """Returns all pairs of a group: the chosen pair first, then the usable pairs by angle, then the others.
-
-    ``board`` : gives the relative pose of pairs with only the board in common, as a plane has two essential matrices.
-
-    Raises MappingError: no pair is usable: too few labels in common, or the camera did not move.
-    """
+    """Returns all pairs of a group: the chosen one, the usable ones by angle, then the others; an error if none is.
+    ``board`` gives the pose of pairs with only it in common, as a plane has two essential matrices."""
     scores = [_score(a, b, camera, options, board) for a, b in combinations(group, 2)]
     scores.sort(key=lambda s: (s.verdict != "usable", -round(s.median_angle_rad, 9), -s.shared, s.first, s.second))
     over = [s for s in scores if s.verdict.startswith(OVER_LIMIT)]
@@ -237,23 +218,17 @@ MIN_DOTS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageGraph:
-    """Pairs of images to match.
-
-    ``pairs`` : (n, 2) indices of images, ascending; ``skeleton`` : indices of the images mapped first, by group.
-    """
+    """Pairs of images to match."""
 
     kind: GraphKind
-    pairs: np.ndarray
-    skeleton: dict[str, np.ndarray]
+    pairs: np.ndarray  # (n, 2) indices of images, ascending
+    skeleton: dict[str, np.ndarray]  # indices of the images mapped first, by group
 
 
 def image_graph(
     observations: Sequence[ImageObservations], board: BoardDesign, kind: GraphKind | None = None
 ) -> ImageGraph:
-    """Returns all pairs of images with at least six common labels, or just enough to keep every track connected.
-
-    ``kind`` : if None, sparse for more than ``SPARSE_FROM`` images.
-    """
+    """Returns all pairs of images with six common labels, or just enough to keep every track connected (sparse)."""
     kind = kind or kind_of_graph(len(observations))
     sees = incidence(observations)
     shared = (sees.astype(np.float32) @ sees.T.astype(np.float32)).astype(np.int32)

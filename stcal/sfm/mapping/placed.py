@@ -39,19 +39,14 @@ SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.3, 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedBody:
-    """A body with the faces and images that are placed.
-
-    ``body_from_face`` : by face id; ``camera_from_body`` : by image; ``faces`` : designs of the placed faces;
-    ``camera`` : with the covariance of the assumptions about an unknown one; ``unlinked`` : faces that are seen, and
-    never with a placed one; ``contradictions`` : corners that lie elsewhere than the body has them.
-    """
+    """A body with the faces and images that are placed."""
 
     body_from_face: dict[str, Rigid]
     camera_from_body: dict[str, Rigid]
     faces: tuple[FaceDesign, ...]
-    camera: Camera
-    unlinked: tuple[str, ...]
-    contradictions: tuple[Outlier, ...]
+    camera: Camera  # with the covariance of the assumptions about an unknown one
+    unlinked: tuple[str, ...]  # faces that are seen, and never with a placed one
+    contradictions: tuple[Outlier, ...]  # corners that lie elsewhere than the body has them
 
     def unlinked_notes(self) -> list[str]:
         """Returns a note for each face of known shape that no image shows together with one that is placed."""
@@ -76,12 +71,7 @@ def unknown_lens(camera: Camera) -> Camera:
 def place_with_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
 ) -> PlacedBody:
-    """Returns the body by its faces, with a known camera.
-
-    Faces of circles may be among them: their design is near enough to begin with, and moves afterwards.
-
-    Raises MappingError: no two faces are ever seen together, or sizes of faces contradict one another.
-    """
+    """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
     corners = Corners.of(observations, faces)
     _require_sizes(corners, camera)
     none = np.zeros((16, 0))
@@ -92,22 +82,13 @@ def place_with_camera(
 def place_and_find_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
 ) -> PlacedBody:
-    """Returns the body by its faces of known shape, with an unknown camera.
-
-    The search begins at each of ``starts``, and at several focal lengths about the first; the least cost decides.
-
-    Raises MappingError: no two faces are ever seen together, sizes of faces contradict one another, or no focal length
-    explains the images.
-    """
+    """Body by faces of known shape and the camera, of least cost from ``starts`` and several focal lengths."""
     corners = Corners.of(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
     cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
     _require_sizes(corners, first)
-    best: Body | None = None
-    for camera in cameras:
-        found = _with_focal_length(corners, camera)
-        if found is not None and (best is None or _better(found, best)):
-            best = found
+    bodies = [body for camera in cameras if (body := _with_focal_length(corners, camera)) is not None]
+    best = max(bodies, key=lambda body: (int(body.placed_images.sum()), -body.cost), default=None)
     if best is None:
         raise MappingError(
             "E-BODY-NO-CAMERA",
@@ -157,12 +138,6 @@ def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
         return None
 
 
-def _better(body: Body, other: Body) -> bool:
-    """Returns whether a body explains more images, or as many of them better."""
-    images = int(body.placed_images.sum()), int(other.placed_images.sum())
-    return images[0] > images[1] or (images[0] == images[1] and body.cost < other.cost)
-
-
 def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
     placed = np.flatnonzero(body.placed_faces).tolist()
     return PlacedBody(
@@ -176,12 +151,7 @@ def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
 
 
 def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> WorldModel:
-    """Returns the model of a group: its placed images and the points that two of them see from different directions.
-
-    Other images of the group, and other points, are added as far as these determine them.
-
-    Raises MappingError: fewer than two images of the group are placed.
-    """
+    """Returns the model of a group: placed images, points that two of them see, and what these determine further."""
     placed = [image for image in group if image.name in body.camera_from_body]
     if len(placed) < 2:
         raise MappingError(

@@ -71,22 +71,15 @@ class MeasuredImage:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MeasureResult(Brief):
-    """Result of :func:`measure`.
+    """Result of :func:`measure`."""
 
-    ``images`` : those with a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the
-    covariances lack; ``sigma_factor`` : factor on the centres' own σ; ``intrinsics_held`` : whether the intrinsics were
-    taken as exact; ``common`` : (m, 6, r) common errors of the poses, see
-    :func:`stcal.sfm.measurement.pose.common_errors`; ``searched`` : number of images of a sequence that were searched
-    as a whole, None if the images are no sequence.
-    """
-
-    images: tuple[MeasuredImage, ...]
-    left_out: tuple[Skipped, ...]
-    notes: tuple[str, ...]
-    sigma_factor: float
-    intrinsics_held: bool
-    common: np.ndarray
-    searched: int | None = None
+    images: tuple[MeasuredImage, ...]  # those with a pose, in order of name
+    left_out: tuple[Skipped, ...]  # the others, with reasons
+    notes: tuple[str, ...]  # what the covariances lack
+    sigma_factor: float  # on the centres' own σ
+    intrinsics_held: bool  # whether the intrinsics were taken as exact
+    common: np.ndarray  # (m, 6, r) of the poses, see :func:`stcal.sfm.measurement.pose.common_errors`
+    searched: int | None = None  # number of images of a sequence that were searched as a whole
 
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
@@ -199,12 +192,9 @@ def measure_labelled(
     camera: Camera,
     target: TargetCircles,
     options: MeasureOptions | None = None,
-    prior: CameraPrior | None = None,
+    prior: CameraPrior | None = None,  # covariance of the intrinsics, which are exact if None
 ) -> MeasureResult:
-    """Returns the poses from labelled centres, without pixels.
-
-    ``prior`` : covariance of the intrinsics, which are exact if None. Images without a pose are in ``left_out``.
-    """
+    """Returns the poses from labelled centres, without pixels."""
     options = options or MeasureOptions()
     outcomes: list[MeasuredImage | Skipped] = []
     for group in by_group(observations).values():
@@ -224,12 +214,9 @@ def follow_files(
     target: TargetCircles,
     board: BoardDesign | None,
     options: MeasureOptions,
-    step: Callable[[object], None],
+    step: Callable[[object], None],  # called once for each file
 ) -> MeasureResult:
-    """Returns the poses of files, each folder of which is a sequence in order of name. Folders run in parallel.
-
-    ``step`` : called once for each file.
-    """
+    """Returns the poses of files, each folder of which is a sequence in order of name. Folders run in parallel."""
     camera, size_from = sized_by(camera_model, list(files))
     folders: dict[str, list[ImageFile]] = {}
     for file in sorted(files, key=lambda result_of_image: result_of_image.name):

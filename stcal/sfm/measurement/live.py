@@ -56,10 +56,7 @@ pointed to this machine (DNS rebinding)."""
 
 class LiveService:
     """App that answers images with poses; if ``live``, also a page with the pictures that :meth:`follow` measures.
-
-    ``tracker`` : target and camera; ``token`` : word that each request must carry, as ``Authorization: Bearer`` or as
-    ``?token=``, none if empty; ``max_megabytes`` : largest size of an image that is sent.
-    """
+    ``token``: word that each request must carry, as ``Authorization: Bearer`` or as ``?token=``."""
 
     def __init__(self, tracker: Tracker, live: bool = False, token: str = "", max_megabytes: float = 64.0):
         self.tracker, self.token, self.max_megabytes = tracker, token, max_megabytes
@@ -72,10 +69,7 @@ class LiveService:
         )
 
     def follow(self, frames: Iterable[np.ndarray], tracker: Tracker) -> Iterator[dict]:
-        """Measures grey pictures (height, width), uint8, puts each on the page, and yields its content.
-
-        Raises InputError: a picture is of another size than the camera's.
-        """
+        """Measures grey pictures (height, width), uint8, puts each on the page, and yields its content."""
         times: deque[float] = deque(maxlen=RATE_OVER)
         for number, frame in enumerate(frames, 1):
             began = time.monotonic()
@@ -99,10 +93,7 @@ class LiveService:
         self.ended = True
 
     def answer(self, data: bytes, name: str) -> tuple[int, dict]:
-        """Returns status code and JSON for one image: the poses file of ``measure``, or the error.
-
-        200 with a pose; 422 without, and the reason in ``left_out``; 400 if the data are no image of this camera.
-        """
+        """Returns status and JSON for one image: 200 with a pose; 422 without; 400 if it is no image of the camera."""
         try:
             stated_size(data, name)  # refuses a small file of a huge image
             with self._measuring, one_thread():
@@ -161,10 +152,7 @@ def _refused(_, error) -> JSONResponse:
 
 @contextmanager
 def served(service: LiveService, host: str = "127.0.0.1", port: int = 8765) -> Iterator[str]:
-    """Answers requests to the port, any free one if 0, within the context, in a thread; returns the URL.
-
-    Raises InputError: it cannot listen on the address, or other machines reach it and there is no token.
-    """
+    """Answers requests to the port, any free one if 0, within the context, in a thread; returns the URL."""
     try:
         listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:

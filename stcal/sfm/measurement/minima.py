@@ -24,27 +24,20 @@ HOPELESS = 500.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseProblem:
-    """Data of a pose: n circles, their measured centres and all covariances. Centres are free of distortion.
+    """Data of a pose: n circles, their measured centres and all covariances. Centres are free of distortion."""
 
-    ``xyz``, ``normal`` : (n, 3) target frame; ``radius`` : (n,); ``centre`` : (n, 2) centres of the ellipses,
-    normalised coordinates; ``px_by_centre`` : (n, 2, 2) Jacobian of the lens; ``noise`` : (n, 2, 2) covariance of
-    ``centre``; ``by_camera`` : (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 if they are held fixed;
-    ``prior`` : (q, q) covariance of the intrinsics; ``shape`` : (3n, 3n) mm² covariance of the circles.
-    """
-
-    xyz: np.ndarray
+    xyz: np.ndarray  # (n, 3) target frame, as ``normal``
     normal: np.ndarray
-    radius: np.ndarray
-    centre: np.ndarray
-    px_by_centre: np.ndarray
-    noise: np.ndarray
-    by_camera: np.ndarray
-    prior: np.ndarray
-    shape: np.ndarray
+    radius: np.ndarray  # (n,)
+    centre: np.ndarray  # (n, 2) of the ellipses, normalised coordinates
+    px_by_centre: np.ndarray  # (n, 2, 2) Jacobian of the lens
+    noise: np.ndarray  # (n, 2, 2) covariance of ``centre``
+    by_camera: np.ndarray  # (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 if they are held fixed
+    prior: np.ndarray  # (q, q) covariance of the intrinsics
+    shape: np.ndarray  # (3n, 3n) mm² covariance of the circles
 
     def seen(self, poses: PoseStack) -> tuple[np.ndarray, CircleImages]:
-        """Returns, for h poses, measured minus projected centres (h, n, 2), and the projections with their
-        derivatives."""
+        """Returns, for h poses, measured minus projected centres (h, n, 2), and the projections."""
         image = project_circles(self.xyz, self.normal, self.radius, poses.rotation, poses.translation)
         return self.centre - image.centre, image
 
@@ -62,8 +55,7 @@ class PoseProblem:
 
 
 def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.ndarray) -> np.ndarray:
-    """Returns the joint covariance (h, 2n, 2n) of all centres from noise (h, n, 2, 2), the target's circles and the
-    intrinsics."""
+    """Returns the covariance (h, 2n, 2n) of all centres from noise (h, n, 2, 2), circles and intrinsics."""
     by_circle = block_diagonal(image.by_circle)
     full = block_diagonal(noise) + by_circle @ problem.shape @ np.swapaxes(by_circle, 1, 2)
     by_camera = problem.by_camera.reshape(full.shape[-1], -1)
@@ -71,10 +63,7 @@ def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.n
 
 
 def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
-    """Returns the descent near a pose, with residuals whitened centre by centre.
-
-    The σ of a centre are those of its noise and of its own circle.
-    """
+    """Returns the descent near a pose, with residuals whitened by the σ of each centre's noise and own circle."""
     by_circle = problem.seen(pose)[1].by_circle
     n = len(problem.xyz)
     covariance_by_circle = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
@@ -145,10 +134,7 @@ def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int
 
 
 def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):
-    """Returns the minima without centres that contradict the others, the indices kept, and the outliers.
-
-    Each centre is weighted on its own, without covariance between centres.
-    """
+    """Returns the minima without centres that contradict the others, the indices kept, and the outliers."""
     keep, outliers = np.arange(len(names)), []
     alone = len({name.face for name in names}) == 1
     failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"

@@ -58,23 +58,12 @@ def covariance_of_likelihood(
     plane: Rigid | None,
     plausible: float,
 ) -> tuple[np.ndarray, float]:
-    """Returns the covariance of a pose (6, 6), and the excess in χ² of its mirror image.
-
-    The excess is infinite if the mirror image does not matter. The covariance is the given one if the likelihood is
-    Gaussian. Else it is the second moment of the likelihood about the pose, by importance sampling with fixed numbers
-    (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4). Poses nearer to the ``second`` solution are
-    left out.
-
-    Parameters
-    ----------
-    full : (2n, 2n) covariance of the centres
-    least : χ² of the pose
-    covariance : (6, 6) of the linearised problem
-    second : the second solution, or None
-    plane : merged into a valley, of which the linearised problem sees one side. The mirror image matters if its excess
-        in χ² is below ``plausible``, it is some σ away, and it is far more probable than these σ say.
-    plausible : largest excess in χ² with which the mirror image is plausible
-    """
+    """Returns the covariance of a pose (6, 6), and the excess in χ² of its mirror image, infinite if that does not
+    matter. If the likelihood is not Gaussian, it is the second moment, by importance sampling with fixed numbers
+    (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4), without poses nearer to the ``second``
+    solution. ``full``: (2n, 2n) of the centres; ``least``: χ² of the pose; ``covariance``: (6, 6), linearised.
+    ``plane``: merged into a valley, of which the linearised problem sees one side. The mirror image matters if its
+    excess is below ``plausible``, it is some σ away, and it is far more probable than these σ say."""
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
     def excess(step: np.ndarray) -> np.ndarray:
@@ -112,10 +101,7 @@ def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: n
 
 
 def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, second: PoseStack | None) -> np.ndarray:
-    """Returns the second moment (6, 6) of exp(−(excess − least)/2) about the pose.
-
-    ``covariance`` : a first guess of it.
-    """
+    """Returns the second moment (6, 6) of exp(−(excess − least)/2) about the pose, first guessed as ``covariance``."""
     normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
     precision = np.linalg.inv(covariance)
     for _ in range(SAMPLE_ROUNDS):
@@ -152,16 +138,11 @@ Status = Literal["certain", "resolved", "ambiguous"]
 
 @dataclass(frozen=True, slots=True)
 class PoseOptions:
-    """Options of the measurement of a pose.
+    """Options of the measurement of a pose."""
 
-    ``flip_odds`` : largest odds of the second solution for a pose to be certain, for Gaussian errors;
-    ``sigma_margin`` : factor by which the stated σ may be too small while this holds; ``sigma_factor`` : factor on the
-    centres' own σ, the one of the target's run if None.
-    """
-
-    flip_odds: float = 1e-6
-    sigma_margin: float = 1.5
-    sigma_factor: float | None = None
+    flip_odds: float = 1e-6  # largest odds of the second solution for a pose to be certain, for Gaussian errors
+    sigma_margin: float = 1.5  # factor by which the stated σ may be too small while this holds
+    sigma_factor: float | None = None  # on the centres' own σ; None: that of the target's run
 
     def __post_init__(self):
         require_fields(self, "options")
@@ -180,37 +161,24 @@ class PoseOptions:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TargetPose(ImageFit, Brief):
-    """The pose of the target in one image.
-
-    ``camera_from_target`` ; ``covariance`` : (6, 6), rad and mm, left perturbation in the camera frame, R' = exp(w) R,
-    t' = t + dt; ``parts`` : (6, 6) each, summands of the covariance: ``image``, ``target`` and ``intrinsics``, of which
-    the last two are common to all images of the same target and camera, and ``curvature``, the difference between the
-    second moment of the likelihood and the sum of the others, zero if the likelihood is Gaussian; ``by_circles`` : (6,
-    3n), and ``by_intrinsics`` : (6, q) derivatives, but for the sign, by errors of the circles (target frame, mm) and
-    intrinsics; ``status`` : certain, resolved or ambiguous; ``faces``, ``labels`` : faces and circles used;
-    ``residuals_px`` : (n, 2) measured minus projected ellipse centres; ``weights`` : (n,) Huber's; ``outliers`` :
-    circles left out; ``chi2``, ``redundancy`` : of all residuals with their covariance; ``delta_chi2`` : excess in χ²
-    of the second solution, or of the other side of the valley if both solutions are one, infinite if there is neither;
-    ``needed_chi2`` : least ``delta_chi2`` with which the pose is certain; ``second`` : the second solution, unless the
-    pose is certain.
-    """
+    """The pose of the target in one image."""
 
     camera_from_target: Rigid
-    covariance: np.ndarray
-    parts: dict[str, np.ndarray]
-    by_circles: np.ndarray
-    by_intrinsics: np.ndarray
-    status: Status
+    covariance: np.ndarray  # (6, 6), rad and mm, left perturbation in the camera frame, R' = exp(w) R, t' = t + dt
+    parts: dict[str, np.ndarray]  # (6, 6) summands, of which ``target`` and ``intrinsics`` are common to all images
+    by_circles: np.ndarray  # (6, 3n) derivatives, but for the sign, by errors of the circles (target frame, mm)
+    by_intrinsics: np.ndarray  # (6, q) the same by errors of the intrinsics
+    status: Status  # certain, resolved or ambiguous
     faces: tuple[str, ...]
     labels: tuple[CircleLabel, ...]
-    residuals_px: np.ndarray
-    weights: np.ndarray
+    residuals_px: np.ndarray  # (n, 2) measured minus projected ellipse centres
+    weights: np.ndarray  # (n,) Huber's
     outliers: tuple[Outlier, ...]
-    chi2: float
+    chi2: float  # of all residuals with their covariance
     redundancy: int
-    delta_chi2: float
-    needed_chi2: float
-    second: "TargetPose | None" = None
+    delta_chi2: float  # of the second solution or the other side of the valley, infinite if there is neither
+    needed_chi2: float  # least ``delta_chi2`` with which the pose is certain
+    second: "TargetPose | None" = None  # solution, unless the pose is certain
 
     def __post_init__(self):
         n = len(self.labels)
@@ -228,39 +196,18 @@ class TargetPose(ImageFit, Brief):
 
 
 def pose_from_circles(
-    labels: Sequence[str],
-    centre_px: np.ndarray,
-    covariance_px2: np.ndarray,
+    labels: Sequence[str],  # texts ``face:circle``; dots of the board are ignored
+    centre_px: np.ndarray,  # (n, 2) in the distorted image
+    covariance_px2: np.ndarray,  # (n, 2, 2) of the single centres, without the σ factor
     target: TargetCircles,
     camera: Camera,
     options: PoseOptions | None = None,
-    prior: CameraPrior | None = None,
-    where: str = "image",
+    prior: CameraPrior | None = None,  # covariance of the intrinsics, which are exact if None
+    where: str = "image",  # name of the image, for messages
 ) -> TargetPose:
-    """Returns the pose of a calibrated target from the ellipse centres of its circles in one image.
-
-    The first step minimises the residuals of the single centres with Huber's loss. It starts from two poses: that of
-    the homography of the face with the most circles, and its reflection about the line of sight. The second weighs them
-    by their whole covariance (generalised least squares), which is the sum of image noise and the uncertainties of
-    target and intrinsics. So the covariance of the pose contains all three.
-
-    Parameters
-    ----------
-    labels : n labels ``face:circle``, or texts of that form; dots of the board are ignored
-    centre_px : (n, 2) ellipse centres in the distorted image, px
-    covariance_px2 : (n, 2, 2) covariances of the single centres, without the σ factor
-    prior : covariance of the intrinsics, which are exact if None
-    where : name of the image, for messages
-
-    Raises
-    ------
-    InputError
-        If the target does not have a circle, a label occurs twice, or an array has a wrong shape.
-    DegenerateError
-        If no face has four circles in general position, or too many circles contradict each other.
-    ConvergenceError
-        If no minimum is reached.
-    """
+    """Returns the pose of a calibrated target from the ellipse centres of its circles in one image. From the homography
+    of the largest face, and from its reflection, Huber's loss of single centres is minimised. The minima are then
+    weighed by the whole covariance of the centres: noise, target and intrinsics."""
     options = options or PoseOptions()
     labels = parse_labels(labels)
     used, problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
@@ -375,10 +322,8 @@ def _answer(
 
 
 def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tuple[float, PoseStack | None]:
-    """Returns the excess in χ² of the second minimum over the first, and its pose; infinite and None if there is none.
-
-    Both minima give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide.
-    """
+    """Returns the excess in χ² of the second minimum, and its pose; infinite and None if there is none. Both minima
+    give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide."""
     if len(found.cost) == 1:
         return np.inf, None
     delta = float(found.cost[1] - found.cost[0])
@@ -394,11 +339,7 @@ def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tu
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
-    """One minimum, weighed by the whole covariance of its centres.
-
-    Fields are as in :class:`TargetPose`. ``other_side`` : excess in χ² of the other side of a wide valley, infinite if
-    the minimum is no valley.
-    """
+    """One minimum, weighed by the whole covariance of its centres; fields are as in :class:`TargetPose`."""
 
     camera_from_target: Rigid
     covariance: np.ndarray
@@ -408,7 +349,7 @@ class _Solution:
     residuals_px: np.ndarray
     weights: np.ndarray
     chi2: float
-    other_side: float
+    other_side: float  # excess in χ² of the other side of a wide valley, infinite if the minimum is no valley
 
     def pose(self, status: Status, delta_chi2: float, seen: dict, second: TargetPose | None = None) -> TargetPose:
         """Returns the pose with the decision. ``seen`` : the fields that do not depend on the minimum."""
@@ -419,11 +360,7 @@ class _Solution:
 def _solution(
     problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
 ) -> _Solution:
-    """Returns a minimum weighed by the whole covariance of its centres, with its own covariance.
-
-    ``second``, ``plane`` : see :func:`stcal.sfm.measurement.pose.covariance_of_likelihood`. Two steps are enough, as
-    the error after the first is of second order.
-    """
+    """Returns a minimum weighed by the whole covariance of its centres in two steps: the first errs by second order."""
     weights = weights_of(minimum.length[0])
     noise = problem.noise / weights[:, None, None]
     residual, image = problem.seen(minimum.poses)
@@ -484,11 +421,7 @@ def measured_pose(
 
 
 def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
-    """Returns the pose with its two-fold ambiguity decided by the pose of the image before.
-
-    ``previous`` : camera_from_target of that image. The pose is unchanged if it is certain, or if neither of its two
-    solutions is clearly nearer to the previous pose.
-    """
+    """Pose with its two-fold ambiguity decided by the image before, if one solution is clearly nearer to it."""
     if pose.status == "certain" or pose.second is None:
         return pose
     turn, turn_of_second = (
@@ -517,12 +450,8 @@ rounding or if the likelihood of a pose is narrower than its linearisation."""
 
 
 def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: CameraPrior | None) -> np.ndarray:
-    """Returns the common errors (m, 6, r): pose i has the common error ``common[i] @ z``.
-
-    The vector z, r independent normal numbers of σ 1, is the same for all poses. The errors are those of the circles
-    and of the intrinsics as far as they matter (:data:`FELT`): the largest directions over all poses, each pose in
-    units of its covariance. rad and mm, left perturbation in the camera frame.
-    """
+    """Returns the errors (m, 6, r) that circles and intrinsics add to all poses, in camera frames: ``common[i] @ z``, z
+    normal. Only the largest directions that matter to the poses (:data:`FELT`) are kept."""
     if not poses:
         return np.zeros((0, 6, 0))
     circles, intrinsics = _root(target.covariance), _root(np.zeros((0, 0)) if prior is None else prior.covariance)

@@ -13,17 +13,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells, require_pose_table_written
-from stcal.report.document import (
-    Block,
-    Document,
-    Printed,
-    Section,
-    alarms,
-    fold,
-    legend,
-    plot,
-    plots,
-)
+from stcal.report.document import Block, Document, Printed, Section, alarms, fold, legend, plot, plots
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, count_ticks, limits, round_below
 from stcal.report.text import number, text_table
@@ -233,11 +223,7 @@ def _image_json(each: MeasuredImage) -> dict:
 
 
 def _printed(result: MeasureResult, every: bool) -> list[str]:
-    """Returns the table for the terminal, 80 columns wide for names of eight characters.
-
-    σ are the largest of three axes, n counts circles. Of more than :data:`MOST_LISTED` images, those are listed that
-    need a look, with the median and worst figures of all, unless ``every`` image is wanted.
-    """
+    """Returns the table for the terminal; of more than :data:`MOST_LISTED` images those that need a look."""
     every = every or len(result.images) <= MOST_LISTED
     doubtful = [image for image in result.images if not _sound(image)]
     images = result.images if every else doubtful[:MOST_LISTED]

@@ -27,28 +27,18 @@ SAME_RADIUS_MM = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TargetCircles(Brief):
-    """The c circles of a calibrated target, target frame, mm.
-
-    ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) joint covariance of all centres,
-    mm², zero if unknown; ``sigma_factor`` : factor on the centres' own σ, as estimated by the run; ``notes`` : what the
-    covariance lacks; ``design`` : design for detection in images, None if images are not searched. Computed from these:
-    ``normal`` : (c, 3) normal of the plane of each circle's face; ``target_from_plane`` : by face, with the origin of
-    the plane at the mean of its circles; ``place`` : index by label.
-
-    Raises DegenerateError if the circles of a face lie in line. Raises InputError: if an array has a wrong shape, a
-    number is out of range, a label occurs twice, or a covariance is invalid.
-    """
+    """The c circles of a calibrated target, target frame, mm."""
 
     labels: tuple[CircleLabel, ...]
-    xyz: np.ndarray
-    radius: np.ndarray
-    covariance: np.ndarray
-    sigma_factor: float = 1.0
-    notes: tuple[str, ...] = ()
-    design: TargetDesign | None = None
-    normal: np.ndarray = field(init=False)
-    target_from_plane: dict[str, Rigid] = field(init=False)
-    place: dict[CircleLabel, int] = field(init=False)
+    xyz: np.ndarray  # (c, 3)
+    radius: np.ndarray  # (c,)
+    covariance: np.ndarray  # (3c, 3c) of all centres, mm², zero if unknown
+    sigma_factor: float = 1.0  # on the centres' own σ, as estimated by the run
+    notes: tuple[str, ...] = ()  # what the covariance lacks
+    design: TargetDesign | None = None  # None if images are not searched
+    normal: np.ndarray = field(init=False)  # (c, 3) of the plane of each circle's face
+    target_from_plane: dict[str, Rigid] = field(init=False)  # with the mean of its circles as origin
+    place: dict[CircleLabel, int] = field(init=False)  # index by label
 
     def __post_init__(self):
         object.__setattr__(self, "labels", circle_labels(self.labels))
@@ -118,7 +108,10 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
     try:
         labels = circle_labels(faces.circles)
         xyz = np.array(list(faces.circles.values())).reshape(-1, 3)
-        xyz = xyz + _seen_in_front(faces, labels)
+        # Circles behind rims are seen half a rim in front of their luminous surface.
+        outward = {face: pose.rotation[:, 2] for face, pose in faces.poses().items()}
+        shifts = [0.5 * faces.rim_mm.get(label, 0.0) * outward.get(label.face, np.zeros(3)) for label in labels]
+        xyz = xyz + np.array(shifts).reshape(-1, 3)
         radius = np.array([faces.radius_mm[label] for label in labels])
         covariance, notes = _covariance(labels, _joint(faces, labels), faces.circle_covariance_mm2)
         if faces.centre_sigma_factor is None:
@@ -132,13 +125,6 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
         ) from error
     _require_design(target, design, path)
     return target
-
-
-def _seen_in_front(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray:
-    """Returns how far in front of their luminous surface circles behind rims are seen, (c, 3), mm."""
-    outward = {face: pose.rotation[:, 2] for face, pose in faces.poses().items()}
-    shifts = [0.5 * faces.rim_mm.get(label, 0.0) * outward.get(label.face, np.zeros(3)) for label in labels]
-    return np.array(shifts).reshape(-1, 3)
 
 
 def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:

@@ -58,33 +58,25 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class NewGroup:
-    """A pair of faces to photograph together for the first time.
-
-    ``images`` : number of views; ``face``, ``sigma_mm`` : the worst face with these views, and its σ.
-    """
+    """A pair of faces to photograph together for the first time."""
 
     faces: tuple[str, str]
-    images: int
-    face: str
+    images: int  # number of views
+    face: str  # the worst one with these views, and its σ
     sigma_mm: float
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Advice(Brief):
-    """Further photographs, and what each of them would improve.
+    """Further photographs, and what each of them would improve."""
 
-    ``now`` : forecast of the run as it is; ``shares`` : of its variance, by face and source; ``choices`` : views, each
-    chosen in addition to those before it; ``new_groups`` : the best first; ``better_board`` : forecast of the run with
-    half the board's σ; ``tried`` : number of candidates.
-    """
-
-    now: Forecast
-    shares: dict[str, dict[str, float]]
+    now: Forecast  # of the run as it is
+    shares: dict[str, dict[str, float]]  # of its variance, by face and source
     noise: CentreNoise
-    choices: tuple[Choice, ...]
-    new_groups: tuple[NewGroup, ...]
-    better_board: Forecast
-    tried: int
+    choices: tuple[Choice, ...]  # each chosen in addition to those before it
+    new_groups: tuple[NewGroup, ...]  # the best first
+    better_board: Forecast  # with half the board's σ
+    tried: int  # number of candidates
 
     @property
     def has_board(self) -> bool:
@@ -109,12 +101,7 @@ class Known(Brief):
 
 
 def known_of(run: SavedRun) -> Known:
-    """Returns the geometry of a finished run.
-
-    It is adjusted once more, which moves nothing, for the data that ``faces.json`` does not contain.
-
-    Raises InputError: the run's ``target_model`` is missing or damaged.
-    """
+    """Returns the geometry of a finished run, adjusted once more for the data that ``faces.json`` does not contain."""
     again = adjusted_run(run)
     joint = again.state.result()
     heights, rim_sigma_mm = run.rims_mm()

@@ -93,24 +93,7 @@ def plan(
 
 @one_thread()
 def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rigid]) -> Plan:
-    """Returns the forecast of photographs of a body in random poses, each of which shows two faces at least.
-
-    Parameters
-    ----------
-    options : images, distance, camera and noise. Without a camera it is found from the photographs, as ``run`` does.
-    target : design of the body, mm
-    nominal : pose of every face in one common frame, mm, by face id
-
-    Returns
-    -------
-    Plan
-        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
-
-    Raises
-    ------
-    InputError
-        A face has circles, or the body does not fit into the image at this distance.
-    """
+    """Returns the forecast of photographs of a body in random poses, each of which shows two faces at least."""
     placed = replace(
         target, faces=tuple(replace(face, rough_target_from_face=nominal[face.id]) for face in target.faces)
     )
@@ -209,11 +192,7 @@ ROLLS_DEG = (0.0, 90.0)
 
 
 def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
-    """Returns candidates for further photographs of a body: each shows two faces that one view can show together.
-
-    A view is described relative to the nearest photograph, as the motion of the camera about the middle of the body. To
-    turn the body the other way is the same.
-    """
+    """Returns candidates, each with two faces that one view can show, as a motion from the nearest photograph."""
     target_from_face = setup.start.target_from_face
     faces = [face for face in setup.target.faces if face.id in target_from_face]
     normals = {face.id: face.outward * target_from_face[face.id].rotation[:, 2] for face in faces}

@@ -350,8 +350,7 @@ def advice_text(advice: Advice) -> str:
 
 
 def where(view: PlannedView) -> str:
-    """Returns the direction from the named photograph to the view, as seen in that photograph: ``25° right, 12°
-    up``."""
+    """Returns the direction from the named photograph to the view, as seen there: ``25° right, 12° up``."""
     parts = []
     for angle, names in ((view.azimuth_deg, ("right", "left")), (view.elevation_deg, ("up", "down"))):
         if angle:

@@ -1,7 +1,4 @@
-"""Forecast of the σ of a geometry, photographed or only planned, and nominal poses before a photograph exists.
-
-Centring noise follows from the size and tilt of the circles, the covariance from the joint adjustment itself.
-"""
+"""Forecast of the σ of a geometry, photographed or only planned, and nominal poses before a photograph exists."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -33,12 +30,7 @@ from stcal.synthetic.scene import Scene, image_circles
 
 
 def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, Rigid]:
-    """Returns the pose of every face in one frame. ``faces`` : a ``faces.json``, or None for the rough poses of the
-    design.
-
-    Raises InputError if a face has no rough pose and there is no ``faces.json``, or if that file is invalid or lacks a
-    face.
-    """
+    """Returns the pose of every face in one frame, of a ``faces.json`` or, without one, by the design's rough poses."""
     if faces is None:
         rough = target.rough_poses()
         if not rough and _is_reference(target):  # of files from before there were rough poses
@@ -78,10 +70,7 @@ EXACT_SIGMA_PX = 0.005
 
 
 def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: float = 0.0) -> list[ImageObservations]:
-    """Returns the ellipse centres of all circles that must be found, with Gaussian noise of σ ``noise_px`` per axis.
-
-    ``missing`` : share of the circles that detection loses.
-    """
+    """Returns the centres of all circles but a share ``missing``, with Gaussian noise of σ ``noise_px`` per axis."""
     images = []
     for name, group in scene.groups.items():
         for i in range(len(group.camera_from_target)):
@@ -104,8 +93,7 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
 
 
 def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list[MetricModel]:
-    """Returns models of the groups at the true geometry, mm, target frame, with these observations, not yet corrected
-    for eccentricity."""
+    """Returns models of the groups at the true geometry, mm, target frame, not yet corrected for eccentricity."""
     models = []
     for name, images in by_group(observations).items():
         group = scene.groups[name]
@@ -177,8 +165,7 @@ class CentreNoise:
 
     @classmethod
     def measured(cls, models: Sequence[MetricModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
-        """Returns the noise fitted to the covariances of the observations of metric models. Large sets are thinned out
-        evenly."""
+        """Noise fitted to the covariances of the observations of metric models. Large sets are thinned out evenly."""
         step = max(1, sum(len(model.point_index) for model in models) // ENOUGH)
         sampled = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
         corner = [_is_corner(model, radius_mm) for model in sampled]
@@ -243,10 +230,7 @@ class _Rims:
 
 
 def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns ∮ nₓ² ds around ellipses with these semi-axes, along the minor and along the major axis.
-
-    They are complete elliptic integrals (Abramowitz and Stegun 1964, 17.3).
-    """
+    """Returns ∮ nₓ² ds around ellipses along the minor and the major axis (Abramowitz and Stegun 1964, 17.3)."""
     m = np.maximum(1 - (minor / major) ** 2, 1e-6)  # for a circle the formula is defined as a limit only
     first, second = ellipk(m), ellipe(m)
     return 4 * major * (second - (1 - m) * first) / m, 4 * minor**2 / major * (first - second) / m
@@ -254,24 +238,18 @@ def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """Input of a forecast besides the views: the hardware and the options of the adjustment.
-
-    ``start`` : the target as it is, for the reference face and the sides that faces look to; ``prior`` : of the
-    intrinsics, None if they are fixed; ``common`` : see :func:`stcal.sfm.adjust.joint.covariance_of`; ``sigma0`` :
-    factor on all σ; ``rims_mm2`` : (3c, 3c) covariance of the circles by the heights of their rims, which no view
-    changes, None if these are not estimated.
-    """
+    """Input of a forecast besides the views: the hardware and the options of the adjustment."""
 
     target: TargetDesign
     board: BoardDesign
     camera: Camera
-    start: CalibratedTarget
+    start: CalibratedTarget  # the target as it is, for the reference face and the sides that faces look to
     frame: FrameKind
     flatness_mm: float | None
-    prior: CameraPrior | None
-    common: float
-    sigma0: float = 1.0
-    rims_mm2: np.ndarray | None = None
+    prior: CameraPrior | None  # of the intrinsics, None if they are fixed
+    common: float  # see :func:`stcal.sfm.adjust.joint.covariance_of`
+    sigma0: float = 1.0  # factor on all σ
+    rims_mm2: np.ndarray | None = None  # (3c, 3c) by the heights of rims, which no view changes, None if not estimated
 
     def circle_covariance(self, adjusted_mm2: np.ndarray) -> np.ndarray:
         """Returns the covariance of the circles, (3c, 3c) mm², from that of an adjustment whose σ₀ is 1."""
@@ -295,17 +273,12 @@ class Setup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """The σ to expect of a geometry, target frame.
+    """The σ to expect of a geometry, target frame."""
 
-    ``face_covariance`` : (6, 6) by face except the reference face, rad and mm; ``circle_sigma_mm`` : root of the trace,
-    by label; ``scale_sigma`` : relative σ of the target's size; ``derivatives`` : reusable for other views of the same
-    circles.
-    """
-
-    face_covariance: dict[str, np.ndarray]
-    circle_sigma_mm: dict[CircleLabel, float]
-    scale_sigma: float
-    derivatives: Derivatives
+    face_covariance: dict[str, np.ndarray]  # (6, 6) except for the reference face, rad and mm
+    circle_sigma_mm: dict[CircleLabel, float]  # root of the trace
+    scale_sigma: float  # relative, of the target's size
+    derivatives: Derivatives  # reusable for other views of the same circles
 
     def __post_init__(self):
         fixed = {face: frozen(c, (6, 6), f"face {face}: covariance") for face, c in self.face_covariance.items()}
@@ -337,10 +310,8 @@ def forecast(
     known: Derivatives | None = None,
     photographs: Photographs | None = None,
 ) -> Forecast:
-    """Returns the σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
-
-    ``known`` : derivatives of an earlier forecast of the same circles; ``photographs`` : those of the groups, if known.
-    """
+    """Returns the σ of metric models, mm, target frame, as the joint adjustment would state them. ``known``:
+    derivatives of an earlier forecast of the same circles."""
     joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.circle_covariance(joint.covariance_mm2)
@@ -356,14 +327,11 @@ def forecast(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionsWith:
-    """Computes :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would.
-
-    ``variance_mm2`` : of the position of each face without it; ``to_positions`` : by group, (3p + q, 3f) covariance
-    between its points and the intrinsics, and the positions, without the factor ``scale``.
-    """
+    """Computes :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
 
     now: Extensible
-    variance_mm2: dict[str, float]
+    variance_mm2: dict[str, float]  # of the position of each face without it
+    # (3p + q, 3f) covariance with the positions, by group, without the factor ``scale``
     to_positions: dict[str, np.ndarray]
     scale: float
 
@@ -396,13 +364,8 @@ def position_sigma_mm(face_covariance: np.ndarray) -> float:
 def variance_shares(
     now: Forecast, models: Sequence[MetricModel], setup: Setup, photographs: Photographs | None = None
 ) -> dict[str, dict[str, float]]:
-    """Returns, by face and source, the share of the variance of the face's position that is due to the source.
-
-    Sources are images, board or print, flatness if stated, intrinsics if adjusted, and rims if estimated. A variance
-    grows by f² where the σ of all sources do by f, so that its derivatives by the sources' variances add up to it.
-
-    ``now`` : forecast of ``models`` and ``setup``; ``photographs`` : as in :func:`forecast`.
-    """
+    """Returns, by face and source, the share of the variance of the face's position that is due to the source. A
+    variance grows by f² where all σ do by f, so that its derivatives by the sources' variances add up to it."""
     smaller: dict[str, tuple[Sequence[MetricModel], Setup, Photographs | None]] = {
         "image noise": (
             [replace(model, covariance_px2=SMALLER**2 * model.covariance_px2) for model in models],

@@ -108,42 +108,31 @@ class PlanOptions(Brief):
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """A change of the plan.
-
-    ``sigma_mm`` : σ of the worst face with it, or None and the ``reason`` if it is impossible.
-    """
+    """A change of the plan."""
 
     what: str
-    sigma_mm: float | None
+    sigma_mm: float | None  # of the worst face with it, or None and the ``reason`` if it is impossible
     reason: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Plan(Brief):
-    """A plan with its forecast and remedies.
-
-    ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``aperture_mm`` : see
-    :func:`widest_aperture_mm`; ``shares`` : of the variance, by face and source; ``hardly_seen`` : sentence on the
-    faces of a body that the photographs hardly show, empty if there is none.
-    """
+    """A plan with its forecast and remedies."""
 
     options: PlanOptions
     setup: Setup
     groups: tuple[str, ...]
-    observations: int
-    centre_sigma_px: float
-    aperture_mm: float
+    observations: int  # number of centres
+    centre_sigma_px: float  # RMS
+    aperture_mm: float  # see :func:`widest_aperture_mm`
     forecast: Forecast
-    shares: dict[str, dict[str, float]]
+    shares: dict[str, dict[str, float]]  # of the variance, by face and source
     remedies: tuple[Remedy, ...]
-    hardly_seen: str = ""
+    hardly_seen: str = ""  # sentence on the faces of a body that the photographs hardly show
 
 
 def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:
-    """Returns the pairs of face ids that a text like ``12,14`` or ``top-left,top-right`` names.
-
-    Raises InputError if a name is not a pair of the target's faces.
-    """
+    """Returns the pairs of face ids that a text like ``12,14`` or ``top-left,top-right`` names."""
     pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
     for name in names:
@@ -214,12 +203,8 @@ def _now(scene: Scene, options: PlanOptions, board: BoardDesign) -> Plan:
 
 
 def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
-    """Returns the diameter of the aperture up to which depth of field moves no centre by more than its σ.
-
-    Each image is in focus at the mean inverse depth of its circles. The squared blur of a point at the inverse depth u
-    is then (f_px A/4)² (u − u_f)² for an aperture of diameter A, and a centre moves by a multiple of its gradient
-    (:mod:`stcal.sfm.detect.defocus`).
-    """
+    """Returns the diameter of the aperture up to which depth of field moves no centre by more than its σ. Each image is
+    in focus at the mean inverse depth u_f; the squared blur is (f_px A/4)² (u − u_f)²."""
     focal_px, widest = float(np.sqrt(camera.focal.prod())), []
     for model in models:
         rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
@@ -278,10 +263,7 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
 
 
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
-    """Returns the faces of all groups, after a check that each is linked to the reference face.
-
-    Raises InputError if a face is not linked to it.
-    """
+    """Returns the faces of all groups; an error if one is not linked to the reference face."""
     planned = {face for pair in pairs for face in pair}
     linked = {reference}
     for _ in planned:

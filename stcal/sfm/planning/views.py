@@ -25,41 +25,29 @@ ROLLS_DEG = (0.0, 90.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedView:
-    """A photograph to take in a group.
-
-    ``model`` : the group's model of this one image; ``middle`` : name of the photograph in the middle of the group's
-    views; ``azimuth_deg``, ``elevation_deg`` : angles from there to the right and up, as that photograph shows right
-    and up; ``roll_deg`` : rotation of the camera about its axis; ``distance_mm`` : distance from the middle of board
-    and faces; ``tilts_deg`` : angle between normal and line of sight, by face and ``board``; ``nearest`` : name of the
-    nearest photograph; ``nearest_deg`` : angle to it, seen from the middle of board and faces.
-    """
+    """A photograph to take in a group, at angles about its middle that count from the ``middle`` photograph."""
 
     group: str
-    model: MetricModel
+    model: MetricModel  # of this one image
     azimuth_deg: float
     elevation_deg: float
-    roll_deg: float
+    roll_deg: float  # about the camera's axis
     distance_mm: float
-    tilts_deg: dict[str, float]
+    tilts_deg: dict[str, float]  # between normal and line of sight, by face and ``board``
     middle: str
-    nearest: str
+    nearest: str  # photograph, at the angle ``nearest_deg``
     nearest_deg: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stand:
-    """Arrangement of a group's views, target frame.
+    """Arrangement of a group's views, target frame."""
 
-    ``centre`` : (3,) middle of board and faces; ``axes`` : (3, 3) rows right, up, towards the cameras;
-    ``distance_mm`` : median distance of the cameras from the centre; ``directions`` : (m, 3) unit vectors from the
-    centre to the cameras; ``middle`` : name of the image in the middle of the views.
-    """
-
-    centre: np.ndarray
-    axes: np.ndarray
-    distance_mm: float
-    directions: np.ndarray
-    middle: str
+    centre: np.ndarray  # (3,) middle of board and faces
+    axes: np.ndarray  # (3, 3) rows right, up, towards the cameras
+    distance_mm: float  # median, of the cameras from the centre
+    directions: np.ndarray  # (m, 3) unit vectors from the centre to the cameras
+    middle: str  # image in the middle of the views
 
     def __post_init__(self):
         for name, shape in (("centre", (3,)), ("axes", (3, 3)), ("directions", (None, 3))):
@@ -131,10 +119,7 @@ def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], c
 
 
 def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
-    """Returns the views of a group that show the whole board and at least one whole face.
-
-    They stand on a grid about the middle of the present views.
-    """
+    """Returns the views, on a grid about the present ones, that show the whole board and at least one whole face."""
     stand = _Stand.of(model)
     steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
     places = [

@@ -273,10 +273,7 @@ def _require_same_unit(where: str, kind: str, true: float, measured: float, side
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
-    """Counts the labels of a run or a detection against the truth.
-
-    A board's numbers are known up to its own symmetry, but only for a whole group at once.
-    """
+    """Counts the labels against the truth; a board's numbers are known up to its symmetry, for a whole group."""
     try:
         rows = list(csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())))
         require_unchanged(path)

@@ -32,13 +32,8 @@ def group_colours(names: list[str]) -> dict[str, str]:
 
 def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> Drawing:
     """Draws residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
-
-    Parameters
-    ----------
-    residuals_um : by ``board:row:column``, (3,) each
-    reach_um : residual that is drawn as long as the grid's pitch
-    height_um : end of the colour scale for the out-of-plane part; both are the same for all groups, to compare them
-    """
+    ``residuals_um``: (3,) by ``board:row:column``; ``reach_um``: drawn as long as the pitch; ``height_um``: end of the
+    colour scale."""
     cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
     vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
     per_cell = reach_um if reach_um > 0 else 1.0
@@ -64,10 +59,7 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
 
 
 def image_bars(rows: list[dict], colours: dict[str, str]) -> Drawing:
-    """Draws the RMS residual of each image as a bar in its group's colour, and its largest residual as a tick.
-
-    The horizontal axis is the number of the image in the table.
-    """
+    """Draws the RMS residual of each image as a bar in its group's colour, and its largest residual as a tick."""
     drawing, count = Drawing(10.5, 2.9), max(len(rows), 1)
     top = max((row["max_px"] for row in rows), default=0.0)
     axes = Axes(drawing, (43.0, 19.0, 749.0, 176.0), (0.2, count + 0.8), (0.0, 1.05 * top if top > 0 else 1.0))
@@ -93,10 +85,7 @@ LEAST_UPRIGHT = 0.5
 
 
 def upright(report: dict) -> dict:
-    """Returns the report with target, boards and cameras turned as they stood, if the photographs were taken upright.
-
-    Else the target's Z is up.
-    """
+    """Report with target, boards and cameras as they stood for upright photographs, else the target's Z up."""
     from scipy.spatial.transform import Rotation
 
     scene = report["scene"]
@@ -191,19 +180,8 @@ SHEET = "#7f93a8"
 
 
 def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
-    """Returns the parts to be drawn, in the target frame.
-
-    Parameters
-    ----------
-    report : content of ``report.json``
-    colours : by group
-
-    Returns
-    -------
-    list of dict
-        ``kind`` (``line``, ``sheet``, ``point``, ``text``), ``xyz`` (points, mm), ``colour``, and for some parts
-        ``name``, ``size`` (px) and ``target``: whether the part belongs to the target.
-    """
+    """Returns the parts to be drawn in the target frame: ``kind`` (``line``, ``sheet``, ``point``, ``text``), ``xyz``
+    (mm), ``colour``, and for some ``name``, ``size`` (px) and ``target``: whether the part belongs to the target."""
     scene = report["scene"]
     parts = _faces(scene["circles"], report["faces"])
     for label, xyz in scene["circles"].items():
@@ -216,7 +194,8 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
     everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])
     depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
     for camera in scene["cameras"]:
-        path = _traced(frustum(camera, report["camera"], depth))
+        lines = frustum(camera, report["camera"], depth)
+        path = np.vstack([section for line in lines for section in (lines[0][:1], line)])  # back to the tip each time
         parts.append(_part("line", path, colours.get(camera["group"], INK), name=camera["image"], size=1.1))
     return parts
 
@@ -240,12 +219,6 @@ def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict
     return parts
 
 
-def _traced(lines: list[np.ndarray]) -> np.ndarray:
-    """Returns the pyramid's lines as one path from its tip, which goes back to the tip after each line."""
-    tip = lines[0][:1]
-    return np.vstack([section for line in lines for section in (tip, line)])
-
-
 def _part(kind: str, xyz, colour: str, **more) -> dict:
     return {"kind": kind, "xyz": np.round(np.asarray(xyz, float), DIGITS).tolist(), "colour": colour, **more}
 
@@ -260,44 +233,29 @@ Residuals = np.ndarray
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """One photograph.
-
-    ``says`` : what was found in it; ``jpeg`` : as a data URI; ``vectors`` : path of an SVG in px of the image.
-    """
+    """One photograph."""
 
     name: str
-    says: str
-    jpeg: str
-    vectors: str
+    says: str  # what was found in it
+    jpeg: str  # as a data URI
+    vectors: str  # path of an SVG in px of the image
 
 
 @dataclass(frozen=True, slots=True)
 class Photographs:
-    """All photographs that the page shows, with the common scale of their vectors.
-
-    ``box`` : the images' place in px, pixel centres integer; ``aspect`` : width by height; ``factor`` : by which all
-    vectors are lengthened, 0 if there are none; ``stroke`` : width of their lines, px; ``bar`` : path of a bar, as long
-    as the vector of a residual of ``bar_px``.
-    """
+    """All photographs that the page shows, with the common scale of their vectors."""
 
     each: tuple[Photograph, ...]
-    box: str
-    aspect: float
-    factor: float
-    stroke: float
-    bar: str
+    box: str  # the images' place in px, pixel centres integer
+    aspect: float  # width by height
+    factor: float  # by which all vectors are lengthened, 0 if there are none
+    stroke: float  # width of their lines, px
+    bar: str  # path of a bar, as long as the vector of a residual of ``bar_px``
     bar_px: float
 
 
 def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> Photographs:
-    """Returns all photographs that the page shows, with vectors on one scale.
-
-    Parameters
-    ----------
-    report : content of ``report.json``
-    overlays : JPEG by image name
-    residuals : by image name
-    """
+    """Returns all photographs that the page shows, with vectors on one scale."""
     width, height = report["camera"]["size_px"]
     mapped = {row["image"]: row for row in report["residuals_by_image"]}
     lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])
@@ -321,10 +279,7 @@ def _path(residuals: Residuals, factor: float) -> str:
 
 
 def shown_overlays(report: dict) -> list[str]:
-    """Returns the names of the images whose overlays the page shows.
-
-    These are all images, or in a large set those that most deserve a look.
-    """
+    """Returns the names of the images whose overlays the page shows; of a large set, those that deserve a look."""
     names = [image["name"] for image in report["images"]]
     if len(names) <= FIRST_IMAGES:
         return names

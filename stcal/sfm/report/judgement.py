@@ -1,7 +1,5 @@
-"""The report in four sentences: may I use it, how good is it, what limits it, what to do next.
-
-The rules use nothing but the content of ``report.json``, so that everyone can follow them.
-"""
+"""The report in four sentences: may I use it, how good is it, what limits it, what to do next; from ``report.json``
+alone."""
 
 import math
 from collections.abc import Iterable
@@ -115,21 +113,16 @@ def judged(report: dict) -> dict:
 
 
 def judgement_of(report: dict) -> Judgement:
-    """Returns the judgement of a run.
-
-    Parameters
-    ----------
-    report : content of ``report.json``
-    """
+    """Returns the judgement of a run from the content of ``report.json``."""
     verdict, use = _use(report)
-    failed = any(check["verdict"] == "failed" for check in report.get("checks", []))
+    failed = [check["key"] for check in report.get("checks", []) if check["verdict"] == "failed"]
     lost = None if failed else _by_lost_group(report)  # what is only suspicious comes after it
     by_result = _control(report) or lost or _by_checks(report) or _by_gaps(report)
     cause = by_result or _by_drawing(report) or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
-    invalid = _invalid(report)
+    invalid = invalidated(failed)
     return Judgement(
         verdict=verdict,
         use=use,
@@ -143,11 +136,6 @@ def judgement_of(report: dict) -> Judgement:
         invalid=invalid,
         missing=[*_missing_faces(report), *_lost_groups(report)],
     )
-
-
-def _invalid(report: dict) -> list[str]:
-    """Returns what the failed checks do not let hold, each once."""
-    return invalidated(check["key"] for check in report.get("checks", []) if check["verdict"] == "failed")
 
 
 def invalidated(failed: Iterable[str]) -> list[str]:
@@ -336,8 +324,7 @@ def _gaps(report: dict) -> list[str]:
 
 
 def _first(report: dict, verdict: str) -> dict:
-    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first that
-    is not a general one."""
+    """Returns the cause of the whole set, else the first check of this verdict, rather one that names an image."""
     images = {image["name"] for image in report["images"]}
     matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
     naming = [check for check in matching if any(name in images for name in check["names"])]
@@ -427,8 +414,7 @@ def _control(report: dict) -> _Cause | None:
 
 
 def _by_checks(report: dict) -> _Cause | None:
-    """Returns the cause that the first failed check names, what limits a result with a suspicious one, or the
-    cross-check's; None without any."""
+    """Returns the cause by the first failed check, a suspicious one that limits the result, or the cross-check."""
     verdicts = {check["verdict"] for check in report.get("checks", [])}
     for verdict in ("failed", "suspicious"):
         if verdict in verdicts:
@@ -509,8 +495,7 @@ def _by_sigma(report: dict) -> _Cause:
 
 
 def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cause:
-    """Returns the cause where the photographs limit the result. ``variance`` : due to them, of ``sigma``²; 0 if it is
-    not known."""
+    """Returns the cause where photographs limit the result; ``variance``: their part of ``sigma``², 0 if unknown."""
     summary, advice = report["summary"], "`stcal-sfm advise RUN` says which do most."
     if not variance:
         return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")

@@ -53,19 +53,11 @@ FIRST_PAIRS = 15
 
 def report_html(
     report: dict,
-    overlays: dict[str, bytes],
-    residuals: Mapping[str, Residuals] | None = None,
-    gone: int = 0,
+    overlays: dict[str, bytes],  # JPEG by image name
+    residuals: Mapping[str, Residuals] | None = None,  # centres and their residuals by image name, px; None: not drawn
+    gone: int = 0,  # number of overlays that are no longer in the run's folder
 ) -> str:
-    """Returns the page.
-
-    Parameters
-    ----------
-    report : result of :func:`stcal.sfm.runs.output.report_of`
-    overlays : JPEG by image name
-    residuals : centres and their residuals by image name, px; none are drawn if None
-    gone : number of overlays that are no longer in the run's folder
-    """
+    """Returns the page."""
     judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
     if judgement.verdict == "no":
         report = without_sigma(report)

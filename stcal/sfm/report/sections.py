@@ -21,13 +21,10 @@ FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "thr
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """Words for what was photographed.
+    """Words for what was photographed."""
 
-    ``point`` : circle, corner or, where faces have either, point; ``board`` : whether a board of dots gives the scale
-    """
-
-    point: str
-    board: bool
+    point: str  # circle, corner or, where faces have either, point
+    board: bool  # whether a board of dots gives the scale
 
     @classmethod
     def of(cls, report: dict) -> "Words":
@@ -290,10 +287,7 @@ FIRST_NAMES = 6
 
 
 def count_verdicts(verdicts: list[tuple[str, str]]) -> str:
-    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first.
-
-    ``verdicts`` : verdict and remedy of each check; one of circles or a board where there are none does not apply.
-    """
+    """Number of checks (verdict, remedy) by verdict, the worst first; one that does not apply is left out."""
     told = [verdict if applies(verdict, remedy) else NOT_APPLICABLE for verdict, remedy in verdicts]
     return ", ".join(f"{told.count(v)} {v}" for v in (*ORDER, NOT_APPLICABLE) if v in told) or "none"
 

@@ -65,11 +65,8 @@ HASH_DIGITS = 12
 def overlays_beside(
     detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, run: RunFolder, progress: Progress
 ) -> Iterator[dict[str, frozenset[Label]]]:
-    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block.
-
-    An overlay of an earlier run with the same content is taken from the cache. Yields the labels, by image, of the
-    circles that are left out of the adjustment: the block adds them, and their images are drawn again with crosses.
-    """
+    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block, which
+    adds to the yielded labels, by image, those that are to be crossed out."""
     face_ids, focal_px = [face.id for face in target.faces], detection.camera.focal
 
     left_out: dict[str, frozenset[Label]] = {}
@@ -102,10 +99,7 @@ def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
 
 
 def overlay_path(out: Path, name: str) -> Path:
-    """Returns the path of an image's overlay: the image's own name, with ``.jpg`` unless it is one of a JPEG.
-
-    A long name is cut, and ends in its hash.
-    """
+    """Returns the path of an image's overlay, with ``.jpg``; a long name is cut, and ends in its hash."""
     group, slash, file_name = name.rpartition("/")
     if len(os.fsencode(file_name)) > LONGEST_NAME:
         cut = os.fsencode(file_name)[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
@@ -115,10 +109,7 @@ def overlay_path(out: Path, name: str) -> Path:
 
 
 def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
-    """Writes database, models, faces and report into a folder that holds the overlays; returns the judgement.
-
-    The database has corrected centres.
-    """
+    """Writes database, with corrected centres, models, faces and report beside the overlays; returns the judgement."""
     observations = result.observations()
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
@@ -158,15 +149,11 @@ def write_report(out: Path, report: dict, run: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ReportAgain:
-    """Result of :func:`report_again`.
+    """Result of :func:`report_again`."""
 
-    ``files`` : page and PDF that were written; ``gone`` : number of overlays that the folder no longer holds, so that
-    the page lacks them; ``notes`` : on files that are not as the run left them.
-    """
-
-    files: tuple[Path, ...]
-    gone: int
-    notes: tuple[str, ...] = ()
+    files: tuple[Path, ...]  # page and PDF that were written
+    gone: int  # number of overlays that the page lacks
+    notes: tuple[str, ...] = ()  # on files that are not as the run left them
 
     def text(self) -> str:
         """Returns the text for the terminal."""
@@ -288,10 +275,7 @@ def require_report(saved: SavedRun) -> None:
 
 
 def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
-    """Returns all keypoints of every image as the models of the groups correct them.
-
-    In groups without a model the keypoints are as measured.
-    """
+    """Returns all keypoints of every image as the models of the groups correct them, as measured without a model."""
     rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
     none = np.zeros(0, int)
     return [

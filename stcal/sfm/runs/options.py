@@ -134,11 +134,8 @@ class RunOptions:
 
 
 def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]:
-    """Returns what seem to be faces that the target does not have, with the group that each is named in.
-
-    If the name of one group consists of two faces, another group's name of two words or letters also consists of faces
-    if one of them is a face; the other one is then a face that the target lacks.
-    """
+    """Returns what seem to be faces that the target lacks, with their group: beside a face in a name of two words, if
+    another group is named after two faces."""
     ids, groups = [face.id for face in target.faces], list(groups)
     found: dict[str, str] = {}
     for group in groups if any(faces_in_name(name, ids) for name in groups) else ():

@@ -24,24 +24,15 @@ STEPS = ("centres of blurred edges", "eccentricity", "weights", "joint adjustmen
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Result of one method.
-
-    ``target`` ; ``models`` : models without unit that it rests on, one per group; ``scales`` : by group.
-    """
+    """Result of one method."""
 
     target: CalibratedTarget
-    models: tuple[WorldModel, ...]
-    scales: dict[str, Scale]
+    models: tuple[WorldModel, ...]  # without unit, one per group
+    scales: dict[str, Scale]  # by group
 
 
 def require_comparable(options: AdjustOptions) -> None:
-    """Refuses to compare a run that is itself a part of the published method.
-
-    Raises
-    ------
-    InputError
-        The solve is not the joint adjustment with eccentricity.
-    """
+    """Refuses to compare a run that is itself a part of the published method."""
     if options.solve != "joint" or not options.eccentricity:
         raise InputError(
             "E-OPTION-CONFLICT",
@@ -51,24 +42,16 @@ def require_comparable(options: AdjustOptions) -> None:
 
 
 def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
-    """Compares faces, board and residuals of the published method, and of each step of this package added in turn.
-
-    Parameters
-    ----------
-    result
-        Result of the joint adjustment.
-    published
-        Result of ``--solve paper`` on the same photographs, or the error that prevents it.
-
-    Returns
-    -------
-    Comparison
-        Poses as three-point frames, against those of ``result``'s circles.
-    """
-    whole = _jointly(result)
+    """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
+    three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
+    joint, scales = result.calibration.joint, result.calibration.scales
+    if joint is None:
+        raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
+    whole = calibrated_target(joint, result.target, result.target_design, "three-point")
     steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
-    rows.append(_last_row(f"+ {STEPS[-1]}", result))
+    rms = residual_rms_px(joint.models, result.calibration.camera)
+    rows.append(_compared(f"+ {STEPS[-1]}", {}, [], scales, rms, None))
     sigma = {
         face: SigmaRow(
             translation_um=MICRO * float(np.sqrt(np.trace(c[3:, 3:]))),
@@ -81,10 +64,7 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
 
 
 def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
-    """Returns the answers from the run's own circles after each added step, without the joint adjustment.
-
-    Keys are the steps added last. If a step has no answer, the value is its error.
-    """
+    """Answers, or errors, from the run's own circles by the step added last, without the joint adjustment."""
     equal_models = [_alike(solution.model) for solution in result.solutions]
     weighted_models = [solution.model for solution in result.solutions]
     answers: dict[str, Answer | StcalError] = {}
@@ -101,14 +81,6 @@ def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
 def answer_of(run: RunResult) -> Answer:
     """Returns the answer of a run, group by group."""
     return Answer(run.target, tuple(solution.model for solution in run.solutions), run.calibration.scales)
-
-
-def _jointly(result: RunResult) -> CalibratedTarget:
-    """Returns the run's own target with three-point frames."""
-    joint = result.calibration.joint
-    if joint is None:
-        raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
-    return calibrated_target(joint, result.target, result.target_design, "three-point")
 
 
 def _alike(model: WorldModel) -> WorldModel:
@@ -147,14 +119,6 @@ def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera:
             )
     missing = [face for face in others if face not in faces]
     return _compared(name, faces, missing, found.scales, residual_rms_px(found.models, camera), None)
-
-
-def _last_row(name: str, result: RunResult) -> ComparedRow:
-    """Returns the row of the run's own method, with the board's least-squares residuals in each group."""
-    joint = result.calibration.joint
-    models = () if joint is None else joint.models
-    rms = residual_rms_px(models, result.calibration.camera)
-    return _compared(name, {}, [], result.calibration.scales, rms, None)
 
 
 def residual_rms_px(models: Sequence[GroupModel], camera: Camera) -> float:

@@ -354,15 +354,8 @@ class ReportRead(Part):
     summary: SummaryRead
 
     def names(self) -> list[tuple[str, str, int]]:
-        """Returns (name, group, circles) of the images in the database's order.
-
-        Raises
-        ------
-        KeyError
-            A group of images is missing.
-        ValueError
-            A group's initial pair is not of its images, or a name leads out of the folder of images.
-        """
+        """Returns (name, group, circles) of the images in the database's order; KeyError or ValueError if they are
+        damaged."""
         pairs = {entry.name: entry.pairs[0] for entry in self.groups}
         names = [(entry.name, entry.group, entry.circles) for entry in self.images]
         for name, _, _ in names:

@@ -83,8 +83,7 @@ class SavedRun(Brief):
 
     @property
     def target(self) -> CalibratedTarget:
-        """The calibrated target, as of :class:`~stcal.sfm.runs.result.RunResult`, with the covariances of
-        ``faces.json``; poses of groups are not kept."""
+        """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
         faces = self.faces
         labels = circle_labels(faces.circles)
         covariance = dict(
@@ -116,19 +115,12 @@ class SavedRun(Brief):
         return SigmaFactors(overall, circles, dots, printed, self.target_design.printed_ids())
 
     def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
-        """Returns the heights of the rims behind which the faces lie, by circle, and σ of all of them together, mm: 0
-        if they are stated. If no circle is listed, the faces are as seen."""
+        """Heights of the rims behind which the faces lie, by circle, and σ of all, mm, 0 if they are stated."""
         heights = dict(zip(circle_labels(self.faces.rim_mm), self.faces.rim_mm.values(), strict=True))
         return heights, self.report["summary"].get("rim_sigma_mm") or 0.0
 
     def report_as(self, part: type[ReportPart]) -> ReportPart:
-        """Returns the part of ``report.json`` that a command needs.
-
-        Raises
-        ------
-        InputError
-            It lacks what this version writes.
-        """
+        """Returns the part of ``report.json`` that a command needs."""
         try:
             return checked(self.report, part)
         except InputError as error:
@@ -150,13 +142,7 @@ AnyRun = SavedRun | RunResult | str | Path
 
 
 def folder_of(run: AnyRun) -> Path:
-    """Returns the folder of a run.
-
-    Raises
-    ------
-    InputError
-        No file of the run was kept.
-    """
+    """Returns the folder of a run; an error if no file of it was kept."""
     if isinstance(run, RunResult):
         if run.out is None:
             raise InputError("E-RUN-FOLDER", "run: in memory, no file of it was kept; run it with out=")
@@ -277,10 +263,7 @@ def _as_written(path: Path) -> Iterator[None]:
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
-    """Returns observations and corrected centres from ``labels.csv``.
-
-    ``names`` : (name, group, circles) of the images of the database; ``known`` : all labels of the designs.
-    """
+    """Observations and corrected centres from ``labels.csv``; ``names``: (name, group, circles) of the images."""
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
     for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
         if None in row.values():
@@ -319,36 +302,21 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedRun:
-    """The final adjustment of a run.
+    """The final adjustment of a run."""
 
-    ``state`` : groups in mm in the target frame, at the minimum, with σ as in the run; ``start`` : result of the run;
-    ``prior`` : of the intrinsics if they were adjusted.
-    """
-
-    state: Adjusted
-    start: CalibratedTarget
-    prior: CameraPrior | None
+    state: Adjusted  # groups in mm in the target frame, at the minimum, with σ as in the run
+    start: CalibratedTarget  # result of the run
+    prior: CameraPrior | None  # of the intrinsics if they were adjusted
 
 
 def read_target_model(run: SavedRun) -> ReadModel:
-    """Reads the adjusted model of a run, mm, target frame.
-
-    Raises InputError: it is missing or damaged.
-    """
+    """Reads the adjusted model of a run, mm, target frame."""
     ids = image_ids(run.observations)
     return read_model(run.folder / TARGET_MODEL, run.observations, ids, run.corrected_px, corrected_again=True)
 
 
 def adjusted_run(run: SavedRun) -> AdjustedRun:
-    """Repeats the final adjustment of a run, which moves nothing.
-
-    Raises
-    ------
-    InputError
-        The run's final model is missing or damaged.
-    ConvergenceError
-        The adjustment finds no minimum.
-    """
+    """Repeats the final adjustment of a run, which moves nothing."""
     read = read_target_model(run)
     models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
     start = CalibratedTarget(

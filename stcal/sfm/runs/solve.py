@@ -1,7 +1,4 @@
-"""The first stages of a run: detection in all images, and the solution of each group.
-
-A group is solved from labels to a corrected model: pairs, mapping, refinement. The result is cached by its inputs.
-"""
+"""The first stages of a run: detection in all images, and the solution of each group, which is cached by its inputs."""
 
 import hashlib
 import json
@@ -71,13 +68,7 @@ class DetectedImages(Brief):
 
 
 def require_no_calibration(out: str | Path) -> None:
-    """Refuses a folder for detections that holds a finished calibration.
-
-    Raises
-    ------
-    InputError
-        It holds one.
-    """
+    """Refuses a folder for detections that holds a finished calibration."""
     if (Path(out) / "faces.json").exists():
         raise InputError(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
@@ -85,13 +76,7 @@ def require_no_calibration(out: str | Path) -> None:
 
 
 def require_dots(board: BoardDesign | None, option: str) -> None:
-    """Refuses a board of corners for an option whose method finds dots.
-
-    Raises
-    ------
-    InputError
-        The board is one of corners; the message begins with the option.
-    """
+    """Refuses a board of corners for an option whose method finds dots."""
     if isinstance(board, CornerBoard):
         raise InputError(
             "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
@@ -100,15 +85,12 @@ def require_dots(board: BoardDesign | None, option: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """The subject of all stages of a run.
-
-    ``files`` : the photographs; ``folder`` : the claimed folder; ``board`` : without rows where there is none.
-    """
+    """The subject of all stages of a run."""
 
     files: ImageFiles
-    folder: RunFolder
+    folder: RunFolder  # claimed
     target: TargetDesign
-    board: BoardDesign
+    board: BoardDesign  # without rows where there is none
     options: RunOptions
     progress: Progress
 
@@ -150,17 +132,13 @@ _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px",
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupSolution:
-    """Solution of one group in a world without unit.
+    """Solution of one group in a world without unit."""
 
-    ``pairs`` : the ranking, the chosen pair first; ``model`` ; ``seeded`` : how the pair was registered; ``rounds`` :
-    number of rounds of refinement; ``left_out`` : image → reason; ``outliers`` : observations left out.
-    """
-
-    pairs: tuple[PairScore, ...]
+    pairs: tuple[PairScore, ...]  # the ranking, the chosen pair first
     model: WorldModel
-    seeded: str
-    rounds: int
-    left_out: dict[str, str]
+    seeded: str  # how the pair was registered
+    rounds: int  # of refinement
+    left_out: dict[str, str]  # reason by image
     outliers: tuple[Outlier, ...]
 
 
@@ -170,16 +148,7 @@ def usable_groups(
     board_alone: bool = False,
     needs_board: bool = True,
 ) -> tuple[dict[str, list[ImageObservations]], list[str]]:
-    """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped.
-
-    The others include groups whose images were all skipped. With ``board_alone``, groups need no face; without
-    ``needs_board``, no board.
-
-    Raises
-    ------
-    MappingError
-        No group can be solved: no image or one, no board, or no face in a whole group.
-    """
+    """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped."""
     lost: dict[str, list[Skipped]] = {}
     for file in skipped:
         # A folder that holds only copies is not a group.
@@ -252,14 +221,7 @@ def _left_out(error: StcalError) -> str:
 
 
 def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
-    """Refuses a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face, without
-    ``needs_board`` no board.
-
-    Raises
-    ------
-    MappingError
-        The group has one image, no board, or no face at all.
-    """
+    """Refuses a group that cannot be solved: of one image, without a needed board, or without a face."""
     where = f"group {group[0].group}"
     if len(group) < 2:
         raise MappingError(
@@ -282,15 +244,11 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False, ne
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Group:
-    """A group and all that its solution depends on.
-
-    ``skeleton`` : names of the images that are mapped first, among which the initial pair is chosen; ``matched`` :
-    (n, 2) indices of images to match, in the group.
-    """
+    """A group and all that its solution depends on."""
 
     images: list[ImageObservations]
-    skeleton: list[str]
-    matched: np.ndarray
+    skeleton: list[str]  # names of the images that are mapped first, among which the initial pair is chosen
+    matched: np.ndarray  # (n, 2) indices of images to match, in the group
     camera: Camera
     target: TargetDesign
     board: BoardDesign
@@ -382,11 +340,8 @@ def _odd_one_out(
 
 
 def wrong_file(images: Sequence[ImageObservations], camera: Camera, board: BoardDesign) -> Check | None:
-    """Returns a failed check that names what of a camera file is wrong; None if the dots of the board do not tell it.
-
-    The dots alone, whose places are known, tell the camera, also where groups cannot be solved, or residuals are so
-    large that tests of first order mislead. The file is wrong if another camera explains what it leaves as residuals.
-    """
+    """Returns a failed check that names what of a camera file is wrong by the dots of the board alone, whose places are
+    known: another camera explains what it leaves as residuals."""
     if not board.rows:
         return None
     try:
@@ -463,16 +418,8 @@ def solve_body(
     eccentricity: bool,
     progress: Progress,
 ) -> tuple[list[GroupSolution], list[str]]:
-    """Maps and refines the groups of a body that its faces of known shape have placed.
-
-    Returns the solutions, and the reasons why groups have none. Images that show no such face are resected by the
-    points that the others map.
-
-    Raises
-    ------
-    MappingError, ScaleError, ConvergenceError, DegenerateError
-        No group has a solution; the error of the first group is raised.
-    """
+    """Maps and refines the groups of a body that its faces have placed; returns the solutions, and why groups have
+    none. If there is no solution, the error of the first group is raised."""
     solutions: list[GroupSolution] = []
     errors: list[StcalError] = []
     groups = by_group(observations)
@@ -521,25 +468,17 @@ def unseen_circles(solutions: Sequence[GroupSolution], target: TargetDesign) -> 
 def solve_groups(
     observations: Sequence[ImageObservations],
     graph: ImageGraph,
-    scratch: Path,
-    cache: Path,
+    scratch: Path,  # a folder that is made and removed again
+    cache: Path,  # folder for what later runs take up
     camera: Camera,
     target: TargetDesign,
     board: BoardDesign,
     options: RunOptions,
     progress: Progress,
-    names: Collection[str] | None = None,
+    names: Collection[str] | None = None,  # groups to solve, all if None
 ) -> tuple[list[GroupSolution], list[str]]:
-    """Maps and refines group by group; returns the solutions, and the reasons why groups have none.
-
-    ``names`` : groups to solve, all if None; ``scratch`` : a folder that is made and removed again; ``cache`` : folder
-    for what later runs take up.
-
-    Raises
-    ------
-    MappingError, ScaleError, ConvergenceError, DegenerateError
-        No group has a solution; the error of the first group is raised.
-    """
+    """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
+    solution, the error of the first group is raised."""
     groups = _groups(observations, graph, camera, target, board, options, names)
     paths = [cache / f"group-{group.key()}.npz" for group in groups]
     found: list[GroupSolution | StcalError | None] = [kept(path, _stored) for path in paths]

@@ -260,10 +260,7 @@ def _boards(result: RunResult) -> Iterator[str]:
 
 
 def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
-    """Yields the number of checks with each verdict, and the checks that did not pass, the worst first.
-
-    Those that nobody can make possible, such as tests of circles where corners alone are seen, are in one line.
-    """
+    """Yields the number of checks with each verdict, and those that did not pass, the worst first."""
     yield f"checks: {count_verdicts([(check.verdict, check.remedy) for check in checks])}"
     if any(check.verdict in ("failed", "suspicious") for check in checks):
         yield f"  ({BY_CHANCE})"

@@ -1,8 +1,5 @@
-"""The folder of a run: results are written aside, and take the places of the earlier ones all together.
-
-They are written into a hidden folder inside, which is renamed when they are complete; from then on they are moved to
-their places one by one. Whoever opens the folder next finishes that if the process was killed meanwhile.
-"""
+"""The folder of a run: results are written into a hidden folder inside, which is renamed when they are complete, and
+take the places of the earlier ones. Whoever opens the folder next finishes that if the process was killed."""
 
 import os
 import shutil
@@ -42,13 +39,9 @@ class RunFolder:
 
 @contextmanager
 def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object]) -> Iterator[RunFolder]:
-    """Claims a run's folder; at the end of the block its results take the place of the earlier ones.
-
-    If the block raises, earlier results stay. Without earlier ones, detections and overlays are left to be looked at.
-    ``content`` : the marker; ``inputs`` : what the run reads, by the word for it; what is no path is ignored.
-
-    Raises InputError: the folder holds something else, an input, or a run in progress.
-    """
+    """Claims a run's folder; at the end of the block its results take the place of the earlier ones. If the block
+    raises, earlier results stay; without them detections and overlays are left to be looked at. ``content``: the
+    marker; ``inputs``: what the run reads, by the word for it; what is no path is ignored."""
     out = Path(out)
     length = len(os.fsencode(Path(real_place(out)) / LONGEST_DATABASE))
     if length > MOST_DATABASE_BYTES:
@@ -86,12 +79,8 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
 
 @contextmanager
 def added_results(out: Path) -> Iterator[Path]:
-    """Provides a folder for files that are added to a finished run at the end of the block, or replace some of its own.
-
-    No other command writes meanwhile. The PDF of a report that is replaced is removed.
-
-    Raises InputError: another process is writing there, or the folder is read-only.
-    """
+    """Provides a folder for files that are added to a finished run at the end of the block, while no other command
+    writes. The PDF of a report that is replaced is removed."""
     with _staged(out) as stage:
         yield stage
         marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")

@@ -12,16 +12,12 @@ from stcal.sfm.runs.transaction import RESULTS, complete_interrupted, files_belo
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """Differences of a run's folder from what the run of ``version`` wrote, as paths below the folder.
-
-    ``missing`` : files that are gone; ``changed`` : files whose content is another; ``added`` : files among the results
-    that the run did not make.
-    """
+    """Differences of a run's folder from what the run of ``version`` wrote, as paths below the folder."""
 
     version: str
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # files that are gone
     changed: tuple[str, ...]
-    added: tuple[str, ...]
+    added: tuple[str, ...]  # files among the results that the run did not make
 
     def notes(self, but: tuple[str, ...] = ()) -> list[str]:
         """Returns one note on all files but some that differ, or none."""

@@ -51,18 +51,12 @@ OPTION_RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class EllipseOptions:
-    """Limits for candidates.
+    """Limits for candidates."""
 
-    ``min_diameter_px``, ``max_diameter_px`` : diameter of the circle of the same area; if None, the smallest is
-    4.5 px, and 9 px in images over 8 megapixels;
-    ``min_axis_ratio`` : minor over major axis (cos 70° is 0.34; blur and pixels take some more);
-    ``min_contrast`` : inside against surroundings, as a fraction of the image's grey range.
-    """
-
-    min_diameter_px: float | None = None
+    min_diameter_px: float | None = None  # of the circle of the same area; None: 4.5, or 9 in images over 8 megapixels
     max_diameter_px: float = 450.0
-    min_axis_ratio: float = 0.2
-    min_contrast: float = 0.08
+    min_axis_ratio: float = 0.2  # minor over major axis (cos 70° is 0.34; blur and pixels take some more)
+    min_contrast: float = 0.08  # inside against surroundings, as a fraction of the image's grey range
 
     def __post_init__(self):
         require_fields(self, "options")
@@ -76,15 +70,11 @@ class EllipseOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipses:
-    """n candidates.
+    """n candidates."""
 
-    ``centre_px`` : (n, 2); ``shape_px`` : (n, 2, 2), symmetric, rim = centre + shape @ unit circle; ``contrast`` :
-    (n,) middle against surroundings, grey values of the 8-bit image, positive.
-    """
-
-    centre_px: np.ndarray
-    shape_px: np.ndarray
-    contrast: np.ndarray
+    centre_px: np.ndarray  # (n, 2)
+    shape_px: np.ndarray  # (n, 2, 2), symmetric, rim = centre + shape @ unit circle
+    contrast: np.ndarray  # (n,) middle against surroundings, grey values of the 8-bit image, positive
 
     def __post_init__(self):
         n = len(self.centre_px)
@@ -111,16 +101,14 @@ class Ellipses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """One level of the pyramid: ``image``, ``scale`` of its pixels in px of the full image, ``lowest`` diameter
-    sought, px of the level."""
+    """One level of the pyramid."""
 
     image: np.ndarray
-    scale: float
-    lowest: float
+    scale: float  # of its pixels in px of the full image
+    lowest: float  # diameter sought, px of the level
 
     def in_full(self, rows: list[tuple[float, ...]]) -> np.ndarray:
-        """Converts ellipses, rows (x, y, full axis 1, full axis 2, angle of axis 1 in deg), from the level to the
-        image."""
+        """Converts ellipses (x, y, full axis 1, full axis 2, angle of axis 1 in deg) from the level to the image."""
         table = np.array(rows).reshape(-1, 5)
         table[:, :2] = table[:, :2] * self.scale + (self.scale - 1) / 2
         table[:, 2:4] *= self.scale
@@ -140,8 +128,7 @@ class OutlineGates:
     longest: float
 
     def ellipse(self, contour: np.ndarray) -> tuple[float, ...] | None:
-        """Returns the ellipse of an outline within the limits, (x, y, full axis 1, full axis 2, angle of axis 1 in
-        degrees), or None."""
+        """Returns an ellipse within the limits, (x, y, full axes 1 and 2, angle of axis 1 in deg), or None."""
         if not self.shortest <= len(contour) <= self.longest:
             return None
         x, y, w, h = cv2.boundingRect(contour)
@@ -202,8 +189,7 @@ def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
 
 
 def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Returns the median grey value in the middle minus the median around, (n,); with opposite sign for dark
-    circles."""
+    """Returns the median grey value in the middle minus that around, (n,); with opposite sign for dark circles."""
     angle = np.arange(16) * (np.pi / 8)
     unit = np.column_stack([np.cos(angle), np.sin(angle)])
 
@@ -219,8 +205,7 @@ def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape
 def masks(
     level: Level, polarity: Polarity, threshold: float, options: EllipseOptions
 ) -> Iterator[tuple[np.ndarray, OutlineGates]]:
-    """Yields masks of blobs in one level, one for each window that circles of the level fit into, and the limits for
-    outlines in them."""
+    """Yields masks of blobs, one for each window that circles of the level fit into, and the limits for outlines."""
     smooth = cv2.GaussianBlur(level.image, (3, 3), 0)
     for window in WINDOWS_PX:
         highest = min(options.max_diameter_px / level.scale, window / WINDOW_OVER_DIAMETER)
@@ -300,23 +285,18 @@ MIN_HOMOGRAPHY_POINTS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """n ellipses in normalised ideal coordinates.
+    """n ellipses in normalised ideal coordinates."""
 
-    ``xy`` : (n, 2) centres; ``shape`` : (n, 2, 2), rim = xy + shape @ unit circle; ``radius`` : (n,) of equal area;
-    ``contrast`` : (n,) grey values; ``px`` : size of a pixel in these coordinates; ``tree`` : over ``xy``.
-    """
-
-    xy: np.ndarray
-    shape: np.ndarray
-    radius: np.ndarray
-    contrast: np.ndarray
-    px: float
-    tree: KDTree
+    xy: np.ndarray  # (n, 2) centres
+    shape: np.ndarray  # (n, 2, 2), rim = xy + shape @ unit circle
+    radius: np.ndarray  # (n,) of equal area
+    contrast: np.ndarray  # (n,) grey values
+    px: float  # size of a pixel in these coordinates
+    tree: KDTree  # over ``xy``
 
     @classmethod
     def of(cls, ellipses: Ellipses, camera: Camera) -> "Candidates":
-        """Returns the candidates of ellipses: lens distortion is removed from centres exactly, from shapes to first
-        order."""
+        """Removes lens distortion from centres exactly, from shapes to first order."""
         xy = camera.normalised_from_pixel(ellipses.centre_px)
         _, distorted_by_ideal = camera.distort_jacobian(xy)
         shape = np.linalg.solve(distorted_by_ideal, ellipses.shape_px / camera.focal[:, None])
@@ -336,18 +316,9 @@ class Candidates:
 def match_pattern(
     candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
 ) -> np.ndarray:
-    """Returns for each circle of a pattern the candidate at its predicted place with its predicted size and shape.
-
-    Parameters
-    ----------
-    image_from_plane : (3, 3) homography into normalised coordinates, or (k, 3, 3) of k patterns
-    xy_plane, radius : (m, 2), (m,) circles in the plane, or (k, m, 2), (k, m)
-    slack : factor on the position tolerance
-
-    Returns
-    -------
-    index : (m,) or (k, m) int, −1 if there is none
-    """
+    """Returns for each circle of a pattern the candidate at its place with its size and shape, (m,), −1 for none.
+    ``image_from_plane``: (3, 3) into normalised coordinates, ``xy_plane``: (m, 2), ``radius``: (m,), or k of each;
+    ``slack``: factor on the position tolerance."""
     predicted = apply_homography(image_from_plane, xy_plane)
     local = homography_jacobian(image_from_plane, xy_plane) * radius[..., None, None]
     size = np.sqrt(np.abs(np.linalg.det(local)))
@@ -368,25 +339,19 @@ def match_pattern(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grown:
-    """k grown patterns: ``index`` : (k, m) candidates of their circles, −1 if there is none; ``homography`` : (k, 3,
-    3) to normalised coordinates; ``holds`` : (k,) whether the match converged with four circles or more."""
+    """k grown patterns."""
 
-    index: np.ndarray
-    homography: np.ndarray
-    holds: np.ndarray
+    index: np.ndarray  # (k, m) candidates of their circles, −1 if there is none
+    homography: np.ndarray  # (k, 3, 3) to normalised coordinates
+    holds: np.ndarray  # (k,) whether the match converged with four circles or more
 
 
 def grow_matches(
     candidates: Candidates, index: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, rounds: int = 8
 ) -> Grown:
     """Alternates between fitting homographies to the matched circles and matching again, until nothing changes.
-
-    Parameters
-    ----------
-    index : (k, m) start, −1 if there is none
-    xy_plane, radius : (k, m, 2), (k, m) circles of each pattern; radius 0 behind the last circle of a shorter pattern,
-        with the place of an existing circle
-    """
+    ``index``: (k, m) start, −1 if there is none; ``xy_plane``: (k, m, 2); ``radius``: (k, m), 0 behind the last circle
+    of a shorter pattern, with the place of an existing circle."""
     index, there = index.copy(), radius > 0
     homography, holds = np.full((len(index), 3, 3), np.nan), np.zeros(len(index), bool)
     active = np.arange(len(index))

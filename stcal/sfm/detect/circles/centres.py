@@ -26,11 +26,8 @@ the image. Below it, this changed σ by 1 % only; it takes a tenth of the time o
 
 
 def correlation(chance: np.ndarray) -> float:
-    """Returns the factor by which correlation between pixels enlarges covariances; 1 without circles.
-
-    ``chance`` : (n,) squared harmonics of the residuals of n circles, over their expectation for independent pixels.
-    The mean of few squares may be small by chance. With ν degrees of freedom, the factor ν/(ν−2) keeps the expectation
-    of squared errors over variances at one (mean of the F distribution)."""
+    """Returns the factor by which correlation between pixels enlarges covariances; 1 without circles. ``chance``: (n,)
+    as :func:`_chance` gives it; ν/(ν−2) keeps expected squares over variances at one (F distribution)."""
     freedom = 2 * CHANCE_WAVES * len(chance)
     if not freedom:
         return 1.0
@@ -38,13 +35,9 @@ def correlation(chance: np.ndarray) -> float:
 
 
 def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
-    """Returns covariances of the centres, (n, 2, 2), for independent pixels, and :func:`_chance` over their noise.
-
-    The noise is that of the pixels that determine the centre, as errors are larger on the edge than beside it. The
-    covariance is S·H·Sᵀ, with H the inverse of the normal equations, and S⁻¹ the response of one step to a shift of the
-    image, as a share of the shift (Huber 1981, sec. 6.3). With exact derivatives the share would be 1. Robust weights
-    reduce it; a wide edge, or one that differs from the model, changes it.
-    """
+    """Returns covariances of the centres, (n, 2, 2), for independent pixels, and :func:`_chance` over their noise. It
+    is S·H·Sᵀ, with H the inverse of the normal equations, and S⁻¹ the share of a shift of the image that one step
+    responds with (Huber 1981, sec. 6.3)."""
     pull = fits.scores[:, 0] ** 2 + fits.scores[:, 1] ** 2
     weight = np.where(fits.real > 0, fits.weight, 1)
     share = pull / weight
@@ -65,11 +58,8 @@ def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _chance(fits: Fits, edge: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Returns the variance of a pixel from :data:`CHANCE_WAVES` harmonics of the residuals along the rim.
-
-    It is an estimate from orthonormal series (Phillips 2005), corrected for the degrees of freedom of the fitted
-    parameters. ``edge`` : amplitudes of the harmonics at the pixels; ``total`` : their weighted squares.
-    """
+    """Returns a pixel's variance from :data:`CHANCE_WAVES` harmonics (orthonormal series, Phillips 2005) along the rim.
+    ``edge``: amplitudes of the harmonics at the pixels; ``total``: their weighted squares."""
     wave = np.empty(edge.shape, np.complex64)
     wave.real, wave.imag = np.moveaxis(fits.direction(), 1, 0)
     double, wave = wave * wave, wave * edge
@@ -90,8 +80,7 @@ def _narrowest(fits: Fits) -> np.ndarray:
 
 
 def _exact_slope(fits: Fits, i: int, slope: np.ndarray) -> np.ndarray:
-    """Returns the derivatives of one model by the centre, (2, pixels): those of the step, ``slope``, and the change
-    of the distance's slope."""
+    """Returns derivatives by the centre, (2, pixels): ``slope`` of the step, and the change of the distance's slope."""
     on_unit, reduced = fits.on_unit[i, :, : slope.shape[1]], fits.reduced[i, : slope.shape[1]]
     inverse_shape = fits.inverse_shape[i].astype(np.float32)
     rho = np.maximum(np.hypot(*on_unit), np.float32(CUSP))
@@ -128,19 +117,11 @@ def measure_centres(
     image: np.ndarray,
     camera: Camera,
     ellipses: Ellipses,
-    neighbours: Ellipses,
+    neighbours: Ellipses,  # all candidates of the image; pixels of near ones are excluded
+    # (n,) patterns, whose circles share the factor for correlation; None: one pattern
     groups: np.ndarray | None = None,
 ) -> Centres:
-    """Measures ``ellipses`` in a grey image of any depth.
-
-    Parameters
-    ----------
-    image : (height, width) array, uint8 or uint16
-    ellipses : ellipses to measure
-    neighbours : all candidates of the image; pixels of near ones are excluded
-    groups : (n,) number of each ellipse's pattern; circles of one pattern share the factor for correlation between
-        pixels; one pattern if None
-    """
+    """Measures ``ellipses`` in a grey image of 8 or 16 bits."""
     focal = float(np.sqrt(camera.focal.prod()))
     rims = _fitted(image, camera, ellipses, neighbours)
     centre, uneven = rims.centre / focal, rims.uneven / focal
@@ -169,8 +150,7 @@ def measure_centres(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rims:
-    """n fitted ellipses, ideal px: ``centre`` : (n, 2); ``shape`` and ``covariance`` : (n, 2, 2) for independent
-    pixels; ``chance`` : (n,); others as in :class:`Centres`. Contrast and rim are zero if the fit failed."""
+    """n fitted ellipses, ideal px, covariances for independent pixels; contrast and rim are zero if the fit failed."""
 
     centre: np.ndarray
     shape: np.ndarray

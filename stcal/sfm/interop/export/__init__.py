@@ -21,16 +21,12 @@ ROOT = "target"
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A form of export.
-
-    ``suffix`` : suffix of its files; ``write`` : returns their content; ``lost`` :
-    results among faces, circles, σ and cameras that the files do not hold; ``read`` : returns the transforms of
-    :meth:`Content.statics` from a text, None for viewers, from which nothing is read.
-    """
+    """A form of export."""
 
     suffix: str
     write: Callable[[Content], str | bytes]
-    lost: str
+    lost: str  # results among faces, circles, σ and cameras that the files do not hold
+    # returns :meth:`Content.statics` from a text, None for viewers
     read: Callable[[str], Sequence[Static]] | None = None
 
 
@@ -104,10 +100,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
 
 
 def form_of(path: Path) -> str:
-    """Returns the form for the suffix of a path.
-
-    Raises InputError if no form has the suffix.
-    """
+    """Returns the form for the suffix of a path."""
     suffixes = {form.suffix: name for name, form in FORMS.items()}
     if path.suffix.lower() not in suffixes:
         raise InputError(

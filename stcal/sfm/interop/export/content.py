@@ -61,21 +61,16 @@ class Circle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """Content of an export.
+    """Content of an export."""
 
-    ``root`` : name of the target frame; ``camera`` : as the run refined it; ``faces`` : target_from_face;
-    ``covariances`` : of the faces, 6×6, empty if the run states none; ``photographs`` : in the run's order; ``rgb`` :
-    by face.
-    """
-
-    root: str
+    root: str  # name of the target frame
     run: SavedRun
-    camera: Camera
-    faces: dict[str, Rigid]
-    covariances: dict[str, np.ndarray]
+    camera: Camera  # as the run refined it
+    faces: dict[str, Rigid]  # target_from_face
+    covariances: dict[str, np.ndarray]  # of the faces, 6×6, empty if the run states none
     circles: tuple[Circle, ...]
     photographs: tuple[Photograph, ...]
-    rgb: dict[str, tuple[int, int, int]]
+    rgb: dict[str, tuple[int, int, int]]  # by face
 
     def of_face(self, face: str) -> list[Circle]:
         """Returns the circles of a face, in the order of the design."""
@@ -127,11 +122,7 @@ class Content:
 
 
 def content_of(run: SavedRun, root: str) -> Content:
-    """Returns the content of a run. ``root`` : name of the target frame.
-
-    Raises InputError if the name is invalid, two frames would have the same name, or the run's report is of another
-    version.
-    """
+    """Returns the content of a run; ``root``: name of the target frame."""
     if not root.isprintable() or root.split() != [root]:
         raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
     report = run.report_as(_Report)
@@ -174,10 +165,7 @@ def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
 
 
 def ellipsoid(circle: Circle, target_from_face: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Returns σ (3,) of a centre along the principal axes, and these axes as columns (3, 3) in the face's frame.
-
-    The circle must have a covariance.
-    """
+    """Returns σ (3,) of a centre along the principal axes, and these as columns (3, 3) in the face's frame."""
     turn = np.array(target_from_face.rotation)
     values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
     return np.sqrt(np.maximum(values, 0)), axes * [np.sign(np.linalg.det(axes)), 1, 1]

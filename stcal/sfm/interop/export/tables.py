@@ -11,14 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.poses.programs import (
-    Static,
-    fixed_joint,
-    messages,
-    ros1_launch,
-    ros2_launch,
-    static_of_joint,
-)
+from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, ros2_launch, static_of_joint
 from stcal.io.toml import load_yaml, opencv_matrix
 from stcal.sfm.interop.export.content import Content
 
@@ -34,7 +27,8 @@ def table(content: Content) -> str:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     for face, pose in content.faces.items():
-        turned = [*_wxyz(pose.rotation), *pose.rotation[:, 2].tolist()]
+        x, y, z, w = Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True).tolist()
+        turned = [w, x, y, z, *pose.rotation[:, 2].tolist()]
         sigma = content.face_sigma(face)
         sigma_cells = (
             [""] * 6 if sigma is None else [_digits(v) for v in (*(1e3 * sigma[1]), *(1e3 * np.degrees(sigma[0])))]
@@ -50,11 +44,8 @@ def table(content: Content) -> str:
 
 
 def opencv(content: Content) -> str:
-    """Returns YAML for ``cv2.FileStorage``, mm and rad.
-
-    It has a list of faces, each with its 4×4 pose, covariance, names of circles, centres (n, 3), radii and the
-    covariances (n, 9) of the centres.
-    """
+    """Returns YAML for ``cv2.FileStorage``, mm and rad: by face the 4×4 pose, covariance, and names, centres, radii and
+    covariances of circles."""
     lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
     lines += [
         f"reference_face: {_quoted(content.run.faces.reference_face)}",
@@ -76,11 +67,6 @@ def opencv(content: Content) -> str:
         matrix_lines = [line for name, values in matrices.items() for line in opencv_matrix(name, values)]
         lines.append(indent("\n".join(matrix_lines), "      "))
     return "\n".join(lines) + "\n"
-
-
-def _wxyz(rotation: np.ndarray) -> list[float]:
-    x, y, z, w = Rotation.from_matrix(np.array(rotation)).as_quat(canonical=True).tolist()
-    return [w, x, y, z]
 
 
 def _digits(value: float) -> str:
@@ -107,10 +93,7 @@ def urdf(content: Content) -> str:
 
 
 def xacro(content: Content) -> str:
-    """Returns the same as a macro with ``prefix``, ``parent`` and ``origin``.
-
-    It places the target anywhere, and more than once.
-    """
+    """Macro with ``prefix``, ``parent`` and ``origin``, which places the target anywhere, and more than once."""
 
     def prefixed(name: str) -> str:
         return "${prefix}" + _escaped(name)

@@ -169,10 +169,7 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
 
 
 def _lens(content: Content) -> dict:
-    """Returns a glTF camera with the field of view, and all intrinsics as extras.
-
-    glTF supports neither distortion nor a principal point off the centre.
-    """
+    """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
     camera = content.camera
     parameters = {
         "model": camera.colmap_model,
