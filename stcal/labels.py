@@ -63,10 +63,7 @@ PARSED = (CircleLabel, DotLabel)
 def parse_label(text: str) -> Label:
     """Parses the text of a label.
 
-    Raises
-    ------
-    InputError
-        The text is neither ``face:circle`` nor ``board:row:column``.
+    Raises InputError: the text is neither ``face:circle`` nor ``board:row:column``.
     """
     if isinstance(text, Label):
         return text
@@ -90,10 +87,7 @@ def parse_labels(texts: Iterable[str]) -> tuple[Label, ...]:
 def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
     """Parses each text with :func:`parse_label`; all labels must be of circles on the target.
 
-    Raises
-    ------
-    InputError
-        A text is no ``face:circle``.
+    Raises InputError: a text is no ``face:circle``.
     """
     labels = []
     for label in map(parse_label, texts):
@@ -106,10 +100,7 @@ def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
 def dot_cells(labels: Iterable[Label]) -> np.ndarray:
     """Returns row and column of the board's dots, (n, 2) int.
 
-    Raises
-    ------
-    InputError
-        A label belongs to a circle of the target.
+    Raises InputError: a label belongs to a circle of the target.
     """
     cells = []
     for label in labels:

@@ -41,19 +41,12 @@ class Likeness:
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
     """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest gap.
 
-    Parameters
-    ----------
-    xy, other_xy : (n, 2) and (m, 2) centres, mm
-    radius, other_radius : (n,) and (m,) mm
-    in_place : (n,) places among the other's, optional
-        Places of the same circles, if both are parts of one pattern. The motion that leaves the circles in place is
-        excluded.
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm;
+    ``in_place`` : (n,) places among the other's, optional Places of the same circles, if both are parts of one pattern.
+    The motion that leaves the circles in place is excluded.
 
-    Returns
-    -------
-    Likeness or None
-        None if no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more
-        than ``MOST_CIRCLES``.
+    Returns None if no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of
+    more than ``MOST_CIRCLES``.
     """
     centres, other_centres = (
         points[:, 0] + 1j * points[:, 1] for points in (np.asarray(xy, float), np.asarray(other_xy, float))
@@ -108,17 +101,10 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
 
     The motions that are tried put two circles of the pattern onto two circles of the other one.
 
-    Parameters
-    ----------
-    xy, other_xy : (n, 2) and (m, 2) centres, mm
-    radius, other_radius : (n,) and (m,) mm
-    same : bool
-        True if both are the same pattern. The motion that leaves it in place is then excluded.
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm; ``same`` :
+    True if both are the same pattern. The motion that leaves it in place is then excluded.
 
-    Returns
-    -------
-    set of frozenset of int
-        Places in ``xy``; each set has ``MIN_COMMON`` or more.
+    Returns places in ``xy``; each set has ``MIN_COMMON`` or more.
     """
     fits, _ = _motions(xy, radius, other_xy, other_radius, same)
     return {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0)}
@@ -127,16 +113,10 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
 def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
     """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, radii included.
 
-    Parameters
-    ----------
-    xy, other_xy : (n, 2) and (m, 2) centres, mm
-    radius, other_radius : (n,) and (m,) mm
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm.
 
-    Returns
-    -------
-    list of (c, 2) int
-        Places of the same circle in ``xy`` and in ``other_xy``, for each rigid motion under which ``MIN_COMMON`` or
-        more coincide, the most circles first. A part of another result is omitted.
+    Returns places of the same circle in ``xy`` and in ``other_xy``, for each rigid motion under which ``MIN_COMMON`` or
+    more coincide, the most circles first. A part of another result is omitted.
     """
     fits, nearest = _motions(xy * [1, -1], radius, other_xy, other_radius, same=False)
     found: list[np.ndarray] = []

@@ -30,19 +30,10 @@ def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarr
     The square pixel as the edge's normal sees it is a trapezoid, the convolution of two boxes. The wider one, and with
     it an edge along the rows, is integrated exactly; the narrower one, like the blur, as a Gaussian of its variance.
 
-    Parameters
-    ----------
-    distance : (m, ...) array
-        Distances of the pixels' centres from the edges, positive on the bright side, px.
-    normal : (m, 2) array
-        Normals of the edges.
-    variance : (m,) array
-        Variances of the blur, px².
+    ``distance`` : (m, ...) distances of the pixels' centres from the edges, positive on the bright side, px;
+    ``normal`` : (m, 2) normals of the edges; ``variance`` : (m,) variances of the blur, px².
 
-    Returns
-    -------
-    tuple of (m, ...) arrays
-        The share; its derivatives by distance and by variance.
+    Returns the share; its derivatives by distance and by variance.
     """
     narrow, wide = (side.reshape(-1, *(1,) * (distance.ndim - 1)) for side in np.sort(np.abs(normal), axis=1).T)
     sigma = np.sqrt(variance.reshape(narrow.shape) + narrow**2 / 12)
@@ -101,14 +92,8 @@ def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) ->
     pixel: in an edge along the rows it is one for all profiles, in a turned one it averages out. Its first harmonic is
     what is modelled.
 
-    Parameters
-    ----------
-    distance : (m, p, s) array
-        Distances of the pixels from the edges.
-    rise : (m,) array
-        Change of the distance from one pixel to the next.
-    gradient : (m, p, s) array
-        Derivative of the grey values by the place of the edge.
+    ``distance`` : (m, p, s) distances of the pixels from the edges; ``rise`` : (m,) change of the distance from one
+    pixel to the next; ``gradient`` : (m, p, s) derivative of the grey values by the place of the edge.
     """
     angle = -2 * np.pi * distance / rise[:, None, None]
     return gradient[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)

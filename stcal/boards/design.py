@@ -94,10 +94,7 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
 
     ``corners_mm`` : (n, 4, 2), NaN for tags of no known place
 
-    Raises
-    ------
-    InputError
-        The message begins with ``where`` and names the tag or the tags.
+    Raises InputError: the message begins with ``where`` and names the tag or the tags.
     """
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
@@ -308,10 +305,7 @@ class AsymmetricCirclesDesign:
     def radii_mm(self) -> np.ndarray:
         """Return the radii, (rows·columns,), mm.
 
-        Raises
-        ------
-        InputError
-            The design has none.
+        Raises InputError: the design has none.
         """
         if self.radius_mm is None:
             raise InputError("E-BOARD-RADIUS", "asymmetric circles: no radius; radius_mm needed")

@@ -578,23 +578,14 @@ def _growth(
 
     Parameters
     ----------
-    pull : (n, k, 2) array
-        Derivatives of a crossing by the pixels of its window.
-    residual : (n, k) array
-        Grey values.
-    place : (n, k) array
-        Profiles that the pixels belong to, px along the edges; those of both edges have different numbers.
-    noise : (n,) array
-        Variances of the pixels.
-    profiles : int
-        Number of profiles on each edge.
-    blur : float
-        Variance of the blur, px².
+    pull : (n, k, 2) derivatives of a crossing by the pixels of its window
+    residual : (n, k) grey values
+    place : (n, k) profiles that the pixels belong to, px along the edges; those of both edges have different numbers
+    noise : (n,) variances of the pixels
+    profiles : number of profiles on each edge
+    blur : variance of the blur, px²
 
-    Returns
-    -------
-    float
-        At least 1; the median over the windows, as a single one tells little.
+    Returns at least 1; the median over the windows, as a single one tells little.
     """
     n = len(pull)
     number = np.rint(place).astype(int)

@@ -170,10 +170,8 @@ class TagsFile(Sized):
 def load_tags(path: str | Path, what: str) -> TagsFile:
     """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML).
 
-    Raises
-    ------
-    InputError
-        The file is unreadable or invalid; the message begins with ``what``, and names file, place and reason.
+    Raises InputError: the file is unreadable or invalid; the message begins with ``what``, and names file, place and
+    reason.
     """
     try:
         content = bundle_content(text_of(read_bytes(path, SETTINGS_BYTES)))
@@ -366,10 +364,7 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
 def board_content(path: str | Path) -> dict[str, Any] | None:
     """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither.
 
-    Raises
-    ------
-    InputError
-        The file is unreadable.
+    Raises InputError: the file is unreadable.
     """
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
@@ -427,10 +422,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
 def require_sizes(data: TagsFile, where: str) -> None:
     """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are.
 
-    Raises
-    ------
-    InputError
-        The message names the tag or the tags, and how to correct the file.
+    Raises InputError: the message names the tag or the tags, and how to correct the file.
     """
     require_millimetres(tag_sides(data, where), data.unusual_size, where)
     corners = [place if (place := tag.corners(where)) is not None else np.full((4, 2), np.nan) for tag in data.tag]

@@ -73,10 +73,7 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
 
     Without bundles, standalone tags have their sizes and no places.
 
-    Raises
-    ------
-    InputError
-        Keys are missing or unknown, there are several bundles, or tags do not lie in one plane.
+    Raises InputError: keys are missing or unknown, there are several bundles, or tags do not lie in one plane.
     """
     data = validated(content, _BundlesFile, where)
     if len(data.tag_bundles) > 1:
@@ -174,11 +171,8 @@ def kalibr_board_of(
     Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
     grids do not state the radius of circles, which is determined from images.
 
-    Raises
-    ------
-    InputError
-        Keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is not
-        asymmetric.
+    Raises InputError: keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is
+    not asymmetric.
     """
     kind = content["target_type"]
     if kind == "aprilgrid":

@@ -62,11 +62,8 @@ class _Place(PoseEntry):
 def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
     """Read a board file of any kind, of one board or several (form: ``data_layout.md``).
 
-    Raises
-    ------
-    InputError
-        As :func:`~stcal.boards.file.load_flat_board`; or boards of a set look alike in images, or have a rotational
-        symmetry.
+    Raises InputError: as :func:`~stcal.boards.file.load_flat_board`; or boards of a set look alike in images, or have a
+    rotational symmetry.
     """
     content = board_content(path)
     if content is None or content.get("type") != SET:

@@ -153,11 +153,6 @@ def require_fields(instance: object, what: str, **least: float) -> None:
 
     Numbers must be finite, words in fields of a Literal type must be among those that it lists. Arrays are left to
     :func:`freeze`. ``least`` : lowest value of a number, by field.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``what`` and names the field and what is needed.
     """
     for name, ((admits, words), is_choice) in _rules(type(instance)).items():
         value = getattr(instance, name)
@@ -204,22 +199,12 @@ def frozen(
     Parameters
     ----------
     values : array-like
-    shape : tuple of int or None, optional
-        Required shape; ``None`` in it admits any length. If it is not given, any shape is accepted.
-    what : str
-        Name of the values in messages.
+    shape : required shape; ``None`` in it admits any length. If it is not given, any shape is accepted
+    what : name of the values in messages
     dtype : data type
-    finite : bool
-        Whether floats must be finite; if not, NaN stands for values that are not known.
+    finite : whether floats must be finite; if not, NaN stands for values that are not known
 
-    Returns
-    -------
-    array of ``shape``
-
-    Raises
-    ------
-    InputError
-        If the shape differs, the values are no numbers, or a float array holds a value that is not finite.
+    Raises InputError: the shape differs, the values are no numbers, or a float array holds a value that is not finite.
     """
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")
@@ -250,18 +235,8 @@ def freeze(
 ) -> None:
     """Replace a field of a frozen dataclass by its read-only copy; to be called in ``__post_init__``.
 
-    Parameters
-    ----------
-    instance : dataclass instance
-    field : str
-        Name of the field.
-    shape, what, dtype :
-        See :func:`frozen`.
-
-    Raises
-    ------
-    InputError
-        As :func:`frozen`.
+    ``instance`` : dataclass instance; ``field`` : name of the field; ``shape``, ``what``, ``dtype`` : see
+    :func:`frozen`.
     """
     object.__setattr__(instance, field, frozen(getattr(instance, field), shape, what, dtype))
 

@@ -410,10 +410,8 @@ def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool =
 
     ``fisheye`` : k1 to k4 of an equidistant lens, or with ``tangential`` k1, k2, p1, p2, k3, k4.
 
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, or no supported model has them. The message begins with ``where``.
+    Raises InputError: the number of coefficients is wrong, or no supported model has them. The message begins with
+    ``where``.
     """
     distortion = np.zeros(COEFFICIENTS)
     if fisheye:
@@ -440,11 +438,6 @@ def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool =
 
 def require_lens(flat: np.ndarray, width: float | None, height: float | None, where: str) -> None:
     """Refuse parameters (16,), see :data:`PARAMETER_NAMES`, and sizes that no camera has. None: a size is not stated.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where``.
     """
     if not np.isfinite(flat).all():
         raise InputError("E-CAMERA-NOT-FINITE", f"{where}: a camera parameter is not a finite number; correct it")

@@ -431,16 +431,10 @@ def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
     """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
 
-    Parameters
-    ----------
-    xyz_a, xyz_b : (n, 3) arrays, n ≥ 3, not collinear
-    weights : (n,) array, optional
-        Not negative; the points of positive weight must not be collinear.
+    ``xyz_a``, ``xyz_b`` : (n, 3) arrays, n ≥ 3, not collinear; ``weights`` : (n,) not negative; the points of positive
+    weight must not be collinear.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three points, or collinear ones.
+    Raises DegenerateError: fewer than three points, or collinear ones.
     """
     return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
 
@@ -453,10 +447,7 @@ def align_similarity(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray |
 def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Affine:
     """Return a_from_b with twelve parameters by linear least squares; arguments as :func:`align_rigid`.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than four points, or b's points are coplanar to rounding.
+    Raises DegenerateError: fewer than four points, or b's points are coplanar to rounding.
     """
     a, b, w = _checked(xyz_a, xyz_b, weights, 4)
     mean_a, mean_b = w @ a, w @ b

@@ -80,20 +80,13 @@ def component_variances(
 
     Parameters
     ----------
-    residuals
-        (m, a) residuals near a solution.
-    jacobian
-        (m, a, k) derivative of the residuals by the parameters solved for; dependent columns do no harm.
-    known
-        (m, a, a) known part of the covariances.
-    free
-        (f, m, a, a) components, each to be multiplied by its variance.
-    first
-        (f,) initial variances.
-    bounds
-        (f,) smallest and largest variances.
-    caution
-        Redundancy of each variance that is not counted.
+    residuals : (m, a) residuals near a solution
+    jacobian : (m, a, k) derivative of the residuals by the parameters solved for; dependent columns do no harm
+    known : (m, a, a) known part of the covariances
+    free : (f, m, a, a) components, each to be multiplied by its variance
+    first : (f,) initial variances
+    bounds : (f,) smallest and largest variances
+    caution : redundancy of each variance that is not counted
     """
     jacobian = _independent(jacobian)
 

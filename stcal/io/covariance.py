@@ -53,16 +53,10 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
     A covariance is finite, symmetric and without negative eigenvalues, up to rounding. The eigenvalues of the
     correlation matrix are tested, since the units of the rows differ.
 
-    Parameters
-    ----------
-    matrices : (m, n, n) array
-    rows : names of the rows, and the variances that count as zero
-    definite : True if eigenvalues must be positive, since the matrix will be inverted
+    ``matrices`` : (m, n, n) array; ``rows`` : names of the rows, and the variances that count as zero; ``definite`` :
+    True if eigenvalues must be positive, since the matrix will be inverted.
 
-    Returns
-    -------
-    Fault or None
-        None if all matrices are covariances.
+    Returns None if all matrices are covariances.
     """
     size = matrices.shape[-1]
     nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)

@@ -162,10 +162,7 @@ def require_written(
     most : largest difference of one value: rounding by the decimals of the file
     unit : unit of the values
 
-    Raises
-    ------
-    ConvergenceError
-        The file cannot be read again, or gives other values.
+    Raises ConvergenceError: the file cannot be read again, or gives other values.
     """
     difference = _difference(path, read, reported)
     if not difference <= most:

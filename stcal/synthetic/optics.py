@@ -116,19 +116,14 @@ def defocused(
 
     Parameters
     ----------
-    shares : list of (h, w) arrays
-        Sharp image of each outline, by squares of which ``cells`` make a pixel's side.
-    planes : list of (3,) arrays
-        A point of each plane, near the disc, camera frame, mm.
-    normal : (3,) array
-        Normal of the planes, camera frame.
-    corner_px : tuple of int
-        Pixel (x, y) in the corner of the images.
+    shares : list of (h, w) arrays; sharp image of each outline, by squares of which ``cells`` make a pixel's side
+    planes : list of (3,) arrays; a point of each plane, near the disc, camera frame, mm
+    normal : (3,) normal of the planes, camera frame
+    corner_px : pixel (x, y) in the corner of the images
     cells : int
     camera : Camera
     lens : ThinLens
-    blur_px : float
-        σ of the Gaussian blur that follows, which decides how many points of the lens are taken.
+    blur_px : σ of the Gaussian blur that follows, which decides how many points of the lens are taken
 
     Notes
     -----

@@ -414,14 +414,8 @@ def seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
 
     Target, boards and camera centres stay the same. The camera model is COLMAP's OPENCV_FISHEYE.
 
-    Parameters
-    ----------
-    scene : Scene
-        Scene made with :func:`wide_options`.
-    field_deg : float
-        Field of view over the diagonal, without distortion.
-    seed : int
-        Seed of the random turns.
+    ``scene`` : scene made with :func:`wide_options`; ``field_deg`` : field of view over the diagonal, without
+    distortion; ``seed`` : seed of the random turns.
     """
     original, rng = scene.camera, np.random.default_rng([seed, 9])
     half = np.radians(field_deg) / 2

@@ -241,10 +241,7 @@ def of_parts(
         camodocal's MEI
     width, height : image size, px; 0 if the file states none
 
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, or values are impossible.
+    Raises InputError: the number of coefficients is wrong, or values are impossible.
     """
     camera = camera_from_opencv(lens, given, kind == "equidistant", width, height, source)
     if not abs(skew) < abs(camera.focal[0]):

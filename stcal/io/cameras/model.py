@@ -253,10 +253,7 @@ def camera_from_opencv(
     width, height : image size, px; 0 if the file states none
     path : camera file, for messages
 
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, no supported model has them, or values are impossible.
+    Raises InputError: the number of coefficients is wrong, no supported model has them, or values are impossible.
     """
     distortion, kind = opencv_lens(given, fisheye, f"camera file {path}", tangential)
     return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None, Path(path))

@@ -124,10 +124,8 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
 
     A warning lists them. Frames that are blurred more than others are left out.
 
-    Raises
-    ------
-    InputError
-        The video cannot be read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be written.
+    Raises InputError: the video cannot be read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be
+    written.
     """
     video, folder, every = Path(video), Path(folder), checked_every(every)
     written: list[tuple[Path, int, float]] = []
