@@ -432,8 +432,7 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
 
 @lru_cache(maxsize=256)
 def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, same: bool) -> Likeness | None:
-    """Returns the similarity of two patterns, given as the bytes of their arrays so that it can be cached: the same
-    design is often made again."""
+    """Returns the similarity of two patterns, as bytes for the cache: the same design is often made again."""
     places, radii, other_places, other_radii = map(np.frombuffer, (xy, radius, other_xy, other_radius))
     in_place = np.arange(len(radii)) if same else None
     return whole_likeness(places.reshape(-1, 2), radii, other_places.reshape(-1, 2), other_radii, in_place)

@@ -49,10 +49,7 @@ def implausible(lengths: Iterable[Length]) -> Iterator[Length]:
 
 
 def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> None:
-    """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right.
-
-    Raises InputError: the message names the first one, what is possible, and the likely unit.
-    """
+    """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right."""
     wrong = None if stated else next(implausible(lengths), None)
     if wrong is None:
         return

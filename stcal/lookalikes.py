@@ -77,10 +77,7 @@ def _order(likeness: Likeness) -> tuple[float, float]:
 
 
 def _fitted(own, radius, other, other_radius) -> Likeness | None:
-    """Fits a motion to pairs of circles by least squares; centres are complex numbers.
-
-    Returns the motion without scale if all circles then coincide, else that with scale, or None if they never do.
-    """
+    """Returns the motion that makes all circles (complex centres) coincide, without scale if possible; None if none."""
     centred, target = own - own.mean(), other - other.mean()
     factor = (centred.conj() @ target) / (abs(centred) ** 2).sum()
     for change in (factor / abs(factor), factor):
@@ -132,8 +129,7 @@ def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
 
 
 def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the masks of circles that coincide and the nearest circles of the other pattern, both (motions, n), for
-    all motions that put two circles onto two and let ``MIN_COMMON`` coincide."""
+    """Returns masks and nearest circles (motions, n) of the motions by two circles that let enough coincide."""
     n, m = len(xy), len(other_xy)
     k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
     p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
@@ -157,8 +153,7 @@ def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray
 
 
 def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool):
-    """Returns the circles that coincide and the nearest circles, both (motions, n), for motions that put two circles
-    onto two."""
+    """Returns the circles that coincide and the nearest ones, (motions, n), for motions of two onto two."""
     turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)

@@ -117,8 +117,7 @@ def _flat(values: np.ndarray) -> np.ndarray:
 
 
 def _sums(values: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Returns the sums (m + 1, …) of values (m, …) over the rows from each on, and last the sum weighted by ``along``
-    (m, 1)."""
+    """Returns the sums (m + 1, …) of values (m, …) from each row on; the last is weighted by ``along`` (m, 1)."""
     weighted = np.einsum("r,r...->...", along[:, 0], values)
     return np.concatenate([np.flip(np.cumsum(np.flip(values, 0), 0), 0), weighted[None]])
 

@@ -314,8 +314,7 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
 
 
 def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return level, distance from the line and use (s, p, a) of the pixels about sides of cells, in p rows or columns
-    across the line, and the change of the distance (s,) from one pixel to the next."""
+    """Return level, distance from the line and use (s, p, a) of pixels, and the distance's rise (s,) by pixel."""
     each, sigma = np.arange(len(pieces.tag)), sigma[pieces.tag]
     along = pieces.end - pieces.start
     length = np.linalg.norm(along, axis=1)
@@ -344,8 +343,7 @@ def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.nd
 
 
 def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
-    """Return what evenly spaced lines say, for each tag and direction: whether they move with the phase, and scatter
-    otherwise."""
+    """Return what evenly spaced lines say by tag and direction: how they move with the phase, and scatter otherwise."""
     n = len(outer.blur)
     place = 2 * np.arange(cells + 1) / cells - 1
     sign, place = np.tile([-1.0, 1.0], cells + 1), np.repeat(place, 2)

@@ -111,10 +111,7 @@ def _numbered(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> np
 
 
 def _refined(grey: np.ndarray, grid: np.ndarray) -> Crossings:
-    """Return the corners to a few hundredths of a pixel; the detectors are off by up to half a pixel in slanted views.
-
-    The first windows are large enough for blurred edges; the second are so small that lens distortion bends no edge.
-    """
+    """Return the corners to hundredths of a pixel: by large windows, for blur, then by small ones, for distortion."""
     window = _window(grid)
     margin = MARGIN * min(window, MOST_AT_FIRST) + LEAST_MARGIN
     first = np.floor(np.maximum(grid.min((0, 1)) - margin, 0)).astype(int)
@@ -132,10 +129,7 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> Crossings:
 
 
 def _by_area(grey: np.ndarray, grid: np.ndarray) -> Crossings:
-    """Return the corners by the areas of black and white in their windows, or unchanged where these do not fit.
-
-    Where edges lie along the pixel rows, gradients place all corners by up to 0.02 px to one side.
-    """
+    """Return the corners by the areas of black and white: gradients place those along pixel rows 0.02 px aside."""
     along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
     half = int(min(_window(grid), MOST_BY_AREA))
     clear = np.linalg.norm(along, axis=2).min(1)
@@ -285,11 +279,7 @@ class _Foretold:
 
 
 def _foretold(squares: np.ndarray, corners: np.ndarray) -> _Foretold:
-    """Return the places of corners as predicted by the corners around them, (n, 2) px.
-
-    ``squares`` : (n, 2) places on the board in squares. The deviations from a homography of the whole view come from
-    the lens and a bent board. They are smooth, and are modelled as linear among the corners around each.
-    """
+    """Return the places (n, 2), px, that the neighbours predict for corners at ``squares`` (n, 2) of the board."""
     image_from_squares = _robust_homography(squares, corners)
     base = apply_homography(image_from_squares, squares)
     step = np.linalg.svd(homography_jacobian(image_from_squares, squares), compute_uv=False)[:, 1]
@@ -315,11 +305,7 @@ def _robust_homography(squares: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _windows(board: CharucoDesign) -> tuple[float, float]:
-    """Return half the sides of both windows in squares: clear of the tags, and of the tags' cells.
-
-    White and the tags' black border lie alike on both sides of a corner. Windows are upright in the image: only their
-    half diagonals are limited.
-    """
+    """Return half the sides, in squares, of windows whose diagonals are clear of the tags, and of the tags' cells."""
     white = (1 - board.marker_mm / board.square_mm) / 2
     cell = board.marker_mm / board.square_mm / (dictionary_of(board.dictionary).markerSize + 2)
     return white / np.sqrt(2), (white + cell) / np.sqrt(2)
@@ -337,8 +323,7 @@ def _gradient(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Corners:
-    """Corners as measured, ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2). ``seen`` : (n,) False if there is
-    none in its window."""
+    """Corners, ``xy_px`` (n, 2), ``covariance_px2`` (n, 2, 2); ``seen`` (n,) is False without one in the window."""
 
     xy_px: np.ndarray
     covariance_px2: np.ndarray
@@ -354,10 +339,7 @@ class _Corners:
 
 
 def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half: np.ndarray) -> _Corners:
-    """Return the corners near ``start`` (n, 2): points through which the edges in a window of ``half`` (n,) px pass.
-
-    The weighted squares of the gradients' components towards the corner are least (Förstner & Gülch 1987).
-    """
+    """Return the points near ``start`` (n, 2) where edges meet, in windows of ``half`` (n,) (Förstner & Gülch 1987)."""
 
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
         slope = np.stack([window.sampled(part, xy) for part in gradient], axis=2)
@@ -380,11 +362,7 @@ def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half
 
 
 def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> _Corners:
-    """Return the saddles near ``start`` (n, 2) of a smooth image, by a parabola in a window of ``half`` (n,) px.
-
-    A blurred corner has no edges that meet, but is still a saddle: the image is symmetric about it. The fit's residuals
-    give σ.
-    """
+    """Return the saddles near ``start`` (n, 2), by parabolas in windows of ``half`` (n,) px; residuals give σ."""
 
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
         weight = window.weight(xy, grey.shape)
@@ -438,11 +416,7 @@ class _Window:
 
 
 def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1.0) -> _Corners:
-    """Return the corners at which the steps end.
-
-    ``step`` : returns steps (n, 2) and covariances (n, 2, 2); ``reach`` : largest distance from ``start`` (n, 2) of a
-    corner, in ``half`` sides (n,) of its window.
-    """
+    """Return where steps (n, 2), with covariances, end: within ``reach`` half sides of the window from ``start``."""
     n = len(start)
     xy, covariance, seen = start.copy(), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
     for side in np.unique(half).tolist():

@@ -93,8 +93,6 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
     """Refuse tags whose sides are in another unit than mm, and tags that lie on each other.
 
     ``corners_mm`` : (n, 4, 2), NaN for tags of no known place
-
-    Raises InputError: the message begins with ``where`` and names the tag or the tags.
     """
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
@@ -303,10 +301,7 @@ class AsymmetricCirclesDesign:
         return tuple((int(v), int(u)) for v, u in (cells[row * self.columns + place] for row, place in self.rings))
 
     def radii_mm(self) -> np.ndarray:
-        """Return the radii, (rows·columns,), mm.
-
-        Raises InputError: the design has none.
-        """
+        """Return the radii, (rows·columns,), mm."""
         if self.radius_mm is None:
             raise InputError("E-BOARD-RADIUS", "asymmetric circles: no radius; radius_mm needed")
         return np.full(self.rows * self.columns, self.radius_mm)

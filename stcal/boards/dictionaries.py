@@ -61,10 +61,7 @@ def known_dictionary(name: str) -> str:
 
 
 def dictionary_of(name: str):
-    """Return the dictionary of ``cv2.aruco`` with this name, full or as of :func:`known_dictionary`.
-
-    Raises InputError: the name is unknown.
-    """
+    """Return the dictionary of ``cv2.aruco`` with this name, full or as of :func:`known_dictionary`."""
     if not hasattr(cv2.aruco, name):
         try:
             name = known_dictionary(name)

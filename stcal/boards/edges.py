@@ -355,12 +355,7 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
 
 
 def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the cells behind the border move offset and slope (m, 2) of edges in the mean, and (m, 2, 2) the
-    covariance of this shift.
-
-    What the blur brings from a white cell into the border is not in the model of one edge. A cell is white or black
-    with equal probability, and independent of others.
-    """
+    """Return mean and covariance of the shift (m, 2) of offset and slope by random cells behind the border."""
     m, cells = len(design), frame.cells.reshape(-1)
     blur = np.sqrt(variance + PIXEL_VARIANCE)[:, None, None]
     brought = rise * ndtr(-(distance + frame.cell.reshape(m, 1, 1)) / blur)
@@ -414,9 +409,7 @@ def _noise_of(residual, distance, weight) -> np.ndarray:
 
 
 def _growth_of_tags(residual, offset, weight, noise, good, shape) -> np.ndarray:
-    """Return the factors (m,) by which edges that are not straight increase the variances, for each tag. A factor is
-    the sum of the squared pulls of the profiles on the offset, divided by its expectation from the noise of single
-    pixels."""
+    """Return factors (m,) of variances by edges that are not straight, for each tag: squared pulls over expected."""
     of_profile = ((weight * offset * residual).sum(2) ** 2).sum(1)
     profiles = weight.any(2).sum(1)
     expected = noise * (weight * offset**2).sum((1, 2)) * (1 - 2 / np.maximum(profiles, 3))
@@ -556,8 +549,7 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
 
 
 def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
-    """Return the sum over classes of distances of P Pᵀ, (n, 2, 2), with P the summed pulls (n, k, 2) of the pixels in a
-    class."""
+    """Return the sum over classes of distances of P Pᵀ, (n, 2, 2); P : the summed pulls (n, k, 2) of a class."""
     n, most = len(pull), round(2 * half / BIN_PX)
     bins = 2 * most + 1
     row = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most + bins * np.arange(n)[:, None]

@@ -168,11 +168,7 @@ class TagsFile(Sized):
 
 
 def load_tags(path: str | Path, what: str) -> TagsFile:
-    """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML).
-
-    Raises InputError: the file is unreadable or invalid; the message begins with ``what``, and names file, place and
-    reason.
-    """
+    """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML)."""
     try:
         content = bundle_content(text_of(read_bytes(path, SETTINGS_BYTES)))
     except (OSError, UnicodeDecodeError):
@@ -362,10 +358,7 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
 
 
 def board_content(path: str | Path) -> dict[str, Any] | None:
-    """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither.
-
-    Raises InputError: the file is unreadable.
-    """
+    """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither."""
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
         return tomllib.loads(text)
@@ -420,10 +413,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
 
 
 def require_sizes(data: TagsFile, where: str) -> None:
-    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are.
-
-    Raises InputError: the message names the tag or the tags, and how to correct the file.
-    """
+    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are."""
     require_millimetres(tag_sides(data, where), data.unusual_size, where)
     corners = [place if (place := tag.corners(where)) is not None else np.full((4, 2), np.nan) for tag in data.tag]
     require_tags([(tag.dictionary, tag.id) for tag in data.tag], np.array(corners), True, where)

@@ -170,9 +170,6 @@ def kalibr_board_of(
 
     Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
     grids do not state the radius of circles, which is determined from images.
-
-    Raises InputError: keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is
-    not asymmetric.
     """
     kind = content["target_type"]
     if kind == "aprilgrid":

@@ -217,10 +217,7 @@ def _outermost(found: dict[tuple[str, int], list[np.ndarray]]) -> dict[tuple[str
 
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Return the saturated share (n,) of the white half a cell outside of tags with ``cells`` cells per side.
-
-    Of tags with a negative number of cells it is the white half a cell inside.
-    """
+    """Return the saturated share (n,) of the white half a cell outside of tags; inside for negative ``cells``."""
     if not len(corners):
         return np.zeros(0)
     middle = corners.mean(1, keepdims=True)
@@ -235,10 +232,7 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
 def _refined(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners and covariances; a corner that moves too far, or lacks a visible edge, is not refined.
-
-    ``white`` : (n,) True for tags that are white inside their edges and black outside.
-    """
+    """Return refined corners and covariances where all edges are visible; ``white`` : (n,) white inside the edges."""
     if white.any():
         refined, covariance = np.array(corners), np.zeros((len(corners), 8, 8))
         for colour, picture in ((~white, grey), (white, 255 - grey)):

@@ -203,8 +203,6 @@ def frozen(
     what : name of the values in messages
     dtype : data type
     finite : whether floats must be finite; if not, NaN stands for values that are not known
-
-    Raises InputError: the shape differs, the values are no numbers, or a float array holds a value that is not finite.
     """
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")

@@ -110,10 +110,7 @@ class Minimum(Generic[S, L]):
     steps: int
 
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
-        """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ².
-
-        Raises ConvergenceError: it is no minimum; the message begins with ``what`` and ends with ``remedy``.
-        """
+        """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ²."""
         if not (self.converged | (self.promised <= accepted)).all():
             raise ConvergenceError(
                 "E-NO-MINIMUM",

@@ -62,8 +62,7 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
 
 
 def _solved(block: np.ndarray, cross: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (a, k + 1) of one symmetric block by Cholesky's factor: its inverse takes three times as
-    long."""
+    """Return the solutions (a, k + 1) of one symmetric block by Cholesky; an inverse takes three times as long."""
     both = np.column_stack([cross, right])
     factor, fault = dpotrf(block, lower=True)
     return np.linalg.solve(block, both) if fault else dpotrs(factor, both, lower=True)[0]

@@ -308,8 +308,6 @@ def two_minima(
     failure : message of the ConvergenceError
     planar : True if all points lie in the plane. If the two starts then end in the same minimum, they may have been on
         the same side, and the mirror image of the minimum is tried as a further start
-
-    Raises ConvergenceError: no minimum is reached.
     """
     poses = start.plus(mirrored(start, target_from_plane)) if len(start) == 1 else start
     sigma = 1.0

@@ -46,10 +46,7 @@ def _no_shift() -> Any:
 
 
 def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
-    """Return the largest |R Rᵀ − 1| of a matrix with these rows, infinite if it is left-handed.
-
-    Plain Python numbers, since transforms are made by the thousand, and for nine numbers numpy takes ten times as long.
-    """
+    """Return the largest |R Rᵀ − 1| of rows, infinite if left-handed; numpy takes ten times as long for so few."""
     (a, b, c), (d, e, f), (g, h, i) = x, y, z
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         return math.inf

@@ -82,10 +82,7 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
 
 
 def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
-    """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`.
-
-    Raises InputError: the message states measured and needed values; the caller adds whose covariance it is.
-    """
+    """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
     if matrix.shape != (size, size):
         raise InputError(
             "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'a single number'}, {size}×{size} needed"

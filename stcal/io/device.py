@@ -188,10 +188,7 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
 
 @contextmanager
 def frames_of(video: str | Path) -> Iterator[Iterator[np.ndarray]]:
-    """Open a video file, and return its frames, grey.
-
-    Raises InputError: it cannot be read, or has no frame.
-    """
+    """Open a video file, and return its frames, grey."""
     device = _device(str(video))
     try:
         frames = _every(device)
@@ -242,10 +239,7 @@ def _every(device: cv2.VideoCapture) -> Generator[np.ndarray, None, None]:
 
 
 def _newest(device: cv2.VideoCapture, what: str) -> Generator[np.ndarray, None, None]:
-    """Yield the newest picture of a camera or a stream, and leave out those that come meanwhile.
-
-    Raises InputError: no picture comes for ``PATIENCE_S``.
-    """
+    """Yield the newest picture of a camera or a stream, and leave out those that come meanwhile."""
     ready, ended = threading.Condition(), threading.Event()
     newest: list[np.ndarray] = []
 

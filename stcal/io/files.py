@@ -110,10 +110,7 @@ def unwritable(path: Path, error: OSError) -> InputError:
 
 
 def save(path: Path, content: str | bytes) -> None:
-    """Write a file atomically; a missing folder is made.
-
-    Raises InputError: the file cannot be written.
-    """
+    """Write a file atomically; a missing folder is made."""
     if not path.name or path.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: is a folder; the name of a file needed")
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
@@ -130,10 +127,7 @@ def save(path: Path, content: str | bytes) -> None:
 
 
 def require_new_folder(out: Path, images: Path) -> None:
-    """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written.
-
-    Raises InputError: the message names the reason.
-    """
+    """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
     if real_place(images) in (real_place(out), *real_place(out).parents):
@@ -196,10 +190,7 @@ def require_same(path: str | Path, read: Callable[[], object], content: object) 
 
 
 def save_folder(out: Path, files: dict[str, str]) -> None:
-    """Write all files into a new folder, or none of them.
-
-    Raises InputError: the files cannot be written.
-    """
+    """Write all files into a new folder, or none of them."""
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
         made = Path(folder) / "made"
@@ -259,11 +250,7 @@ PLAIN = {float, int, bool, type(None)}
 
 
 def _indented(value, line: str) -> str:
-    """Return the text of ``json.dumps`` with ``indent=1``, but faster.
-
-    The standard writer handles one number after the other; here lists of numbers, and lists of such lists, are encoded
-    at once. ``line`` : line break with the present indent.
-    """
+    """Return ``json.dumps`` with ``indent=1``, faster: lists of numbers at once; ``line`` : break and indent."""
     inner = line + " "
     if isinstance(value, dict):
         items = [f"{_key(key)}: {_indented(item, inner)}" for key, item in value.items()]
@@ -291,8 +278,6 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
     """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
 
     ``outputs``, ``inputs`` : (option, path); an input may be a folder.
-
-    Raises InputError: the message names the output, and what it would replace.
     """
     places: dict[Path, str] = {}
     for option, path in outputs:

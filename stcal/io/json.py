@@ -186,10 +186,7 @@ ByName = Annotated[str, "name"]
 
 
 def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
-    """Return the object in a JSON file; messages name the kind of file, ``what``, and the ``remedy``.
-
-    Raises InputError: the file is unreadable, not JSON, or not an object with named keys.
-    """
+    """Return the object in a JSON file; messages name the kind of file, ``what``, and the ``remedy``."""
     where = f"{what} {path}".lstrip()
     try:
         content = json.loads(text_of(read_bytes(path, TABLE_BYTES)))
@@ -207,11 +204,7 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
 
 
 def checked(content: dict[str, Any], model: type[F]) -> F:
-    """Return the content of a file as a ``model``; keys that the model does not know are ignored.
-
-    Raises InputError: the file has another format, lacks a key or holds an invalid value; the message names place and
-    reason.
-    """
+    """Return the content of a file as a ``model``; keys that the model does not know are ignored."""
     try:
         return model.model_validate(content, extra="ignore")
     except ValidationError as error:

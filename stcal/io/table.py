@@ -486,10 +486,7 @@ def _other_form(
 def _points_of_analyzer(
     used: Sequence[tuple[int, str]], comments: Sequence[str], where: str, quaternions: Order
 ) -> Table | None:
-    """Return the points of SpatialAnalyzer, a name and three numbers on each line; None for any other table.
-
-    Columns are ``name``, and ``collection``, ``group``, ``target`` where all names have these three parts.
-    """
+    """Return the points of SpatialAnalyzer, a name of one or three parts and three numbers each; None for others."""
     matches = [_COMMA_POINT.fullmatch(line.strip()) for _, line in used]
     commas = all(matches) and any("," in match[k] for match in matches if match for k in (2, 3, 4))
     if not commas:

@@ -75,10 +75,7 @@ def pdf_of(page: str) -> bytes:
 
 
 def require_pdf() -> None:
-    """Refuse, before the work, if no PDF can be made.
-
-    Raises InputError: the message names the missing library, and how to install it.
-    """
+    """Refuse, before the work, if no PDF can be made."""
     pdf_of("<p></p>")
 
 

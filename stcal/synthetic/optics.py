@@ -155,10 +155,7 @@ def defocused(
 
 
 def _moved(share: np.ndarray, source_from_square: np.ndarray) -> np.ndarray:
-    """Returns the image taken from the places that an affine map (2, 3) of its squares gives.
-
-    cv2 rounds places to 1/32 square. Opposite points of the lens err oppositely.
-    """
+    """Returns the image at places that an affine map (2, 3) gives; cv2 rounds these to 1/32 square."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(share, source_from_square, share.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
 

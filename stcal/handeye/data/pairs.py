@@ -420,10 +420,7 @@ class Motions:
         return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
 
     def with_log(self, method: str) -> "Motions":
-        """Returns the motions that satisfy :meth:`has_log`.
-
-        Raises DegenerateError: fewer than two motions do.
-        """
+        """Returns the motions that satisfy :meth:`has_log`."""
         good = self.has_log()
         if good.sum() < 2:
             raise DegenerateError(

@@ -42,8 +42,6 @@ class RobotPoses:
 
         The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
         the ends of names; poses without names, by order. The last result is empty where images are matched by name.
-
-        Raises InputError: a name fits two images, or poses without names are not as many as the images.
         """
         if not self.images:
             if len(names) != len(self.base_from_flange):
@@ -107,9 +105,6 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
 
     ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
     ``statements`` : the user's statements about what a file of another program does not state itself.
-
-    Raises InputError: missing columns, values that are not finite or quaternions that are not of unit length, named by
-    line, or an image that has two rows.
     """
     path, statements = Path(path), statements or Said()
     poses = read_robot(path, statements, "image", quaternions)

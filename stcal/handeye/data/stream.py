@@ -52,10 +52,7 @@ class Stream:
 
     @classmethod
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
-        """Returns the stream of samples that may be in any order.
-
-        Raises InputError: fewer than two samples, or two samples of one time.
-        """
+        """Returns the stream of samples that may be in any order."""
         if len(times) < 2:
             raise InputError(
                 "E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream"

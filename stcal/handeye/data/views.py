@@ -226,10 +226,7 @@ def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
 
 
 def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
-    """Returns the rows of the corners of each plane that has enough of them, and board_from_plane, with Z the normal.
-
-    Adjusted corners leave their plane by a little. A plane therefore ends only where the next corner is far above it.
-    """
+    """Returns the rows of the corners of each plane with enough of them, and board_from_plane, Z the normal."""
     normals, planes = view.normals(), []
     extent = np.linalg.norm(np.ptp(view.xyz_board, axis=0))
     open_rows = np.ones(len(view), bool)

@@ -257,8 +257,6 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
     """Return the supported camera model that is nearest to a lens over the image.
 
     ``lens`` : lens to approximate; ``width``, ``height`` : image size, px.
-
-    Raises InputError: the lens projects nearly no ray into the image.
     """
     rays, pixels, share = _rays(lens, width, height)
     straight = _best(lens, rays, pixels, share, (width, height), False)
@@ -320,10 +318,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
 def _fitted(
     model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int], turn: bool
 ) -> tuple[Camera, Rigid]:
-    """Fit one model by least squares; weights grow with the radius, since outer rays represent a larger area.
-
-    Returns the camera, and camera_from_lens, the identity without ``turn``.
-    """
+    """Return the fitted model and the axes' turn; weights grow with the radius, as outer rays represent more area."""
     about = lens.project(np.array([[0, 0, 1], [SMALL, 0, 1], [0, SMALL, 1]]))
     focal = np.linalg.norm(about[1:] - about[0], axis=1) / SMALL
     start = Camera(*size, focal, about[0], np.zeros(12), FISHEYE in model)

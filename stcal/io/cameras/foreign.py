@@ -125,10 +125,7 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
 
 
 def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
-    """Return the camera of a COLMAP database, or the one of number ``choice``; the file is opened read-only.
-
-    Raises InputError: there is no camera, there are several and no choice, or the model is unknown.
-    """
+    """Return the camera of a COLMAP database, or the one of number ``choice``; the file is opened read-only."""
     try:
         # Without its log a database is read as it stands: SQLite would write files beside it.
         how = "mode=ro" if _has_log(path) else "mode=ro&immutable=1"
@@ -167,10 +164,7 @@ def numbered(cameras: Collection[str], choice: str) -> str:
 
 
 def one_of(names: list[str], choice: str, source: str) -> str:
-    """Return the name of the camera ``choice`` of a file, or of its only camera.
-
-    Raises InputError: there is no camera, the choice is unknown, or there are several cameras and no choice.
-    """
+    """Return the name of the camera ``choice`` of a file, or of its only camera."""
     if not names:
         raise InputError("E-CAMERA-NONE", f"camera file {source}: no camera in it, 1 needed")
     if choice not in names and (choice or len(names) > 1):
@@ -194,10 +188,7 @@ def require_finite(numbers, source: str) -> None:
 
 
 def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str) -> CameraModel | ForeignLens:
-    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
-
-    Raises InputError: the number of coefficients is wrong, or values are impossible.
-    """
+    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor."""
     if len(given) not in (12, 14) or not given[8:].any():
         return camera_from_opencv(lens, given, False, width, height, source)
     camera_from_opencv(lens, given[:8], False, width, height, source)  # refuses impossible values
@@ -219,8 +210,6 @@ def of_skewed(
     """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, or a foreign lens if it has skew.
 
     ``skew`` : px, u = fx x + skew y + cx.
-
-    Raises InputError: the number of coefficients is wrong, or values are impossible.
     """
     if abs(skew) <= SQUARE * abs(lens[0]):
         return camera_from_opencv(lens, given, False, width, height, source)
@@ -240,8 +229,6 @@ def of_parts(
     kind : perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
         camodocal's MEI
     width, height : image size, px; 0 if the file states none
-
-    Raises InputError: the number of coefficients is wrong, or values are impossible.
     """
     camera = camera_from_opencv(lens, given, kind == "equidistant", width, height, source)
     if not abs(skew) < abs(camera.focal[0]):
@@ -341,10 +328,7 @@ def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
 
 
 def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
-    """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2).
-
-    Raises InputError: the name is unknown, or numbers are missing.
-    """
+    """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2)."""
     match = SPLINED.fullmatch(name)
     if match is None:
         raise InputError(

@@ -114,10 +114,7 @@ SAYS_LENS = {
 
 
 def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) -> str:
-    """Return the kind of lens: perspective, equidistant, or unified.
-
-    Raises InputError: it is another one, or two keys contradict each other.
-    """
+    """Return the kind of lens: perspective, equidistant, or unified; refuse others, and keys that disagree."""
     kinds = {"xi": "unified"} if xi else {}
     for name, value in said.items():
         word = plain("" if value is None else value)

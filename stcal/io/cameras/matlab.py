@@ -69,11 +69,7 @@ def is_mat(content: bytes) -> bool:
 
 
 def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
-    """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras.
-
-    Raises InputError: the file is of version 7.3 (HDF5), has objects in place of structures, no camera, or several and
-    no choice.
-    """
+    """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras."""
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
@@ -103,8 +99,6 @@ def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
 
     SciPy follows any other type into foreign memory, which ends the process. ``data`` : elements in a row; ``order`` :
     ``<`` or ``>`` for the order of bytes; ``arrays`` : whether arrays may be among them.
-
-    Raises ValueError: an element is damaged.
     """
     at = count = 0
     while at < len(data):
@@ -146,10 +140,7 @@ def _require_array(data: bytes, order: str) -> None:
 
 
 def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of ``toStruct(cameraParameters)`` or ``toStruct(cameraIntrinsics)``, as a structure or as JSON.
-
-    Raises InputError: the lens is a fisheye lens, or a field is missing.
-    """
+    """Return the camera of ``toStruct(cameraParameters)`` or ``toStruct(cameraIntrinsics)``, as a structure or as JSON."""
     unread = {key: _plain_value(value) for key, value in values.items() if key not in TAKEN}
     require_known(unread, source, HARMLESS)
     if "MappingCoefficients" in values:

@@ -47,8 +47,6 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
 
     ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of the camera in a file
     of several.
-
-    Raises InputError: the file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
     """
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
@@ -100,10 +98,7 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
 
 
 def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple[int, int] | None) -> Camera:
-    """Return the camera of a file; ``size`` is taken where the file states none.
-
-    Raises InputError: no size is known.
-    """
+    """Return the camera of a file; ``size`` is taken where the file states none."""
     width, height = size or (0, 0)
     if not (model.width or width) or not (model.height or height):
         raise InputError(

@@ -52,10 +52,7 @@ class _Frame:
 
 
 def checked_every(every: str | int) -> str | int:
-    """Return ``auto`` or the number of frames.
-
-    Raises InputError: neither of them.
-    """
+    """Return ``auto`` or the number of frames."""
     if every == AUTO:
         return AUTO
     with contextlib.suppress(ValueError):

@@ -72,8 +72,6 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
     """Return the rotations in the columns that begin with a prefix; None if there are none.
 
     ``rotation`` : name of the convention, from ``--rotation``, for angles whose columns leave it open.
-
-    Raises InputError: only some columns of a rotation exist, values are no rotation, or the convention must be given.
     """
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:

@@ -113,10 +113,7 @@ def read_ros2_commands(text: str) -> list[Static]:
 
 
 def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it.
-
-    Raises InputError: a name has white space, at which ``roslaunch`` would split it.
-    """
+    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it."""
     lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
     for static in statics:
         names = static.parent, static.child
@@ -207,10 +204,7 @@ def from_roll_pitch_yaw(angles) -> np.ndarray:
 
 
 def require_form(form: str, forms: Collection[str]) -> None:
-    """Refuses a form of ``--export`` that is not one of ``forms``.
-
-    Raises InputError: the form is unknown; the message names the known ones.
-    """
+    """Refuses a form of ``--export`` that is not one of ``forms``."""
     if form not in forms:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(forms)} needed")
 
@@ -236,10 +230,7 @@ class ImageLine:
 
 
 def image_lines(text: str, where: str) -> list[ImageLine]:
-    """Return the images of ``images.txt``, also of one from which empty lines were removed.
-
-    Raises InputError: a line is neither an image's nor a list of points; the message names it.
-    """
+    """Return the images of ``images.txt``, also of one from which empty lines were removed."""
     images: list[ImageLine] = []
     pending: tuple[int, list[float], str] | None = None  # an image whose second line is to come
     for number, line in enumerate(text.splitlines(), 1):

@@ -77,8 +77,6 @@ def one_source(
     out.
 
     Two tables of the package's own are joined as tables.
-
-    Raises InputError: as in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
     if second is None:
         return source, ()
@@ -207,9 +205,6 @@ def read_input(
     ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``statements`` :
     the user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose
     joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
-
-    Raises InputError: a file is missing or not of the required form, one file too many was given, or no image shows the
-    board.
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
@@ -294,10 +289,7 @@ def _require_unsaid(statements: Said, where: str) -> None:
 
 
 def setup_of(statements: Said, told: str | None, where: str) -> Setup:
-    """Returns the setup that the user states, or that a file states, or eye-in-hand.
-
-    Raises InputError: the user and the file contradict each other.
-    """
+    """Returns the setup that the user states, or that a file states, or eye-in-hand."""
     if statements.setup and told and statements.setup != told:
         raise InputError(
             "E-OPTION-CONTRADICTS", f"{where}: of a setup {told}, --setup {statements.setup}; leave the option out"
@@ -329,10 +321,7 @@ def _from_images(
     timing: Timing | None,
     arm: Arm | None = None,
 ) -> HandEyeInput:
-    """Returns the pairs of all images that show the board and have a pose.
-
-    Raises InputError: no image shows the board, or no image has a pose.
-    """
+    """Returns the pairs of all images that show the board and have a pose."""
     design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
     at_images = robot_at_images(robot, [file.name for file in files], timing)
@@ -406,10 +395,7 @@ def dry_run(
     timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> list[str]:
-    """Returns lines on how the inputs are understood, without looking for the board in images.
-
-    Raises InputError: for the reasons given in :func:`read_input`.
-    """
+    """Returns lines on how the inputs are understood, without looking for the board in images."""
     if isinstance(source, Path) and source.is_dir():
         return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, statements, timing, robot)
     inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)

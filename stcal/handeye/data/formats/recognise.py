@@ -74,8 +74,6 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
     better messages.
 
     ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
-
-    Raises InputError: the message says what is wrong with the file, or names the formats that are read.
     """
     if path.is_dir():
         raise InputError("E-POSES-NOT-FOUND", f"{path}: a folder; one file needed: {KNOWN}")
@@ -113,10 +111,7 @@ def _numbers(line: str) -> list[float] | None:
 
 
 def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: int) -> tuple[np.ndarray, tuple]:
-    """Returns the numbers (m, count) of all lines, and their places.
-
-    Raises InputError: a line holds something else; the message names it.
-    """
+    """Returns the numbers (m, count) of all lines, and their places; refuses a line that holds something else."""
     values = []
     for number, line in file.lines:
         row = of_line(line)
@@ -144,11 +139,7 @@ def _of_universal(file: File) -> Content:
 
 
 def _of_tum(file: File) -> Content:
-    """Returns poses from lines of timestamp tx ty tz qx qy qz qw. A comment may state another order of the quaternion.
-    Times in whole nanoseconds without such a comment, as in EuRoC, leave the order open.
-
-    Raises InputError: a row occurs twice, a quaternion is not of unit length, or its order must be stated.
-    """
+    """Returns poses of lines timestamp tx ty tz qx qy qz qw; a comment, or --rotation, may state another order."""
     values, places = _table_of(file, _numbers, TUM)
     names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in file.lines)
     comments = (line for line in file.text.splitlines() if is_comment(line))
@@ -226,10 +217,7 @@ def _of_npy(file: File) -> Content:
 
 
 def _of_npz(file: File) -> Content:
-    """Returns the poses of an archive of arrays. Names of arrays that are not numbers are passed over.
-
-    Raises InputError: the file is damaged, or larger than any such file is when unpacked.
-    """
+    """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
     arrays: dict[str, Any] = {}
     others = []
     try:
@@ -259,10 +247,7 @@ def _of_npz(file: File) -> Content:
 
 
 def _array(data: bytes, where: str) -> np.ndarray | list[str]:
-    """Returns the array of an npy file, or its strings, which are mostly names of images.
-
-    Raises InputError: the file is damaged, or holds something else.
-    """
+    """Returns the array of an npy file, or its strings, which are mostly names of images."""
     stream = io.BytesIO(data)
     try:
         array = np.load(stream, allow_pickle=False)
