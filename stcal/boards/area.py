@@ -203,37 +203,29 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
     """
     square = np.broadcast_to(cells * SQUARE, outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
-    bright = _bright(grey, image_from_grid, outer, cells)
+    middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
+    xy = apply_homography(image_from_grid, middle).astype(np.float32)
+    level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
+    bright = (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
     pieces = _pieces(image_from_grid, bright, cells)
     lines = _offsets(grey, pieces, outer, cells)
     return _scatter(lines, outer, cells)
 
 
-def _bright(grey: np.ndarray, image_from_grid: np.ndarray, outer: OuterLines, cells: int) -> np.ndarray:
-    """Return the cells (n, row, column) that are bright in their middle."""
-    middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
-    xy = apply_homography(image_from_grid, middle).astype(np.float32)
-    level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
-    return (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pieces:
-    """Sides of cells between dark and bright: ``tag``, ``axis`` (0 : lines of one x), ``line`` and ``sign`` (s,), +1
-    where the next cell is bright; ``along`` (s,) place on the line, -1 to 1; ``start``, ``end`` (s, 2), px; ``normal``
-    (s, 2) towards the next cell; ``lean`` (s,) how far the cell's other sides run along the line for each px across it;
-    ``cell`` (s,) the distance to the next line, px."""
+    """s sides of cells between dark and bright."""
 
     tag: np.ndarray
-    axis: np.ndarray
+    axis: np.ndarray  # 0: lines of one x
     line: np.ndarray
-    sign: np.ndarray
-    along: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-    normal: np.ndarray
-    lean: np.ndarray
-    cell: np.ndarray
+    sign: np.ndarray  # +1 where the next cell is bright
+    along: np.ndarray  # place on the line, -1 to 1
+    start: np.ndarray  # (s, 2) px
+    end: np.ndarray  # (s, 2) px
+    normal: np.ndarray  # (s, 2) towards the next cell
+    lean: np.ndarray  # how far the cell's other sides run along the line for each px across it
+    cell: np.ndarray  # distance to the next line, px
 
 
 def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pieces:
@@ -263,15 +255,13 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Offsets:
-    """Offsets of lines from the grid, px: ``offset``, ``variance`` (n, 2, lines, 2), of both signs apart, and
-    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen. ``along`` : (n, 2, lines, 2) mean place on the
-    line of the sides used; ``passed`` : (n, 2), by direction."""
+    """Offsets of lines from the grid, px, of both signs apart; NaN where a line is not seen."""
 
-    offset: np.ndarray
-    variance: np.ndarray
-    by_sampling: np.ndarray
-    along: np.ndarray
-    passed: np.ndarray
+    offset: np.ndarray  # (n, 2, lines, 2)
+    variance: np.ndarray  # (n, 2, lines, 2)
+    by_sampling: np.ndarray  # (n, 2, lines, 2, 2)
+    along: np.ndarray  # (n, 2, lines, 2) mean place on the line of the sides used
+    passed: np.ndarray  # (n, 2), by direction
 
 
 def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> _Offsets:

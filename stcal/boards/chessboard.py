@@ -224,16 +224,21 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
         return None
     squares = board.xy_mm()[ids] / board.square_mm
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)
-    small, large = _windows(board)
+    # Half the sides of upright windows, in squares, whose diagonals are clear of the tags, and of the tags' cells:
+    # white and a tag's black border lie alike on both sides of a corner.
+    white = (1 - board.marker_mm / board.square_mm) / 2
+    cell = board.marker_mm / board.square_mm / (dictionary_of(board.dictionary).markerSize + 2)
+    small, large = white / np.sqrt(2), (white + cell) / np.sqrt(2)
     for _ in range(2):
         foretold = _foretold(squares, corners)
         blurred = _saddles(smooth, foretold.xy_px, _half_px(large, foretold))
         corners = blurred.xy_px
-    sharp = _edges_meet(_gradient(smooth), corners, _half_px(small, foretold))
+    gradient = tuple(cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
+    sharp = _edges_meet(gradient, corners, _half_px(small, foretold))
     along = np.swapaxes(homography_jacobian(_robust_homography(squares, corners), squares), 1, 2)
     start, clear = sharp.otherwise(blurred).xy_px, np.sqrt(2) * small * foretold.step_px
     by_area = crossings(grey, start, along, _half_px(small, foretold), clear)
-    measured = _Corners(by_area.xy_px, by_area.covariance_px2, by_area.seen).otherwise(sharp).otherwise(blurred)
+    measured = by_area.otherwise(sharp).otherwise(blurred)
     good = measured.seen & _foretold(squares, measured.xy_px).agrees(measured.xy_px)
     if good.sum() < LEAST_CORNERS:
         return None
@@ -304,41 +309,12 @@ def _robust_homography(squares: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return fit_homography(squares, corners) if found is None else found
 
 
-def _windows(board: CharucoDesign) -> tuple[float, float]:
-    """Return half the sides, in squares, of windows whose diagonals are clear of the tags, and of the tags' cells."""
-    white = (1 - board.marker_mm / board.square_mm) / 2
-    cell = board.marker_mm / board.square_mm / (dictionary_of(board.dictionary).markerSize + 2)
-    return white / np.sqrt(2), (white + cell) / np.sqrt(2)
-
-
 def _half_px(share: float, foretold: _Foretold) -> np.ndarray:
     """Return half the sides (n,) of the corners' windows, whole px."""
     return np.rint(share * foretold.step_px).clip(LEAST_WINDOW_PX, MOST_WINDOW_PX).astype(int)
 
 
-def _gradient(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of an image by x and y, grey values per px."""
-    return cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32), cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Corners:
-    """Corners, ``xy_px`` (n, 2), ``covariance_px2`` (n, 2, 2); ``seen`` (n,) is False without one in the window."""
-
-    xy_px: np.ndarray
-    covariance_px2: np.ndarray
-    seen: np.ndarray
-
-    def otherwise(self, other: "_Corners") -> "_Corners":
-        """Return these corners, those that are not seen as ``other`` has them."""
-        return _Corners(
-            np.where(self.seen[:, None], self.xy_px, other.xy_px),
-            np.where(self.seen[:, None, None], self.covariance_px2, other.covariance_px2),
-            self.seen | other.seen,
-        )
-
-
-def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half: np.ndarray) -> _Corners:
+def _edges_meet(gradient: tuple[np.ndarray, ...], start: np.ndarray, half: np.ndarray) -> Crossings:
     """Return the points near ``start`` (n, 2) where edges meet, in windows of ``half`` (n,) (Förstner & Gülch 1987)."""
 
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
@@ -361,7 +337,7 @@ def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half
     return _found(step, start, half, MOST_FROM_SADDLE)
 
 
-def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> _Corners:
+def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> Crossings:
     """Return the saddles near ``start`` (n, 2), by parabolas in windows of ``half`` (n,) px; residuals give σ."""
 
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
@@ -415,7 +391,7 @@ class _Window:
         return cv2.remap(image, x, y, cv2.INTER_LINEAR).astype(float)
 
 
-def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1.0) -> _Corners:
+def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1.0) -> Crossings:
     """Return where steps (n, 2), with covariances, end: within ``reach`` half sides of the window from ``start``."""
     n = len(start)
     xy, covariance, seen = start.copy(), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
@@ -429,4 +405,4 @@ def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1
                 break
         seen[own] = np.linalg.norm(xy[own] - start[own], axis=1) <= reach * side
     seen &= np.isfinite(covariance).all((1, 2))
-    return _Corners(np.where(seen[:, None], xy, start), covariance + LEAST_SIGMA_PX**2 * np.eye(2), seen)
+    return Crossings(np.where(seen[:, None], xy, start), covariance + LEAST_SIGMA_PX**2 * np.eye(2), seen)

@@ -1,7 +1,7 @@
 """Boards and tags: the places of their corners, and the rotations that leave their appearance unchanged."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -499,6 +499,12 @@ class BoardView:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def rows(self, keep: np.ndarray) -> "BoardView":
+        """Return the points of a mask (k,)."""
+        names = ("ids", "xyz_board", "xy_px", "covariance_px2", "normal")
+        parts = {name: part[keep] for name in names if (part := getattr(self, name)) is not None}
+        return replace(self, **parts)
 
 
 def view_of(image: str, board: FlatBoard, ids: np.ndarray, xy_px: np.ndarray, covariance_px2=None) -> BoardView:

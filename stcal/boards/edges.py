@@ -144,35 +144,26 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frame:
-    """Geometry of the edges, px.
+    """Geometry of the edges, px."""
 
-    ``middle`` : (n, 4, 2) of each edge; ``along`` : (n, 4, 2) direction; ``normal`` : (n, 4, 2) outwards; ``length`` :
-    (n, 4); ``cell`` : (n, 4) width of a cell across; ``cells`` : (n, 4) number of cells along; ``reach`` : (n, 4) of
-    the profiles; ``place`` : (n, 4, POINTS) of the profiles from the middle.
-    """
-
-    middle: np.ndarray
-    along: np.ndarray
-    normal: np.ndarray
-    length: np.ndarray
-    cell: np.ndarray
-    cells: np.ndarray
-    reach: np.ndarray
-    place: np.ndarray
+    middle: np.ndarray  # (n, 4, 2) of each edge
+    along: np.ndarray  # (n, 4, 2)
+    normal: np.ndarray  # (n, 4, 2) outwards
+    length: np.ndarray  # (n, 4)
+    cell: np.ndarray  # (n, 4) width of a cell across
+    cells: np.ndarray  # (n, 4) number of cells along
+    reach: np.ndarray  # (n, 4) of the profiles
+    place: np.ndarray  # (n, 4, POINTS) of the profiles from the middle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Lines of points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``.
+    """Lines of points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``."""
 
-    ``offset``, ``slope`` : (n, 4); ``covariance`` : (n, 4, 2, 2) of the two; ``keep`` : (n, 4, POINTS) profiles that
-    are no outliers.
-    """
-
-    offset: np.ndarray
-    slope: np.ndarray
-    covariance: np.ndarray
-    keep: np.ndarray
+    offset: np.ndarray  # (n, 4)
+    slope: np.ndarray  # (n, 4)
+    covariance: np.ndarray  # (n, 4, 2, 2) of the two
+    keep: np.ndarray  # (n, 4, POINTS) profiles that are no outliers
 
 
 def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
@@ -235,14 +226,13 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pixels:
-    """Pixels about m edges: ``level`` (m, p, s) in p rows or columns, ``along`` and ``across`` (m, p, s) of their
-    centres from the edge's middle, px, ``used`` (m, p, s); ``rise`` (m,) of ``across`` from one pixel to the next."""
+    """Pixels about m edges, (m, p, s) in p rows or columns; places from the edge's middle, px."""
 
     level: np.ndarray
     along: np.ndarray
     across: np.ndarray
     used: np.ndarray
-    rise: np.ndarray
+    rise: np.ndarray  # (m,) of ``across`` from one pixel to the next
 
 
 def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
@@ -276,24 +266,18 @@ def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Area:
-    """Lines of m edges by area, with what their σ are made of.
+    """Lines of m edges by area, with what their σ are made of."""
 
-    ``offset``, ``slope`` : (n, 4), as in :class:`_Lines`; ``settled`` : (n, 4) False where the profiles' line is kept;
-    ``blur`` : (m,) variances, px²; ``levels`` : (m, 2) dark and rise; ``by_noise`` : (m, 2, 2) covariance of offset and
-    slope without sampling; ``by_sampling`` : (m, 2, 2) their derivatives by its two harmonics, in columns; ``passed`` :
-    (m,) share of it that the blur passes; ``told`` : estimate of the offset from the profiles along rotated edges.
-    """
-
-    offset: np.ndarray
-    slope: np.ndarray
-    settled: np.ndarray
-    blur: np.ndarray
-    levels: np.ndarray
-    noise: np.ndarray
-    by_noise: np.ndarray
-    by_sampling: np.ndarray
-    passed: np.ndarray
-    told: Displacement
+    offset: np.ndarray  # (n, 4), as in _Lines
+    slope: np.ndarray  # (n, 4)
+    settled: np.ndarray  # (n, 4) False where the profiles' line is kept
+    blur: np.ndarray  # (m,) variances, px²
+    levels: np.ndarray  # (m, 2) dark and rise
+    noise: np.ndarray  # (m,) variance of pixels
+    by_noise: np.ndarray  # (m, 2, 2) covariance of offset and slope without sampling
+    by_sampling: np.ndarray  # (m, 2, 2) their derivatives by its two harmonics, in columns
+    passed: np.ndarray  # (m,) share of it that the blur passes
+    told: Displacement  # of the offset, by the profiles along rotated edges
 
     def lines(self, rough: _Lines, variance: SamplingVariance) -> _Lines:
         """Return the lines with their covariances, where sampling displaces them by ``variance``."""
@@ -451,12 +435,19 @@ def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossings:
-    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False if a window shows no
-    crossing."""
+    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False if a window shows none."""
 
     xy_px: np.ndarray
     covariance_px2: np.ndarray
     seen: np.ndarray
+
+    def otherwise(self, other: "Crossings") -> "Crossings":
+        """Return these crossings, those that are not seen as ``other`` has them."""
+        return Crossings(
+            np.where(self.seen[:, None], self.xy_px, other.xy_px),
+            np.where(self.seen[:, None, None], self.covariance_px2, other.covariance_px2),
+            self.seen | other.seen,
+        )
 
 
 def crossings(

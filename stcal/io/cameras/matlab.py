@@ -140,7 +140,7 @@ def _require_array(data: bytes, order: str) -> None:
 
 
 def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of ``toStruct(cameraParameters)`` or ``toStruct(cameraIntrinsics)``, as a structure or as JSON."""
+    """Return the camera of ``toStruct`` of cameraParameters or cameraIntrinsics, as a structure or as JSON."""
     unread = {key: _plain_value(value) for key, value in values.items() if key not in TAKEN}
     require_known(unread, source, HARMLESS)
     if "MappingCoefficients" in values:

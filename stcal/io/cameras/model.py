@@ -209,7 +209,7 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
 
 
 def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
-    """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : their file, for messages."""
+    """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : file, for messages."""
     if colmap_model not in COLMAP_LAYOUT:
         known = ", ".join(COLMAP_LAYOUT)
         raise InputError(

@@ -131,7 +131,7 @@ def let_pillow_read_heic(name: str) -> None:
 
 
 def heic_grey(data: bytes, name: str) -> np.ndarray:
-    """Return the grey pixels of a HEIC photograph as they are stored, without the rotation that its container states."""
+    """Return the grey pixels of a HEIC photograph as they are stored, without the turn that its container states."""
     let_pillow_read_heic(name)
     try:
         with Image.open(BytesIO(data)) as image:

@@ -72,7 +72,7 @@ class Convention:
 
 
 def convention_of(name: str) -> Convention:
-    """Return the convention of a name that the user gives, such as ``kuka-abc``, ``ZYX``, ``zyx-rad``, ``rotvec-deg``."""
+    """Return the convention of a name that the user gives, such as ``kuka-abc``, ``ZYX`` or ``rotvec-deg``."""
     if name in ALIASES:
         return Convention(*ALIASES[name])
     order, _, unit = name.partition("-")
