@@ -452,9 +452,7 @@ def require_board(
     corner_radius_mm: float | None,
     where: str,
 ) -> None:
-    """Refuses a grid with too few dots or with overlapping dots, and a larger dot that is not larger or not at a
-    corner.
-    """
+    """Refuses a grid with too few or overlapping dots, and a larger dot that is not larger or not at a corner."""
     if min(rows, columns) < 1:
         raise InputError("E-BOARD-SIZE", f"{where}: {rows} rows and {columns} columns; 1 or more of each needed")
     if not 0 < 2 * radius_mm < pitch_mm:

@@ -102,8 +102,7 @@ def dot_cells(labels: Iterable[Label]) -> np.ndarray:
 
 
 def unseen_lines(labels: Iterable[Label], rows: int, columns: int) -> list[str]:
-    """Returns notes on rows and columns of the board of which ``labels`` have no dot: hidden in all images, or
-    nonexistent."""
+    """Returns notes on rows and columns of the board of which ``labels`` have no dot: hidden, or nonexistent."""
     cells = dot_cells(labels)
     notes = []
     for line, count, numbers in (("row", rows, cells[:, 0]), ("column", columns, cells[:, 1])):

@@ -19,8 +19,7 @@ KEY = "unusual_size"
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """A length of a file. ``place`` : its key, with what it belongs to; ``least``, ``most`` : between which hardware
-    has it, mm."""
+    """A length of a file; ``place`` : its key; ``least``, ``most`` : between which hardware has it, mm."""
 
     place: str
     value_mm: float

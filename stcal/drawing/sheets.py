@@ -24,8 +24,7 @@ BAR, SHORT_BAR = 100.0, 50.0
 
 
 def framed(part: Part, bare: bool = False) -> list[Shape]:
-    """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions below and to the
-    left."""
+    """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions."""
     box = np.array([part.outline.min(0), part.outline.max(0)])
     lines = part.lines or (Line(part.outline, "CUT", width=0.1, closed=True),)
     if bare:

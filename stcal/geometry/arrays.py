@@ -194,15 +194,10 @@ def frozen(
     dtype: DTypeLike = float,
     finite: bool = True,
 ) -> np.ndarray:
-    """Return a read-only copy.
+    """Return a read-only copy of values.
 
-    Parameters
-    ----------
-    values : array-like
-    shape : required shape; ``None`` in it admits any length. If it is not given, any shape is accepted
-    what : name of the values in messages
-    dtype : data type
-    finite : whether floats must be finite; if not, NaN stands for values that are not known
+    ``shape`` : the required one, if any; ``None`` in it admits any length; ``what`` : name of the values in messages;
+    ``finite`` : whether floats must be finite; if not, NaN stands for values that are not known.
     """
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")
@@ -231,11 +226,7 @@ def frozen(
 def freeze(
     instance: object, field: str, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float
 ) -> None:
-    """Replace a field of a frozen dataclass by its read-only copy; to be called in ``__post_init__``.
-
-    ``instance`` : dataclass instance; ``field`` : name of the field; ``shape``, ``what``, ``dtype`` : see
-    :func:`frozen`.
-    """
+    """Replace a field of a frozen dataclass by its read-only copy, in ``__post_init__``; see :func:`frozen`."""
     object.__setattr__(instance, field, frozen(getattr(instance, field), shape, what, dtype))
 
 

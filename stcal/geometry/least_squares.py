@@ -120,17 +120,12 @@ class Minimum(Generic[S, L]):
         return self
 
 
-def _one(take: np.ndarray, new, old):
-    """Return the new state if ``take``, else the old one; for a single problem."""
-    return new if take else old
-
-
 def minimise(
     state: S,
     linearise: Callable[[S], L],
     moved: Callable[[S, np.ndarray], S],
     cost: Callable[[S], float] | None = None,
-    select: Callable[[np.ndarray, Any, Any], Any] = _one,
+    select: Callable[[np.ndarray, Any, Any], Any] = lambda take, new, old: new if take else old,
     damping: float = 1e-4,
     least_damping: float = 1e-12,
     settled: float = SETTLED,

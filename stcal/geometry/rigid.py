@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,14 +35,6 @@ def skew(v: ArrayLike) -> np.ndarray:
     m = np.zeros((*v.shape[:-1], 3, 3))
     m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return m - np.swapaxes(m, -1, -2)
-
-
-def _no_turn() -> Any:
-    return np.eye(3)
-
-
-def _no_shift() -> Any:
-    return np.zeros(3)
 
 
 def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
@@ -99,8 +91,8 @@ class Rigid(_ByValue):
         Origin of b in a, mm.
     """
 
-    rotation: Turn = field(default_factory=_no_turn)
-    translation: Array = field(default_factory=_no_shift)
+    rotation: Turn = field(default_factory=lambda: cast(Any, np.eye(3)))
+    translation: Array = field(default_factory=lambda: cast(Any, np.zeros(3)))
 
     def __post_init__(self):
         if isinstance(self.rotation, Rotation):

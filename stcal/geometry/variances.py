@@ -88,7 +88,9 @@ def component_variances(
     bounds : (f,) smallest and largest variances
     caution : redundancy of each variance that is not counted
     """
-    jacobian = _independent(jacobian)
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+    jacobian = u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)  # an orthonormal basis of its columns
 
     def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
         theta = np.exp(logs)
@@ -109,13 +111,6 @@ def component_variances(
     limits = np.log(np.column_stack(bounds))
     optimum = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})
     return np.exp(optimum.x)
-
-
-def _independent(jacobian: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (m, a, r) of the space that the columns of ``jacobian`` span."""
-    flat = jacobian.reshape(-1, jacobian.shape[2])
-    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
-    return u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)
 
 
 def sigma_factor(square: float, redundancy: float) -> float:

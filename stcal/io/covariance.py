@@ -48,15 +48,12 @@ class Fault:
 
 
 def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
-    """Return the fault of the first of many matrices that is not a covariance.
+    """Return the fault of the first of many matrices that is not a covariance, None if all are.
 
     A covariance is finite, symmetric and without negative eigenvalues, up to rounding. The eigenvalues of the
     correlation matrix are tested, since the units of the rows differ.
 
-    ``matrices`` : (m, n, n) array; ``rows`` : names of the rows, and the variances that count as zero; ``definite`` :
-    True if eigenvalues must be positive, since the matrix will be inverted.
-
-    Returns None if all matrices are covariances.
+    ``matrices`` : (m, n, n); ``definite`` : True if eigenvalues must be positive, since the matrix will be inverted.
     """
     size = matrices.shape[-1]
     nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)

@@ -158,17 +158,6 @@ def require_written(
 
     Raises ConvergenceError: the file cannot be read again, or gives other values.
     """
-    difference = _difference(path, read, reported)
-    if not difference <= most:
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
-            f"{most:g} allowed; do not use the file, and report this with its data",
-        )
-
-
-def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
-    """Returns the largest difference between a file and the reported values; infinite for another shape."""
     import numpy as np
 
     try:
@@ -179,9 +168,15 @@ def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "Ar
             f"{path}: written, and cannot be read again: {error}; do not use the file, and report this with its data",
         ) from error
     reported = np.asarray(reported, float)
-    if again.shape != reported.shape or (np.isnan(again) != np.isnan(reported)).any():
-        return float("inf")
-    return float(np.nanmax(np.abs(again - reported), initial=0.0))
+    difference = float("inf")
+    if again.shape == reported.shape and (np.isnan(again) == np.isnan(reported)).all():
+        difference = float(np.nanmax(np.abs(again - reported), initial=0.0))
+    if not difference <= most:
+        raise ConvergenceError(
+            "E-WRITTEN-DIFFERS",
+            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
+            f"{most:g} allowed; do not use the file, and report this with its data",
+        )
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:
@@ -288,7 +283,7 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
                 raise InputError(
                     "E-OUTPUT-IS-INPUT", f"{option} {path}: is an input of this command; give another name"
                 )
-            if input_place in place.parents and place.exists() and not _is_ours(place, input_place):
+            if input_place in place.parents and place.exists() and _is_read(place, input_place):
                 raise InputError(
                     "E-OUTPUT-IS-INPUT", f"{option} {path}: is a file of {given} {read}; give another name"
                 )
@@ -306,12 +301,8 @@ def real_place(path: str | Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _is_ours(place: Path, folder: Path) -> bool:
-    """Return True if no command reads this file of an input folder, so that it may be replaced.
-
-    In a run's folder these are the files that no run makes; in a folder of images, those with the suffix of a table or
-    a page.
-    """
+def _is_read(place: Path, folder: Path) -> bool:
+    """Return True if commands read this file of an input folder: a run's own, or no table or page."""
     if (folder / RUN_MARKER).exists():
-        return place.relative_to(folder).parts[0] not in RUN_ENTRIES
-    return place.name not in RUN_ENTRIES and place.suffix.lower() in NEVER_READ
+        return place.relative_to(folder).parts[0] in RUN_ENTRIES
+    return place.name in RUN_ENTRIES or place.suffix.lower() not in NEVER_READ

@@ -60,20 +60,16 @@ def first_mistake(
         shown = shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…"
         said = first["msg"].removeprefix("Value error, ")
         code, reason = "E-KEY-VALUE", f"{shown}: {said[0].lower()}{said[1:]}"
-    unknown = _unknown_beside(error) if code == "E-KEY-MISSING" else []
+    unknown = [
+        " ".join(str(other["loc"][-1]).split())[:LONGEST]
+        for other in (error.errors()[1:] if code == "E-KEY-MISSING" else ())
+        if other["type"] == "extra_forbidden" and other["loc"][:-1] == first["loc"][:-1]
+    ]
     if unknown:
         reason += f"; unknown key {', '.join(unknown)} in its place, perhaps misspelt"
     more = error.error_count() - 1 - len(unknown)
     suffix = f" (and {more} more)" if more else ""
     return InputError(code, ": ".join(part for part in (where, place, reason + suffix) if part))
-
-
-def _unknown_beside(error: ValidationError) -> list[str]:
-    """Returns the unknown keys of the table that lacks the key of the first mistake."""
-    first, *others = error.errors()
-    table = first["loc"][:-1]
-    unknown = [e["loc"][-1] for e in others if e["type"] == "extra_forbidden" and e["loc"][:-1] == table]
-    return [" ".join(str(key).split())[:LONGEST] for key in unknown]
 
 
 class Part(BaseModel):

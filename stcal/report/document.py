@@ -284,14 +284,11 @@ def _lines(blocks: Iterable[Block]) -> Iterator[str]:
 
 
 def _macro(name: str, *values) -> str:
-
     return environment().globals[name](*values)
 
 
 def html(*blocks: Block):
     """Return blocks as markup: sentences as paragraphs, with a capital at their start and a full stop."""
-    from markupsafe import Markup, escape
-
     paragraph = Markup("<p>{}</p>")
     return Markup("\n").join(
         paragraph.format(with_code(sentence(block))) if isinstance(block, str) else escape(block)

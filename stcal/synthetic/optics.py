@@ -120,13 +120,8 @@ def defocused(
     planes : list of (3,) arrays; a point of each plane, near the disc, camera frame, mm
     normal : (3,) normal of the planes, camera frame
     corner_px : pixel (x, y) in the corner of the images
-    cells : int
-    camera : Camera
-    lens : ThinLens
     blur_px : σ of the Gaussian blur that follows, which decides how many points of the lens are taken
 
-    Notes
-    -----
     The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion.
     """
     widest = max(float(lens.confusion_px(camera, point[2])) for point in planes)

@@ -165,14 +165,10 @@ def _wall(scene: Scene, g: Group, rng) -> Rigid:
     return Rigid(rotation, middle + (depth - middle @ g.axes[2]) * g.axes[2])
 
 
-def _view_mm(painter: _Painter) -> float:
-    """Returns the approximate width of the view at the distance of the wall."""
-    distance = np.linalg.norm(painter.camera_from_target.translation) + WALL_BEHIND_MM
-    return float(distance * painter.camera.width / painter.camera.focal[0])
-
-
 def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
-    n = int(WALL_REACH * _view_mm(painter) / WALL_CELL_MM)
+    distance = np.linalg.norm(painter.camera_from_target.translation) + WALL_BEHIND_MM
+    view_mm = float(distance * painter.camera.width / painter.camera.focal[0])  # width at the wall, about
+    n = int(WALL_REACH * view_mm / WALL_CELL_MM)
     row, column = np.mgrid[-n:n, -n:n].reshape(2, -1)
     light = (row + column) % 2 == 0
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -210,10 +210,9 @@ def _by_time(
             f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
         )
     rows = np.flatnonzero(taken.kept)
-    of_camera = None if camera.covariance is None else camera.covariance[rows]
-    common = None if camera.common is None else camera.common[rows]
     names = tuple(camera.names[i] for i in rows)
-    pairs = HandEyePoses(taken.base_from_flange, camera.poses[rows], None, of_camera, names, where, common)
+    at_images = replace(robot, poses=taken.base_from_flange, covariance=None)
+    pairs = _pairs(at_images, camera, range(len(rows)), rows.tolist(), names, where)
     left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
     dropped = (
         ("covariances of the robot's poses are not used: they are of other times",)
@@ -383,7 +382,6 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
 
 
 def trailing_number(name: str) -> int | None:
-    """Returns the number at the end of a name: 7 for ``img07.png``. Returns None where the name ends otherwise, or is a
-    time."""
+    """Returns the number at the end of a name: 7 for ``img07.png``; None where there is none, or for a time."""
     match = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
     return int(match[1]) if match else None

@@ -227,8 +227,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
 
 def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
-    """Returns poses ``wanted``, their covariances and what their errors have in common, from the columns of ``wanted``
-    or of its inverse."""
+    """Returns poses ``wanted``, covariances and common errors, from the columns of ``wanted`` or of its inverse."""
     names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(names) != 1:
         fault = "no such columns" if not names else "both"

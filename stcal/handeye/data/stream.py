@@ -205,8 +205,7 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
 
 
 def stamps_of(names: Sequence[str]) -> list[Decimal] | None:
-    """Returns the times that names mean, in s. Returns None where a name is not a time, or where all are whole numbers
-    that may count images."""
+    """Returns the times that names mean, in s; None where one is none, or where all may count images."""
     parsed = [time_of(name) for name in names]
     times = [time for time in parsed if time is not None]
     if not times or len(times) < len(parsed):

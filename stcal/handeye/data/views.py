@@ -179,8 +179,7 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
 
 
 def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Returns residuals (2k,) of a view's corners in units of their σ, and their derivative (2k, 6) by the board's
-    pose."""
+    """Returns residuals (2k,) of a view's corners in σ, and their derivative (2k, 6) by the board's pose."""
     weight = view.whitening()
     rotated = view.xyz_board @ camera_from_board.rotation.T
     px, by_point = project_jacobian(camera, rotated + camera_from_board.translation)

@@ -78,10 +78,6 @@ class SizedLens:
         met = np.linalg.norm(self.project(unit) - pixels, axis=1) < MET_PX
         return np.where((met & self.lens.determined(pixels))[:, None], unit, np.nan)
 
-    def determined(self, pixels: np.ndarray) -> np.ndarray:
-        """Return a mask (n,) of the pixels (n, 2) that lie in the region in which the lens was determined."""
-        return self.lens.determined(pixels)
-
 
 @require_arguments
 def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
@@ -136,7 +132,7 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     apart = np.full(flat.shape, np.nan)
     seen = two.project(turn @ first[good])
     if isinstance(two, SizedLens):
-        seen = np.where(two.determined(seen)[:, None], seen, np.nan)
+        seen = np.where(two.lens.determined(seen)[:, None], seen, np.nan)
     apart[good] = seen - flat[good]
     return CameraDifference(pixels, apart.reshape(pixels.shape), turn)
 

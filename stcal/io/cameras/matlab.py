@@ -19,7 +19,7 @@ from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.foreign import ForeignLens, of_skewed, one_of
+from stcal.io.cameras.foreign import ForeignLens, of_opencv, one_of
 from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.model import CameraModel
 
@@ -169,7 +169,7 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
     k = [0.0, 0.0] if radial is None else [*radial, 0.0, 0.0][: max(len(radial), 2)]
     p = [0.0, 0.0] if tangential is None else tangential
     lens = [fx, fy, cx - PIXEL_ORIGIN, cy - PIXEL_ORIGIN]
-    return of_skewed(lens, float(skew), np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source)
+    return of_opencv(lens, np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source, float(skew))
 
 
 def _plain_value(value: object) -> object:
@@ -217,7 +217,7 @@ def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
     focal, centre, k = (_known(values, key, source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
     width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
     skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
-    lens = of_skewed([*focal, *centre], skew, k, width, height, source)
+    lens = of_opencv([*focal, *centre], k, width, height, source, skew)
     if isinstance(lens, ForeignLens) or lens.colmap_model != "OPENCV":
         return lens
     if not all(f"{key}_error" in values for key in BOUGUET):

@@ -155,11 +155,6 @@ def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray |
     return covariance
 
 
-def _starts_with(path: Path, head: bytes) -> bool:
-    with open(path, "rb") as stream:
-        return stream.read(len(head)) == head
-
-
 def _from_colmap(text: str, name: str, source: str) -> CameraModel | ForeignLens:
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cameras = {row[0]: row[1:] for row in rows}
@@ -182,8 +177,11 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     """Read the lens of a camera file, also of an unsupported model; arguments and errors as :func:`read_camera`."""
     path, name = Path(path), name or _chosen.get()
     try:
-        if path.is_file() and _starts_with(path, SQLITE):
-            return of_database(path, name)
+        if path.is_file():
+            with open(path, "rb") as stream:
+                is_database = stream.read(len(SQLITE)) == SQLITE
+            if is_database:
+                return of_database(path, name)
         content = read_bytes(path, SETTINGS_BYTES)
         for recognised, read in BINARY_FORMATS:
             if recognised(content):

@@ -35,6 +35,7 @@ NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
+OF_IMAGES = ("--poses", "--camera", "--board")
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | Told
 
@@ -233,23 +234,25 @@ def read_input(
 
 
 def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Path | None) -> tuple[Path, Path, Path]:
-    images = {"--poses": poses, "--camera": camera, "--board": board}
-    missing = [name for name, path in images.items() if path is None]
+    missing = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is None]
     if poses is None or camera is None or board is None:
         raise InputError("E-OPTION-MISSING", f"image folder {source}: {', '.join(missing)} needed with images")
     return poses, camera, board
 
 
+def _place(source: Source) -> str:
+    if isinstance(source, Path):
+        return str(source)
+    return source.where if isinstance(source, Table) else source.pairs.where
+
+
 def _require_no_images(source: Source, poses: Path | None, camera: Path | None, board: Path | None) -> None:
-    images = {"--poses": poses, "--camera": camera, "--board": board}
-    extra = [name for name, path in images.items() if path is not None]
+    extra = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is not None]
     if isinstance(source, Path) and not source.exists():
         raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed")
     if extra:
-        description = f"{source} is a file of poses"
-        if not isinstance(source, Path):
-            description = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
-        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {description}")
+        held = "is a file of poses" if isinstance(source, Path) else "are poses"
+        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {_place(source)} {held}")
 
 
 def _require_by_name(timing: Timing) -> None:
@@ -268,13 +271,10 @@ def _require_timed(source: Source, timing: Timing) -> None:
             "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
         )
     if timing.offset and not (isinstance(source, Told) and source.timed is not None):
-        where = (
-            source.where if isinstance(source, Table) else source if isinstance(source, Path) else source.pairs.where
-        )
         raise InputError(
             "E-OPTION-NEEDS",
-            f"{where}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images and "
-            "--poses, each with times",
+            f"{_place(source)}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or "
+            "images and --poses, each with times",
         )
 
 

@@ -249,8 +249,7 @@ def frames_of(key: str) -> Frames | None:
 
 
 def inverse_name(key: str) -> str:
-    """Returns a name with its two frames changed about, like ``t_cam2target`` of ``t_target2cam``; empty where the name
-    is of another form."""
+    """Returns a name with its two frames exchanged, such as ``t_cam2target``; empty for a name of another form."""
     for between in ("_from_", "_wrt_", "_in_", "2"):
         head, separator, tail = key.partition(between)
         if separator:

@@ -66,8 +66,7 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
 
 
 def numbers(value: Any) -> np.ndarray | None:
-    """Returns an array of numbers from lists, arrays or OpenCV's matrix; None for anything else, and for ragged
-    lists."""
+    """Returns an array of numbers from lists, arrays or OpenCV's matrix; None for others, and for ragged lists."""
     if isinstance(value, Mapping):
         if not {"rows", "cols", "data"} <= value.keys():
             return None
