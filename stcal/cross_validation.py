@@ -33,18 +33,11 @@ def held_out_errors(
 ) -> tuple[int, np.ndarray, np.ndarray]:
     """Returns the errors on each fold's rows of fits to the other folds.
 
-    Parameters
-    ----------
-    ways : sequence of callables
-        Functions of (rows to fit to, rows (m,) to test on) that return the errors (m,).
-    folds : sequence of int arrays
-        Rows of each fold.
+    ``ways`` : functions of (rows to fit to, rows (m,) to test on) that return the errors (m,); ``folds`` : rows of each
+    fold.
 
-    Returns
-    -------
-    tuple
-        The number of folds done, their rows (m,) in ascending order, and the errors (ways, m). A fold that one of the
-        ways cannot solve is left out for all ways.
+    Returns the number of folds done, their rows (m,) in ascending order, and the errors (ways, m). A fold that one of
+    the ways cannot solve is left out for all ways.
     """
     rows, errors = [np.zeros(0, int)], [np.zeros((len(ways), 0))]
     for fold in folds:

@@ -358,13 +358,7 @@ MIN_SINE = 0.02
 def require_face(
     ids: Sequence[str], xy: np.ndarray, radius: np.ndarray, frame: tuple[str, str, str], where: str
 ) -> None:
-    """Refuses circles of a face that occur twice or overlap, and frame circles (origin, x, y) that give no frame.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where``.
-    """
+    """Refuses circles of a face that occur twice or overlap, and frame circles (origin, x, y) that give no frame."""
     _require_different(ids, f"{where}: circle id")
     for key, circle in zip(("origin", "x", "y"), frame, strict=True):
         if circle not in ids:
@@ -399,13 +393,7 @@ def require_face(
 
 
 def require_ids(ids: Sequence[str], where: str) -> None:
-    """Refuses ids of faces that occur twice, or that are the board's.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where``.
-    """
+    """Refuses ids of faces that occur twice, or that are the board's."""
     _require_different(ids, f"{where}: face id")
     if BOARD in ids:
         raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
@@ -418,13 +406,7 @@ def _require_different(ids: Sequence[str], what: str) -> None:
 
 
 def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
-    """Refuses faces that look alike in photographs, and a face that looks the same after a rotation.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where``.
-    """
+    """Refuses faces that look alike in photographs, and a face that looks the same after a rotation."""
     for i, face in enumerate(faces):
         for second in faces[i:]:
             few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
@@ -450,8 +432,7 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
 
 @lru_cache(maxsize=256)
 def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, same: bool) -> Likeness | None:
-    """Returns the similarity of two patterns, given as the bytes of their arrays so that it can be cached: the same
-    design is often made again."""
+    """Returns the similarity of two patterns, as bytes for the cache: the same design is often made again."""
     places, radii, other_places, other_radii = map(np.frombuffer, (xy, radius, other_xy, other_radius))
     in_place = np.arange(len(radii)) if same else None
     return whole_likeness(places.reshape(-1, 2), radii, other_places.reshape(-1, 2), other_radii, in_place)
@@ -471,14 +452,7 @@ def require_board(
     corner_radius_mm: float | None,
     where: str,
 ) -> None:
-    """Refuses a grid with too few dots or with overlapping dots, and a larger dot that is not larger or not at a
-    corner.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where``.
-    """
+    """Refuses a grid with too few or overlapping dots, and a larger dot that is not larger or not at a corner."""
     if min(rows, columns) < 1:
         raise InputError("E-BOARD-SIZE", f"{where}: {rows} rows and {columns} columns; 1 or more of each needed")
     if not 0 < 2 * radius_mm < pitch_mm:

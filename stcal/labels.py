@@ -61,13 +61,7 @@ PARSED = (CircleLabel, DotLabel)
 
 
 def parse_label(text: str) -> Label:
-    """Parses the text of a label.
-
-    Raises
-    ------
-    InputError
-        The text is neither ``face:circle`` nor ``board:row:column``.
-    """
+    """Parses the text of a label."""
     if isinstance(text, Label):
         return text
     plane, _, name = text.partition(":")
@@ -88,13 +82,7 @@ def parse_labels(texts: Iterable[str]) -> tuple[Label, ...]:
 
 
 def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
-    """Parses each text with :func:`parse_label`; all labels must be of circles on the target.
-
-    Raises
-    ------
-    InputError
-        A text is no ``face:circle``.
-    """
+    """Parses each text with :func:`parse_label`; all labels must be of circles on the target."""
     labels = []
     for label in map(parse_label, texts):
         if not isinstance(label, CircleLabel):
@@ -104,13 +92,7 @@ def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
 
 
 def dot_cells(labels: Iterable[Label]) -> np.ndarray:
-    """Returns row and column of the board's dots, (n, 2) int.
-
-    Raises
-    ------
-    InputError
-        A label belongs to a circle of the target.
-    """
+    """Returns row and column of the board's dots, (n, 2) int."""
     cells = []
     for label in labels:
         if not isinstance(label, DotLabel):
@@ -120,8 +102,7 @@ def dot_cells(labels: Iterable[Label]) -> np.ndarray:
 
 
 def unseen_lines(labels: Iterable[Label], rows: int, columns: int) -> list[str]:
-    """Returns notes on rows and columns of the board of which ``labels`` have no dot: hidden in all images, or
-    nonexistent."""
+    """Returns notes on rows and columns of the board of which ``labels`` have no dot: hidden, or nonexistent."""
     cells = dot_cells(labels)
     notes = []
     for line, count, numbers in (("row", rows, cells[:, 0]), ("column", columns, cells[:, 1])):

@@ -19,8 +19,7 @@ KEY = "unusual_size"
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """A length of a file. ``place`` : its key, with what it belongs to; ``least``, ``most`` : between which hardware
-    has it, mm."""
+    """A length of a file; ``place`` : its key; ``least``, ``most`` : between which hardware has it, mm."""
 
     place: str
     value_mm: float
@@ -49,13 +48,7 @@ def implausible(lengths: Iterable[Length]) -> Iterator[Length]:
 
 
 def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> None:
-    """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right.
-
-    Raises
-    ------
-    InputError
-        The message names the first one, what is possible, and the likely unit.
-    """
+    """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right."""
     wrong = None if stated else next(implausible(lengths), None)
     if wrong is None:
         return

@@ -41,19 +41,12 @@ class Likeness:
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
     """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest gap.
 
-    Parameters
-    ----------
-    xy, other_xy : (n, 2) and (m, 2) centres, mm
-    radius, other_radius : (n,) and (m,) mm
-    in_place : (n,) places among the other's, optional
-        Places of the same circles, if both are parts of one pattern. The motion that leaves the circles in place is
-        excluded.
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm;
+    ``in_place`` : (n,) places among the other's, optional Places of the same circles, if both are parts of one pattern.
+    The motion that leaves the circles in place is excluded.
 
-    Returns
-    -------
-    Likeness or None
-        None if no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more
-        than ``MOST_CIRCLES``.
+    Returns None if no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of
+    more than ``MOST_CIRCLES``.
     """
     centres, other_centres = (
         points[:, 0] + 1j * points[:, 1] for points in (np.asarray(xy, float), np.asarray(other_xy, float))
@@ -84,10 +77,7 @@ def _order(likeness: Likeness) -> tuple[float, float]:
 
 
 def _fitted(own, radius, other, other_radius) -> Likeness | None:
-    """Fits a motion to pairs of circles by least squares; centres are complex numbers.
-
-    Returns the motion without scale if all circles then coincide, else that with scale, or None if they never do.
-    """
+    """Returns the motion that makes all circles (complex centres) coincide, without scale if possible; None if none."""
     centred, target = own - own.mean(), other - other.mean()
     factor = (centred.conj() @ target) / (abs(centred) ** 2).sum()
     for change in (factor / abs(factor), factor):
@@ -108,17 +98,10 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
 
     The motions that are tried put two circles of the pattern onto two circles of the other one.
 
-    Parameters
-    ----------
-    xy, other_xy : (n, 2) and (m, 2) centres, mm
-    radius, other_radius : (n,) and (m,) mm
-    same : bool
-        True if both are the same pattern. The motion that leaves it in place is then excluded.
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm; ``same`` :
+    True if both are the same pattern. The motion that leaves it in place is then excluded.
 
-    Returns
-    -------
-    set of frozenset of int
-        Places in ``xy``; each set has ``MIN_COMMON`` or more.
+    Returns places in ``xy``; each set has ``MIN_COMMON`` or more.
     """
     fits, _ = _motions(xy, radius, other_xy, other_radius, same)
     return {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0)}
@@ -127,16 +110,10 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
 def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
     """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, radii included.
 
-    Parameters
-    ----------
-    xy, other_xy : (n, 2) and (m, 2) centres, mm
-    radius, other_radius : (n,) and (m,) mm
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm.
 
-    Returns
-    -------
-    list of (c, 2) int
-        Places of the same circle in ``xy`` and in ``other_xy``, for each rigid motion under which ``MIN_COMMON`` or
-        more coincide, the most circles first. A part of another result is omitted.
+    Returns places of the same circle in ``xy`` and in ``other_xy``, for each rigid motion under which ``MIN_COMMON`` or
+    more coincide, the most circles first. A part of another result is omitted.
     """
     fits, nearest = _motions(xy * [1, -1], radius, other_xy, other_radius, same=False)
     found: list[np.ndarray] = []
@@ -152,8 +129,7 @@ def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
 
 
 def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the masks of circles that coincide and the nearest circles of the other pattern, both (motions, n), for
-    all motions that put two circles onto two and let ``MIN_COMMON`` coincide."""
+    """Returns masks and nearest circles (motions, n) of the motions by two circles that let enough coincide."""
     n, m = len(xy), len(other_xy)
     k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
     p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
@@ -177,8 +153,7 @@ def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray
 
 
 def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool):
-    """Returns the circles that coincide and the nearest circles, both (motions, n), for motions that put two circles
-    onto two."""
+    """Returns the circles that coincide and the nearest ones, (motions, n), for motions of two onto two."""
     turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)

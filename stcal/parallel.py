@@ -213,10 +213,7 @@ def load_ahead(workers: int | None = None) -> None:
 
 
 def _context() -> multiprocessing.context.BaseContext:
-    """Returns the way to start processes: a server without threads that loads the libraries, which it starts, or spawn.
-
-    To be called within :func:`_starting`.
-    """
+    """Returns the way to start processes, a server that loads the libraries, or spawn; within :func:`_starting`."""
     if "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing.forkserver import ensure_running
 
@@ -254,10 +251,7 @@ def _starting() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deaf_to_interrupts():
-    """Lets processes that start in the context ignore Ctrl-C from their first moment, not only after their imports.
-
-    SIGTERM is delayed: a process whose parent ends before it has read its task prints a stack on the terminal.
-    """
+    """Lets processes that start in the context ignore Ctrl-C before their imports; SIGTERM waits for its end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -274,10 +268,7 @@ def _deaf_to_interrupts():
 
 
 def _follow_parent(folder: str) -> None:
-    """Lets a worker leave Ctrl-C to the parent, which stops the pool in order, and end when the parent is killed.
-
-    ``folder`` : the parent's folder of sockets, which it removes at its end, except if it is killed.
-    """
+    """Lets a worker leave Ctrl-C to the parent, and end, without its ``folder`` of sockets, if that is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     reserve_buffers()
     parent = multiprocessing.parent_process()

@@ -23,22 +23,15 @@ class Change:
 
     Parameters
     ----------
-    kind : {"jump", "drift"}
-        Whether the rows from ``row`` on are moved, or all rows in proportion to their place in the order.
-    row : int
-        First row after a jump; 0 for a drift.
-    first, last : int
-        Range of rows that may be the first one after the jump.
-    motion : (c,) array
-        Jump, or drift from the first to the last row, in units of the motions given.
-    moves : (r,) array
-        Share of the motion in each row: 0 and 1, or 0 to 1.
-    share : float
-        Share of the squared residuals that it explains.
-    log_p : float
-        Logarithm of the probability of such a change by chance, wherever it is in the order.
-    good : (r,) array
-        Mask of the rows that are no gross errors.
+    kind : {"jump", "drift"}; whether the rows from ``row`` on are moved, or all rows in proportion to their place in
+        the order
+    row : first row after a jump; 0 for a drift
+    first, last : range of rows that may be the first one after the jump
+    motion : (c,) jump, or drift from the first to the last row, in units of the motions given
+    moves : (r,) share of the motion in each row: 0 and 1, or 0 to 1
+    share : share of the squared residuals that it explains
+    log_p : logarithm of the probability of such a change by chance, wherever it is in the order
+    good : (r,) mask of the rows that are no gross errors
     """
 
     kind: Literal["jump", "drift"]
@@ -63,19 +56,11 @@ def change_along(errors: np.ndarray, explained: np.ndarray, motions: np.ndarray)
     The F test of each place of a jump, and of a drift, is made in the space that the fitted parameters leave open;
     probabilities are multiplied by their number (Bonferroni). Rows that fit neither side are left out.
 
-    Parameters
-    ----------
-    errors : (r, w) array
-        Residuals in units of one common σ, in the order of measurement.
-    explained : (r, w, k) array
-        Derivatives by the fitted parameters, in the same units.
-    motions : (r, w, c) array
-        Effects of the motions that may have happened, in the same units.
+    ``errors`` : (r, w) residuals in units of one common σ, in the order of measurement; ``explained`` : (r, w, k)
+    derivatives by the fitted parameters, in the same units; ``motions`` : (r, w, c) effects of the motions that may
+    have happened, in the same units.
 
-    Returns
-    -------
-    Change or None
-        None if there are too few rows, or the parameters explain any such change.
+    Returns None if there are too few rows, or the parameters explain any such change.
     """
     return changes_along(errors, explained, [motions])[0]
 
@@ -132,8 +117,7 @@ def _flat(values: np.ndarray) -> np.ndarray:
 
 
 def _sums(values: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Returns the sums (m + 1, …) of values (m, …) over the rows from each on, and last the sum weighted by ``along``
-    (m, 1)."""
+    """Returns the sums (m + 1, …) of values (m, …) from each row on; the last is weighted by ``along`` (m, 1)."""
     weighted = np.einsum("r,r...->...", along[:, 0], values)
     return np.concatenate([np.flip(np.cumsum(np.flip(values, 0), 0), 0), weighted[None]])
 

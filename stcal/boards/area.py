@@ -30,19 +30,10 @@ def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarr
     The square pixel as the edge's normal sees it is a trapezoid, the convolution of two boxes. The wider one, and with
     it an edge along the rows, is integrated exactly; the narrower one, like the blur, as a Gaussian of its variance.
 
-    Parameters
-    ----------
-    distance : (m, ...) array
-        Distances of the pixels' centres from the edges, positive on the bright side, px.
-    normal : (m, 2) array
-        Normals of the edges.
-    variance : (m,) array
-        Variances of the blur, px².
+    ``distance`` : (m, ...) distances of the pixels' centres from the edges, positive on the bright side, px;
+    ``normal`` : (m, 2) normals of the edges; ``variance`` : (m,) variances of the blur, px².
 
-    Returns
-    -------
-    tuple of (m, ...) arrays
-        The share; its derivatives by distance and by variance.
+    Returns the share; its derivatives by distance and by variance.
     """
     narrow, wide = (side.reshape(-1, *(1,) * (distance.ndim - 1)) for side in np.sort(np.abs(normal), axis=1).T)
     sigma = np.sqrt(variance.reshape(narrow.shape) + narrow**2 / 12)
@@ -101,14 +92,8 @@ def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) ->
     pixel: in an edge along the rows it is one for all profiles, in a turned one it averages out. Its first harmonic is
     what is modelled.
 
-    Parameters
-    ----------
-    distance : (m, p, s) array
-        Distances of the pixels from the edges.
-    rise : (m,) array
-        Change of the distance from one pixel to the next.
-    gradient : (m, p, s) array
-        Derivative of the grey values by the place of the edge.
+    ``distance`` : (m, p, s) distances of the pixels from the edges; ``rise`` : (m,) change of the distance from one
+    pixel to the next; ``gradient`` : (m, p, s) derivative of the grey values by the place of the edge.
     """
     angle = -2 * np.pi * distance / rise[:, None, None]
     return gradient[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -218,37 +203,29 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
     """
     square = np.broadcast_to(cells * SQUARE, outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
-    bright = _bright(grey, image_from_grid, outer, cells)
+    middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
+    xy = apply_homography(image_from_grid, middle).astype(np.float32)
+    level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
+    bright = (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
     pieces = _pieces(image_from_grid, bright, cells)
     lines = _offsets(grey, pieces, outer, cells)
     return _scatter(lines, outer, cells)
 
 
-def _bright(grey: np.ndarray, image_from_grid: np.ndarray, outer: OuterLines, cells: int) -> np.ndarray:
-    """Return the cells (n, row, column) that are bright in their middle."""
-    middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
-    xy = apply_homography(image_from_grid, middle).astype(np.float32)
-    level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
-    return (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pieces:
-    """Sides of cells between dark and bright: ``tag``, ``axis`` (0 : lines of one x), ``line`` and ``sign`` (s,), +1
-    where the next cell is bright; ``along`` (s,) place on the line, -1 to 1; ``start``, ``end`` (s, 2), px; ``normal``
-    (s, 2) towards the next cell; ``lean`` (s,) how far the cell's other sides run along the line for each px across it;
-    ``cell`` (s,) the distance to the next line, px."""
+    """s sides of cells between dark and bright."""
 
     tag: np.ndarray
-    axis: np.ndarray
+    axis: np.ndarray  # 0: lines of one x
     line: np.ndarray
-    sign: np.ndarray
-    along: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-    normal: np.ndarray
-    lean: np.ndarray
-    cell: np.ndarray
+    sign: np.ndarray  # +1 where the next cell is bright
+    along: np.ndarray  # place on the line, -1 to 1
+    start: np.ndarray  # (s, 2) px
+    end: np.ndarray  # (s, 2) px
+    normal: np.ndarray  # (s, 2) towards the next cell
+    lean: np.ndarray  # how far the cell's other sides run along the line for each px across it
+    cell: np.ndarray  # distance to the next line, px
 
 
 def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pieces:
@@ -278,15 +255,13 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Offsets:
-    """Offsets of lines from the grid, px: ``offset``, ``variance`` (n, 2, lines, 2), of both signs apart, and
-    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen. ``along`` : (n, 2, lines, 2) mean place on the
-    line of the sides used; ``passed`` : (n, 2), by direction."""
+    """Offsets of lines from the grid, px, of both signs apart; NaN where a line is not seen."""
 
-    offset: np.ndarray
-    variance: np.ndarray
-    by_sampling: np.ndarray
-    along: np.ndarray
-    passed: np.ndarray
+    offset: np.ndarray  # (n, 2, lines, 2)
+    variance: np.ndarray  # (n, 2, lines, 2)
+    by_sampling: np.ndarray  # (n, 2, lines, 2, 2)
+    along: np.ndarray  # (n, 2, lines, 2) mean place on the line of the sides used
+    passed: np.ndarray  # (n, 2), by direction
 
 
 def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> _Offsets:
@@ -329,8 +304,7 @@ def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -
 
 
 def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return level, distance from the line and use (s, p, a) of the pixels about sides of cells, in p rows or columns
-    across the line, and the change of the distance (s,) from one pixel to the next."""
+    """Return level, distance from the line and use (s, p, a) of pixels, and the distance's rise (s,) by pixel."""
     each, sigma = np.arange(len(pieces.tag)), sigma[pieces.tag]
     along = pieces.end - pieces.start
     length = np.linalg.norm(along, axis=1)
@@ -359,8 +333,7 @@ def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.nd
 
 
 def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
-    """Return what evenly spaced lines say, for each tag and direction: whether they move with the phase, and scatter
-    otherwise."""
+    """Return what evenly spaced lines say by tag and direction: how they move with the phase, and scatter otherwise."""
     n = len(outer.blur)
     place = 2 * np.arange(cells + 1) / cells - 1
     sign, place = np.tile([-1.0, 1.0], cells + 1), np.repeat(place, 2)

@@ -111,10 +111,7 @@ def _numbered(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> np
 
 
 def _refined(grey: np.ndarray, grid: np.ndarray) -> Crossings:
-    """Return the corners to a few hundredths of a pixel; the detectors are off by up to half a pixel in slanted views.
-
-    The first windows are large enough for blurred edges; the second are so small that lens distortion bends no edge.
-    """
+    """Return the corners to hundredths of a pixel: by large windows, for blur, then by small ones, for distortion."""
     window = _window(grid)
     margin = MARGIN * min(window, MOST_AT_FIRST) + LEAST_MARGIN
     first = np.floor(np.maximum(grid.min((0, 1)) - margin, 0)).astype(int)
@@ -132,10 +129,7 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> Crossings:
 
 
 def _by_area(grey: np.ndarray, grid: np.ndarray) -> Crossings:
-    """Return the corners by the areas of black and white in their windows, or unchanged where these do not fit.
-
-    Where edges lie along the pixel rows, gradients place all corners by up to 0.02 px to one side.
-    """
+    """Return the corners by the areas of black and white: gradients place those along pixel rows 0.02 px aside."""
     along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
     half = int(min(_window(grid), MOST_BY_AREA))
     clear = np.linalg.norm(along, axis=2).min(1)
@@ -230,16 +224,21 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
         return None
     squares = board.xy_mm()[ids] / board.square_mm
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)
-    small, large = _windows(board)
+    # Half the sides of upright windows, in squares, whose diagonals are clear of the tags, and of the tags' cells:
+    # white and a tag's black border lie alike on both sides of a corner.
+    white = (1 - board.marker_mm / board.square_mm) / 2
+    cell = board.marker_mm / board.square_mm / (dictionary_of(board.dictionary).markerSize + 2)
+    small, large = white / np.sqrt(2), (white + cell) / np.sqrt(2)
     for _ in range(2):
         foretold = _foretold(squares, corners)
         blurred = _saddles(smooth, foretold.xy_px, _half_px(large, foretold))
         corners = blurred.xy_px
-    sharp = _edges_meet(_gradient(smooth), corners, _half_px(small, foretold))
+    gradient = tuple(cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
+    sharp = _edges_meet(gradient, corners, _half_px(small, foretold))
     along = np.swapaxes(homography_jacobian(_robust_homography(squares, corners), squares), 1, 2)
     start, clear = sharp.otherwise(blurred).xy_px, np.sqrt(2) * small * foretold.step_px
     by_area = crossings(grey, start, along, _half_px(small, foretold), clear)
-    measured = _Corners(by_area.xy_px, by_area.covariance_px2, by_area.seen).otherwise(sharp).otherwise(blurred)
+    measured = by_area.otherwise(sharp).otherwise(blurred)
     good = measured.seen & _foretold(squares, measured.xy_px).agrees(measured.xy_px)
     if good.sum() < LEAST_CORNERS:
         return None
@@ -285,11 +284,7 @@ class _Foretold:
 
 
 def _foretold(squares: np.ndarray, corners: np.ndarray) -> _Foretold:
-    """Return the places of corners as predicted by the corners around them, (n, 2) px.
-
-    ``squares`` : (n, 2) places on the board in squares. The deviations from a homography of the whole view come from
-    the lens and a bent board. They are smooth, and are modelled as linear among the corners around each.
-    """
+    """Return the places (n, 2), px, that the neighbours predict for corners at ``squares`` (n, 2) of the board."""
     image_from_squares = _robust_homography(squares, corners)
     base = apply_homography(image_from_squares, squares)
     step = np.linalg.svd(homography_jacobian(image_from_squares, squares), compute_uv=False)[:, 1]
@@ -314,50 +309,13 @@ def _robust_homography(squares: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return fit_homography(squares, corners) if found is None else found
 
 
-def _windows(board: CharucoDesign) -> tuple[float, float]:
-    """Return half the sides of both windows in squares: clear of the tags, and of the tags' cells.
-
-    White and the tags' black border lie alike on both sides of a corner. Windows are upright in the image: only their
-    half diagonals are limited.
-    """
-    white = (1 - board.marker_mm / board.square_mm) / 2
-    cell = board.marker_mm / board.square_mm / (dictionary_of(board.dictionary).markerSize + 2)
-    return white / np.sqrt(2), (white + cell) / np.sqrt(2)
-
-
 def _half_px(share: float, foretold: _Foretold) -> np.ndarray:
     """Return half the sides (n,) of the corners' windows, whole px."""
     return np.rint(share * foretold.step_px).clip(LEAST_WINDOW_PX, MOST_WINDOW_PX).astype(int)
 
 
-def _gradient(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of an image by x and y, grey values per px."""
-    return cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32), cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Corners:
-    """Corners as measured, ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2). ``seen`` : (n,) False if there is
-    none in its window."""
-
-    xy_px: np.ndarray
-    covariance_px2: np.ndarray
-    seen: np.ndarray
-
-    def otherwise(self, other: "_Corners") -> "_Corners":
-        """Return these corners, those that are not seen as ``other`` has them."""
-        return _Corners(
-            np.where(self.seen[:, None], self.xy_px, other.xy_px),
-            np.where(self.seen[:, None, None], self.covariance_px2, other.covariance_px2),
-            self.seen | other.seen,
-        )
-
-
-def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half: np.ndarray) -> _Corners:
-    """Return the corners near ``start`` (n, 2): points through which the edges in a window of ``half`` (n,) px pass.
-
-    The weighted squares of the gradients' components towards the corner are least (Förstner & Gülch 1987).
-    """
+def _edges_meet(gradient: tuple[np.ndarray, ...], start: np.ndarray, half: np.ndarray) -> Crossings:
+    """Return the points near ``start`` (n, 2) where edges meet, in windows of ``half`` (n,) (Förstner & Gülch 1987)."""
 
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
         slope = np.stack([window.sampled(part, xy) for part in gradient], axis=2)
@@ -379,12 +337,8 @@ def _edges_meet(gradient: tuple[np.ndarray, np.ndarray], start: np.ndarray, half
     return _found(step, start, half, MOST_FROM_SADDLE)
 
 
-def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> _Corners:
-    """Return the saddles near ``start`` (n, 2) of a smooth image, by a parabola in a window of ``half`` (n,) px.
-
-    A blurred corner has no edges that meet, but is still a saddle: the image is symmetric about it. The fit's residuals
-    give σ.
-    """
+def _saddles(grey: np.ndarray, start: np.ndarray, half: np.ndarray) -> Crossings:
+    """Return the saddles near ``start`` (n, 2), by parabolas in windows of ``half`` (n,) px; residuals give σ."""
 
     def step(xy: np.ndarray, window: _Window) -> tuple[np.ndarray, np.ndarray]:
         weight = window.weight(xy, grey.shape)
@@ -437,12 +391,8 @@ class _Window:
         return cv2.remap(image, x, y, cv2.INTER_LINEAR).astype(float)
 
 
-def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1.0) -> _Corners:
-    """Return the corners at which the steps end.
-
-    ``step`` : returns steps (n, 2) and covariances (n, 2, 2); ``reach`` : largest distance from ``start`` (n, 2) of a
-    corner, in ``half`` sides (n,) of its window.
-    """
+def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1.0) -> Crossings:
+    """Return where steps (n, 2), with covariances, end: within ``reach`` half sides of the window from ``start``."""
     n = len(start)
     xy, covariance, seen = start.copy(), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
     for side in np.unique(half).tolist():
@@ -455,4 +405,4 @@ def _found(step: Callable, start: np.ndarray, half: np.ndarray, reach: float = 1
                 break
         seen[own] = np.linalg.norm(xy[own] - start[own], axis=1) <= reach * side
     seen &= np.isfinite(covariance).all((1, 2))
-    return _Corners(np.where(seen[:, None], xy, start), covariance + LEAST_SIGMA_PX**2 * np.eye(2), seen)
+    return Crossings(np.where(seen[:, None], xy, start), covariance + LEAST_SIGMA_PX**2 * np.eye(2), seen)

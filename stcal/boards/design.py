@@ -1,7 +1,7 @@
 """Boards and tags: the places of their corners, and the rotations that leave their appearance unchanged."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -93,11 +93,6 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
     """Refuse tags whose sides are in another unit than mm, and tags that lie on each other.
 
     ``corners_mm`` : (n, 4, 2), NaN for tags of no known place
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where`` and names the tag or the tags.
     """
     known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
@@ -306,13 +301,7 @@ class AsymmetricCirclesDesign:
         return tuple((int(v), int(u)) for v, u in (cells[row * self.columns + place] for row, place in self.rings))
 
     def radii_mm(self) -> np.ndarray:
-        """Return the radii, (rows·columns,), mm.
-
-        Raises
-        ------
-        InputError
-            The design has none.
-        """
+        """Return the radii, (rows·columns,), mm."""
         if self.radius_mm is None:
             raise InputError("E-BOARD-RADIUS", "asymmetric circles: no radius; radius_mm needed")
         return np.full(self.rows * self.columns, self.radius_mm)
@@ -510,6 +499,12 @@ class BoardView:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def rows(self, keep: np.ndarray) -> "BoardView":
+        """Return the points of a mask (k,)."""
+        names = ("ids", "xyz_board", "xy_px", "covariance_px2", "normal")
+        parts = {name: part[keep] for name in names if (part := getattr(self, name)) is not None}
+        return replace(self, **parts)
 
 
 def view_of(image: str, board: FlatBoard, ids: np.ndarray, xy_px: np.ndarray, covariance_px2=None) -> BoardView:

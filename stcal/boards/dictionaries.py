@@ -42,10 +42,7 @@ def known_dictionary(name: str) -> str:
 
     Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``.
 
-    Raises
-    ------
-    ValueError
-        The name is unknown; the message lists similar names. Or OpenCV lacks the family.
+    Raises ValueError: the name is unknown; the message lists similar names. Or OpenCV lacks the family.
     """
     family = _APRILTAG.fullmatch(name.strip())
     if family is not None and f"DICT_APRILTAG_{family[2].lower()}" in dir(cv2.aruco) and family[1] is None:
@@ -64,13 +61,7 @@ def known_dictionary(name: str) -> str:
 
 
 def dictionary_of(name: str):
-    """Return the dictionary of ``cv2.aruco`` with this name, full or as of :func:`known_dictionary`.
-
-    Raises
-    ------
-    InputError
-        The name is unknown.
-    """
+    """Return the dictionary of ``cv2.aruco`` with this name, full or as of :func:`known_dictionary`."""
     if not hasattr(cv2.aruco, name):
         try:
             name = known_dictionary(name)
@@ -113,10 +104,7 @@ def is_of_apriltag(name: str) -> bool:
 def of_opencv(name: str) -> str:
     """Return the full name of a dictionary, as :func:`known_dictionary`, for boards that only OpenCV finds.
 
-    Raises
-    ------
-    ValueError
-        Also: a family that OpenCV lacks.
+    Raises ValueError: also: a family that OpenCV lacks.
     """
     full = known_dictionary(name)
     if full in FAMILIES:
@@ -165,10 +153,7 @@ def find_family(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:
 def known_tags(tags: Sequence[tuple[str, int]], where: str) -> tuple[tuple[str, int], ...]:
     """Return tags with the full names of their dictionaries; ``where`` : what holds them, for messages.
 
-    Raises
-    ------
-    InputError
-        A dictionary is unknown or lacks the id, or a tag occurs twice.
+    Raises InputError: a dictionary is unknown or lacks the id, or a tag occurs twice.
     """
     known: list[tuple[str, int]] = []
     for name, tag in tags:

@@ -144,35 +144,26 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frame:
-    """Geometry of the edges, px.
+    """Geometry of the edges, px."""
 
-    ``middle`` : (n, 4, 2) of each edge; ``along`` : (n, 4, 2) direction; ``normal`` : (n, 4, 2) outwards; ``length`` :
-    (n, 4); ``cell`` : (n, 4) width of a cell across; ``cells`` : (n, 4) number of cells along; ``reach`` : (n, 4) of
-    the profiles; ``place`` : (n, 4, POINTS) of the profiles from the middle.
-    """
-
-    middle: np.ndarray
-    along: np.ndarray
-    normal: np.ndarray
-    length: np.ndarray
-    cell: np.ndarray
-    cells: np.ndarray
-    reach: np.ndarray
-    place: np.ndarray
+    middle: np.ndarray  # (n, 4, 2) of each edge
+    along: np.ndarray  # (n, 4, 2)
+    normal: np.ndarray  # (n, 4, 2) outwards
+    length: np.ndarray  # (n, 4)
+    cell: np.ndarray  # (n, 4) width of a cell across
+    cells: np.ndarray  # (n, 4) number of cells along
+    reach: np.ndarray  # (n, 4) of the profiles
+    place: np.ndarray  # (n, 4, POINTS) of the profiles from the middle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Lines of points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``.
+    """Lines of points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``."""
 
-    ``offset``, ``slope`` : (n, 4); ``covariance`` : (n, 4, 2, 2) of the two; ``keep`` : (n, 4, POINTS) profiles that
-    are no outliers.
-    """
-
-    offset: np.ndarray
-    slope: np.ndarray
-    covariance: np.ndarray
-    keep: np.ndarray
+    offset: np.ndarray  # (n, 4)
+    slope: np.ndarray  # (n, 4)
+    covariance: np.ndarray  # (n, 4, 2, 2) of the two
+    keep: np.ndarray  # (n, 4, POINTS) profiles that are no outliers
 
 
 def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
@@ -235,14 +226,13 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pixels:
-    """Pixels about m edges: ``level`` (m, p, s) in p rows or columns, ``along`` and ``across`` (m, p, s) of their
-    centres from the edge's middle, px, ``used`` (m, p, s); ``rise`` (m,) of ``across`` from one pixel to the next."""
+    """Pixels about m edges, (m, p, s) in p rows or columns; places from the edge's middle, px."""
 
     level: np.ndarray
     along: np.ndarray
     across: np.ndarray
     used: np.ndarray
-    rise: np.ndarray
+    rise: np.ndarray  # (m,) of ``across`` from one pixel to the next
 
 
 def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
@@ -276,24 +266,18 @@ def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Area:
-    """Lines of m edges by area, with what their σ are made of.
+    """Lines of m edges by area, with what their σ are made of."""
 
-    ``offset``, ``slope`` : (n, 4), as in :class:`_Lines`; ``settled`` : (n, 4) False where the profiles' line is kept;
-    ``blur`` : (m,) variances, px²; ``levels`` : (m, 2) dark and rise; ``by_noise`` : (m, 2, 2) covariance of offset and
-    slope without sampling; ``by_sampling`` : (m, 2, 2) their derivatives by its two harmonics, in columns; ``passed`` :
-    (m,) share of it that the blur passes; ``told`` : estimate of the offset from the profiles along rotated edges.
-    """
-
-    offset: np.ndarray
-    slope: np.ndarray
-    settled: np.ndarray
-    blur: np.ndarray
-    levels: np.ndarray
-    noise: np.ndarray
-    by_noise: np.ndarray
-    by_sampling: np.ndarray
-    passed: np.ndarray
-    told: Displacement
+    offset: np.ndarray  # (n, 4), as in _Lines
+    slope: np.ndarray  # (n, 4)
+    settled: np.ndarray  # (n, 4) False where the profiles' line is kept
+    blur: np.ndarray  # (m,) variances, px²
+    levels: np.ndarray  # (m, 2) dark and rise
+    noise: np.ndarray  # (m,) variance of pixels
+    by_noise: np.ndarray  # (m, 2, 2) covariance of offset and slope without sampling
+    by_sampling: np.ndarray  # (m, 2, 2) their derivatives by its two harmonics, in columns
+    passed: np.ndarray  # (m,) share of it that the blur passes
+    told: Displacement  # of the offset, by the profiles along rotated edges
 
     def lines(self, rough: _Lines, variance: SamplingVariance) -> _Lines:
         """Return the lines with their covariances, where sampling displaces them by ``variance``."""
@@ -355,12 +339,7 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
 
 
 def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far the cells behind the border move offset and slope (m, 2) of edges in the mean, and (m, 2, 2) the
-    covariance of this shift.
-
-    What the blur brings from a white cell into the border is not in the model of one edge. A cell is white or black
-    with equal probability, and independent of others.
-    """
+    """Return mean and covariance of the shift (m, 2) of offset and slope by random cells behind the border."""
     m, cells = len(design), frame.cells.reshape(-1)
     blur = np.sqrt(variance + PIXEL_VARIANCE)[:, None, None]
     brought = rise * ndtr(-(distance + frame.cell.reshape(m, 1, 1)) / blur)
@@ -414,9 +393,7 @@ def _noise_of(residual, distance, weight) -> np.ndarray:
 
 
 def _growth_of_tags(residual, offset, weight, noise, good, shape) -> np.ndarray:
-    """Return the factors (m,) by which edges that are not straight increase the variances, for each tag. A factor is
-    the sum of the squared pulls of the profiles on the offset, divided by its expectation from the noise of single
-    pixels."""
+    """Return factors (m,) of variances by edges that are not straight, for each tag: squared pulls over expected."""
     of_profile = ((weight * offset * residual).sum(2) ** 2).sum(1)
     profiles = weight.any(2).sum(1)
     expected = noise * (weight * offset**2).sum((1, 2)) * (1 - 2 / np.maximum(profiles, 3))
@@ -458,12 +435,19 @@ def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossings:
-    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False if a window shows no
-    crossing."""
+    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False if a window shows none."""
 
     xy_px: np.ndarray
     covariance_px2: np.ndarray
     seen: np.ndarray
+
+    def otherwise(self, other: "Crossings") -> "Crossings":
+        """Return these crossings, those that are not seen as ``other`` has them."""
+        return Crossings(
+            np.where(self.seen[:, None], self.xy_px, other.xy_px),
+            np.where(self.seen[:, None, None], self.covariance_px2, other.covariance_px2),
+            self.seen | other.seen,
+        )
 
 
 def crossings(
@@ -556,8 +540,7 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
 
 
 def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
-    """Return the sum over classes of distances of P Pᵀ, (n, 2, 2), with P the summed pulls (n, k, 2) of the pixels in a
-    class."""
+    """Return the sum over classes of distances of P Pᵀ, (n, 2, 2); P : the summed pulls (n, k, 2) of a class."""
     n, most = len(pull), round(2 * half / BIN_PX)
     bins = 2 * most + 1
     row = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most + bins * np.arange(n)[:, None]
@@ -578,23 +561,14 @@ def _growth(
 
     Parameters
     ----------
-    pull : (n, k, 2) array
-        Derivatives of a crossing by the pixels of its window.
-    residual : (n, k) array
-        Grey values.
-    place : (n, k) array
-        Profiles that the pixels belong to, px along the edges; those of both edges have different numbers.
-    noise : (n,) array
-        Variances of the pixels.
-    profiles : int
-        Number of profiles on each edge.
-    blur : float
-        Variance of the blur, px².
+    pull : (n, k, 2) derivatives of a crossing by the pixels of its window
+    residual : (n, k) grey values
+    place : (n, k) profiles that the pixels belong to, px along the edges; those of both edges have different numbers
+    noise : (n,) variances of the pixels
+    profiles : number of profiles on each edge
+    blur : variance of the blur, px²
 
-    Returns
-    -------
-    float
-        At least 1; the median over the windows, as a single one tells little.
+    Returns at least 1; the median over the windows, as a single one tells little.
     """
     n = len(pull)
     number = np.rint(place).astype(int)

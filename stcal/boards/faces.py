@@ -88,9 +88,7 @@ def _not_oblique(view: BoardView | None) -> tuple[BoardView | None, str]:
     why = f"{tags} tilted by {tilt_deg:.0f}°, up to {MOST_TILT_DEG:g}° is measured; turn the face towards the camera"
     if not keep.any():
         return None, why
-    covariance = None if view.covariance_px2 is None else view.covariance_px2[keep]
-    place = {"ids": view.ids[keep], "xyz_board": view.xyz_board[keep], "xy_px": view.xy_px[keep]}
-    return replace(view, **place, covariance_px2=covariance), why
+    return view.rows(keep), why
 
 
 def straightened(view: BoardView | None, camera: Camera) -> BoardView | None:

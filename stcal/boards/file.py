@@ -20,10 +20,11 @@ from stcal.boards.design import (
     LatticePart,
     TagLayout,
     require_tags,
+    sides_mm,
 )
 from stcal.boards.dictionaries import count_of, known_dictionary, of_opencv
 from stcal.boards.foreign import KEYS as BUNDLE_KEYS
-from stcal.boards.foreign import Few, bundle_content, kalibr_board_of, kalibr_content, tags_of_bundle
+from stcal.boards.foreign import Few, kalibr_board_of, tags_of_bundle, yaml_content
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
@@ -168,15 +169,9 @@ class TagsFile(Sized):
 
 
 def load_tags(path: str | Path, what: str) -> TagsFile:
-    """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML).
-
-    Raises
-    ------
-    InputError
-        The file is unreadable or invalid; the message begins with ``what``, and names file, place and reason.
-    """
+    """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML)."""
     try:
-        content = bundle_content(text_of(read_bytes(path, SETTINGS_BYTES)))
+        content = yaml_content(text_of(read_bytes(path, SETTINGS_BYTES)), BUNDLE_KEYS)
     except (OSError, UnicodeDecodeError):
         content = None  # the error of the reader of TOML says why
     if content is None:
@@ -279,8 +274,7 @@ def _lengths(board: FlatBoard) -> list[Length]:
     if isinstance(board, AsymmetricCirclesDesign):
         return [side("spacing_mm", board.spacing_mm), radius("radius_mm", board.radius_mm or 0.0)]
     if isinstance(board, TagLayout):
-        sides = np.linalg.norm(board.corners_mm - np.roll(board.corners_mm, 1, axis=1), axis=2).mean(1)
-        return [side("side of a tag", float(mm)) for mm in sides]
+        return [side("side of a tag", float(mm)) for mm in sides_mm(board.corners_mm)]
     names = ("square_mm", "marker_mm", "tag_mm")
     return [side(name, getattr(board, name)) for name in names if hasattr(board, name)]
 
@@ -364,13 +358,7 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
 
 
 def board_content(path: str | Path) -> dict[str, Any] | None:
-    """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither.
-
-    Raises
-    ------
-    InputError
-        The file is unreadable.
-    """
+    """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither."""
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
         return tomllib.loads(text)
@@ -379,7 +367,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
     except UnicodeDecodeError:
         return None
     except (ValueError, RecursionError):
-        return kalibr_content(text) if "target_type" in text else bundle_content(text)
+        return yaml_content(text, ("target_type",) if "target_type" in text else BUNDLE_KEYS)
 
 
 def _charuco(data: _Charuco, where: str) -> CharucoDesign:
@@ -391,16 +379,7 @@ def _charuco(data: _Charuco, where: str) -> CharucoDesign:
             f"{where}: marker_mm {data.marker_mm:g}, under {MOST_MARKER:g} of square_mm {data.square_mm:g} needed; "
             "are they swapped?",
         )
-    board = CharucoDesign(
-        data.rows,
-        data.columns,
-        data.square_mm,
-        data.marker_mm,
-        data.dictionary,
-        data.legacy,
-        data.sigma_mm,
-        data.first_id,
-    )
+    board = CharucoDesign(**data.model_dump(exclude={"type", "unusual_size"}))
     _require_tags(board, where)
     return board
 
@@ -425,13 +404,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
 
 
 def require_sizes(data: TagsFile, where: str) -> None:
-    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are.
-
-    Raises
-    ------
-    InputError
-        The message names the tag or the tags, and how to correct the file.
-    """
+    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are."""
     require_millimetres(tag_sides(data, where), data.unusual_size, where)
     corners = [place if (place := tag.corners(where)) is not None else np.full((4, 2), np.nan) for tag in data.tag]
     require_tags([(tag.dictionary, tag.id) for tag in data.tag], np.array(corners), True, where)
@@ -444,8 +417,7 @@ def tag_sides(data: TagsFile, where: str = "") -> list[Length]:
         if tag.size_mm is not None:
             sides.append(side(f"size_mm of tag {tag.id}", tag.size_mm))
         elif (corners := tag.corners(where)) is not None:
-            length = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
-            sides.append(side(f"side of tag {tag.id} by corners_mm", float(length)))
+            sides.append(side(f"side of tag {tag.id} by corners_mm", float(sides_mm(corners[None])[0])))
     return sides
 
 
@@ -464,17 +436,7 @@ def _require_convex(corners: np.ndarray, where: str) -> None:
 
 def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
     require_millimetres([side("tag_mm", data.tag_mm)], data.unusual_size, where)
-    board = AprilGridDesign(
-        data.rows,
-        data.columns,
-        data.tag_mm,
-        data.spacing,
-        data.border_bits,
-        data.first_id,
-        data.dictionary,
-        data.upright,
-        data.sigma_mm,
-    )
+    board = AprilGridDesign(**data.model_dump(exclude={"type", "unusual_size"}))
     _require_tags(board, where)
     return board
 

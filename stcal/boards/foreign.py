@@ -3,6 +3,7 @@
 apriltag_ros has bundles with a place for each tag, and standalone tags with their sizes alone.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -57,15 +58,15 @@ class _BundlesFile(Strict):
     standalone_tags: list[_Tag] = Field(default_factory=list)
 
 
-def bundle_content(text: str) -> dict[str, Any] | None:
-    """Return the keys and values of a file of apriltag_ros; None for any other text."""
-    if not any(key in text for key in KEYS):
+def yaml_content(text: str, keys: Sequence[str]) -> dict[str, Any] | None:
+    """Return the keys and values of a YAML file with one of these keys; None for any other text."""
+    if not any(key in text for key in keys):
         return None
     try:
         content = load_yaml(text)
     except (yaml.YAMLError, ValueError, RecursionError):
         return None
-    return content if isinstance(content, dict) and any(key in content for key in KEYS) else None
+    return content if isinstance(content, dict) and any(key in content for key in keys) else None
 
 
 def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
@@ -73,10 +74,7 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
 
     Without bundles, standalone tags have their sizes and no places.
 
-    Raises
-    ------
-    InputError
-        Keys are missing or unknown, there are several bundles, or tags do not lie in one plane.
+    Raises InputError: keys are missing or unknown, there are several bundles, or tags do not lie in one plane.
     """
     data = validated(content, _BundlesFile, where)
     if len(data.tag_bundles) > 1:
@@ -90,10 +88,7 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
     [bundle] = data.tag_bundles
     places = tuple(f"tag {tag.id}" for tag in bundle.layout)
     wxyz = np.array([[tag.qw, tag.qx, tag.qy, tag.qz] for tag in bundle.layout])
-    turn, at = (
-        of_quaternions(wxyz, places, where),
-        np.array([[tag.x, tag.y, tag.z] for tag in bundle.layout]) * METRE_MM,
-    )
+    turn, at = of_quaternions(wxyz, places, where), METRE_MM * np.array([[t.x, t.y, t.z] for t in bundle.layout])
     tilt = np.arccos(np.clip(turn[:, 2, 2], -1, 1))
     off = np.abs(at[:, 2] - at[0, 2])
     for place, angle, height in zip(places, tilt, off, strict=True):
@@ -112,15 +107,6 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
-
-
-def kalibr_content(text: str) -> dict[str, Any] | None:
-    """Return keys and values of Kalibr's YAML; None if the text is something else."""
-    try:
-        content = load_yaml(text)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return None
-    return content if isinstance(content, dict) and "target_type" in content else None
 
 
 def _metres(value: float) -> float:
@@ -173,12 +159,6 @@ def kalibr_board_of(
 
     Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
     grids do not state the radius of circles, which is determined from images.
-
-    Raises
-    ------
-    InputError
-        Keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is not
-        asymmetric.
     """
     kind = content["target_type"]
     if kind == "aprilgrid":

@@ -62,11 +62,8 @@ class _Place(PoseEntry):
 def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
     """Read a board file of any kind, of one board or several (form: ``data_layout.md``).
 
-    Raises
-    ------
-    InputError
-        As :func:`~stcal.boards.file.load_flat_board`; or boards of a set look alike in images, or have a rotational
-        symmetry.
+    Raises InputError: as :func:`~stcal.boards.file.load_flat_board`; or boards of a set look alike in images, or have a
+    rotational symmetry.
     """
     content = board_content(path)
     if content is None or content.get("type") != SET:
@@ -105,20 +102,15 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
 def _require_told_apart(found: BoardSet, where: str) -> None:
     """Refuse boards that look alike in an image, and boards that look the same after a rotation."""
     for name, board in zip(found.names, found.boards, strict=True):
-        if _turnable(board):
+        if not board.unique() if isinstance(board, BoardDesign) else board.symmetries():
             raise InputError(
                 "E-BOARD-AMBIGUOUS",
                 f"{where}: {name} looks the same when turned, so that its points cannot be numbered in the common "
-                "frame; "
-                "a chessboard of an odd and an even side, a larger corner dot, or tags needed",
+                "frame; a chessboard of an odd and an even side, a larger corner dot, or tags needed",
             )
     for (first_name, first), (second_name, second) in combinations(zip(found.names, found.boards, strict=True), 2):
         if reason := _alike(first, second):
             raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {first_name} and {second_name} look alike: {reason}")
-
-
-def _turnable(board: BoardDesign | FlatBoard) -> bool:
-    return not board.unique() if isinstance(board, BoardDesign) else bool(board.symmetries())
 
 
 def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:
@@ -126,7 +118,9 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
     if (colour := _circles(first)) and colour == _circles(second):
         return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
     for whole, part in ((first, second), (second, first)):
-        if isinstance(part, ChessboardDesign) and (inner := _inner(whole)) and _fits(part, inner):
+        if not isinstance(part, ChessboardDesign) or not (inner := _inner(whole)):
+            continue
+        if all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True)):
             return (
                 f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too; one with more rows "
                 "and fewer columns, or tags, needed"
@@ -145,11 +139,6 @@ def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
     if isinstance(board, ChessboardDesign):
         return board.rows, board.columns
     return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None
-
-
-def _fits(part: ChessboardDesign, inner: tuple[int, int]) -> bool:
-    """Return True if a chessboard fits into a grid of ``inner`` corners, of a larger one or a ChArUco board."""
-    return all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True))
 
 
 def _tags(board: BoardDesign | FlatBoard) -> set[tuple[str, int]]:

@@ -217,10 +217,7 @@ def _outermost(found: dict[tuple[str, int], list[np.ndarray]]) -> dict[tuple[str
 
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Return the saturated share (n,) of the white half a cell outside of tags with ``cells`` cells per side.
-
-    Of tags with a negative number of cells it is the white half a cell inside.
-    """
+    """Return the saturated share (n,) of the white half a cell outside of tags; inside for negative ``cells``."""
     if not len(corners):
         return np.zeros(0)
     middle = corners.mean(1, keepdims=True)
@@ -235,10 +232,7 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
 def _refined(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners and covariances; a corner that moves too far, or lacks a visible edge, is not refined.
-
-    ``white`` : (n,) True for tags that are white inside their edges and black outside.
-    """
+    """Return refined corners and covariances where all edges are visible; ``white`` : (n,) white inside the edges."""
     if white.any():
         refined, covariance = np.array(corners), np.zeros((len(corners), 8, 8))
         for colour, picture in ((~white, grey), (white, 255 - grey)):
@@ -286,7 +280,7 @@ def find_aprilgrid(
     ):
         worst = fitting.ids[4 * int(off.argmax())] // 4
         unused.append(f"tag {layout.tags[worst][1]} lies off the board's plane")
-        fitting = _rows(fitting, fitting.ids // 4 != worst)
+        fitting = fitting.rows(fitting.ids // 4 != worst)
     if _off(fitting, camera).max() > MAX_OFF_SHARE:
         return None, _why_off(view, board, camera)
     return replace(fitting, unused=tuple(unused)), ""
@@ -318,11 +312,6 @@ def _without_tags(tags: Tags, bits: str, board: AprilGridDesign) -> str:
     return f"no tag of the AprilGrid: {board.dictionary}, border of {bits} cells"
 
 
-def _rows(view: BoardView, keep: np.ndarray) -> BoardView:
-    covariance = None if view.covariance_px2 is None else view.covariance_px2[keep]
-    return BoardView(view.image, view.ids[keep], view.xyz_board[keep], view.xy_px[keep], covariance)
-
-
 def _off(view: BoardView, camera: Camera) -> np.ndarray:
     """Return the RMS deviation of each tag's corners from their places in the plane, in sides of the tag as seen."""
     observed = camera.normalised_from_pixel(view.xy_px)
@@ -335,15 +324,10 @@ def _off(view: BoardView, camera: Camera) -> np.ndarray:
 def _why_off(view: BoardView, board: AprilGridDesign, camera: Camera) -> str:
     """Return why the tags do not fit the board: rotated printing, or another arrangement."""
     turned = replace(board, upright=not board.upright)
-    if _off(_as(turned.layout(), view), camera).max() <= MAX_OFF_SHARE:
+    if _off(replace(view, xyz_board=np.pad(turned.xy_mm()[view.ids], ((0, 0), (0, 1)))), camera).max() <= MAX_OFF_SHARE:
         value = "true" if turned.upright else "false"
         return f"the tags of the AprilGrid are turned by half a turn; write upright = {value} into its file"
     return (
         f"{len(view) // 4} tags of the AprilGrid, but not where rows, columns and spacing put them; ids count from the "
         "bottom left, row by row upwards"
     )
-
-
-def _as(layout: TagLayout, view: BoardView) -> BoardView:
-    xyz = np.pad(layout.xy_mm()[view.ids], ((0, 0), (0, 1)))
-    return BoardView(view.image, view.ids, xyz, view.xy_px, view.covariance_px2)

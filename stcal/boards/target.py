@@ -97,8 +97,7 @@ def tags_on(printed: Any) -> list[tuple[str, int]]:
 def printed_face(
     face_id: str, board: FlatBoard, sigma_mm: float | None = None, size_sigma_mm: float = 0.0, **more: Any
 ) -> FaceDesign:
-    """Return the face of a board or tags; ``sigma_mm`` : σ of a corner, the board's own if None; ``more`` : its
-    rough pose and outline."""
+    """Return the face of a board or tags; ``sigma_mm`` : σ of a corner, else the board's; ``more`` : pose, outline."""
     ids = corner_ids(board)
     xy = board.xy_mm()
     middle = xy.mean(0)

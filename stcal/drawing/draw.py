@@ -145,10 +145,7 @@ def paper_for(parts: Sequence[Part]) -> str | None:
 
 
 def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
-    """Return the content of a file in the form of its suffix.
-
-    Raises InputError: there are more or larger sheets than the form holds.
-    """
+    """Return the content of a file in the form of its suffix."""
     if path.suffix.lower() == ".pdf":
         largest = max(max(sheet.width, sheet.height) for sheet in sheets)
         if largest > MOST_MM:

@@ -48,10 +48,7 @@ class _Plate:
 
 
 def net_part(target: TargetDesign) -> Part:
-    """Return the net of all plates.
-
-    Raises InputError: a face has no outline or rough pose, or a plate has no place in the net.
-    """
+    """Return the net of all plates."""
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:
             raise InputError(
@@ -86,10 +83,7 @@ def net_part(target: TargetDesign) -> Part:
 
 
 def _shared_edges(target: TargetDesign) -> dict[tuple[str, int], tuple[str, int]]:
-    """Return pairs of shared edges, in both directions: face and edge number of one edge, by those of the other.
-
-    Edges are numbered anticlockwise.
-    """
+    """Return pairs of shared edges, in both directions, as face and edge number; edges count anticlockwise."""
     ends = {}
     for face in target.faces:
         assert face.rough_target_from_face is not None

@@ -24,8 +24,7 @@ BAR, SHORT_BAR = 100.0, 50.0
 
 
 def framed(part: Part, bare: bool = False) -> list[Shape]:
-    """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions below and to the
-    left."""
+    """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions."""
     box = np.array([part.outline.min(0), part.outline.max(0)])
     lines = part.lines or (Line(part.outline, "CUT", width=0.1, closed=True),)
     if bare:
@@ -63,10 +62,7 @@ def table(part: Part, below: bool) -> list[Shape]:
 
 
 def _plan(part: Part, corner: np.ndarray) -> list[Shape]:
-    """Return a small plan of a plate, with the number of each circle in its place; ``corner`` : its upper left corner.
-
-    The plate itself has no numbers, since a detector may take letters for circles.
-    """
+    """Return a plan of a plate with the circles' numbers, which a detector on the plate itself may take for circles."""
     low, high = part.outline.min(0), part.outline.max(0)
     scale, left_above = min(PLAN / float((high - low).max()), 1.0), np.array([low[0], high[1]])
     discs = [shape for shape in part.pattern() if isinstance(shape, Disc)]
@@ -202,8 +198,6 @@ def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
     """Return the sheets of a paper for all parts, as few as possible for each part without a seam through its pattern.
 
     A part that is larger than a sheet only by its dimensions and its table is drawn without them.
-
-    Raises InputError: there would be more than :data:`MOST_SHEETS`.
     """
     split = [min(_ways(part, paper), key=lambda way: (way.cuts(), way.count(), way.bare)) for part in parts]
     total = sum(way.count() for way in split)

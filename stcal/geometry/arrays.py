@@ -153,11 +153,6 @@ def require_fields(instance: object, what: str, **least: float) -> None:
 
     Numbers must be finite, words in fields of a Literal type must be among those that it lists. Arrays are left to
     :func:`freeze`. ``least`` : lowest value of a number, by field.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``what`` and names the field and what is needed.
     """
     for name, ((admits, words), is_choice) in _rules(type(instance)).items():
         value = getattr(instance, name)
@@ -199,27 +194,10 @@ def frozen(
     dtype: DTypeLike = float,
     finite: bool = True,
 ) -> np.ndarray:
-    """Return a read-only copy.
+    """Return a read-only copy of values.
 
-    Parameters
-    ----------
-    values : array-like
-    shape : tuple of int or None, optional
-        Required shape; ``None`` in it admits any length. If it is not given, any shape is accepted.
-    what : str
-        Name of the values in messages.
-    dtype : data type
-    finite : bool
-        Whether floats must be finite; if not, NaN stands for values that are not known.
-
-    Returns
-    -------
-    array of ``shape``
-
-    Raises
-    ------
-    InputError
-        If the shape differs, the values are no numbers, or a float array holds a value that is not finite.
+    ``shape`` : the required one, if any; ``None`` in it admits any length; ``what`` : name of the values in messages;
+    ``finite`` : whether floats must be finite; if not, NaN stands for values that are not known.
     """
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")
@@ -248,21 +226,7 @@ def frozen(
 def freeze(
     instance: object, field: str, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float
 ) -> None:
-    """Replace a field of a frozen dataclass by its read-only copy; to be called in ``__post_init__``.
-
-    Parameters
-    ----------
-    instance : dataclass instance
-    field : str
-        Name of the field.
-    shape, what, dtype :
-        See :func:`frozen`.
-
-    Raises
-    ------
-    InputError
-        As :func:`frozen`.
-    """
+    """Replace a field of a frozen dataclass by its read-only copy, in ``__post_init__``; see :func:`frozen`."""
     object.__setattr__(instance, field, frozen(getattr(instance, field), shape, what, dtype))
 
 

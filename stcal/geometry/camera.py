@@ -270,10 +270,7 @@ class Camera:
         return distorted, jacobian @ _equidistant_jacobian(ideal) if self.fisheye else jacobian
 
     def _distorted_parts(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return distorted x and y, and their derivatives: x by x, x by y, y by x, y by y; all (...).
-
-        For an equidistant camera ``x`` and ``y``, by which is differentiated, are the result of :func:`_equidistant`.
-        """
+        """Return distorted x and y, and derivatives x by x, x by y, y by x, y by y; after :func:`_equidistant`."""
         k1, k2, p1, p2, k3, k4, k5, k6, *prisms = self.distortion.tolist()
         r2 = x * x + y * y
         top, bottom = self._radial(r2)
@@ -352,11 +349,7 @@ class Camera:
         )
 
     def _perspective(self, xy: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Return ideal normalised coordinates (..., 2) of undistorted points ``xy``.
-
-        For an equidistant camera the radius of ``xy`` is the angle. ``target`` : (..., 2) the distorted points, which
-        an error message converts to pixels.
-        """
+        """Return ideal coordinates (..., 2) of undistorted ``xy``; ``target`` : distorted points, for messages."""
         if not self.fisheye:
             return xy
         theta = np.hypot(xy[..., 0], xy[..., 1])
@@ -409,11 +402,6 @@ def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool =
     """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly.
 
     ``fisheye`` : k1 to k4 of an equidistant lens, or with ``tangential`` k1, k2, p1, p2, k3, k4.
-
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, or no supported model has them. The message begins with ``where``.
     """
     distortion = np.zeros(COEFFICIENTS)
     if fisheye:
@@ -439,13 +427,7 @@ def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool =
 
 
 def require_lens(flat: np.ndarray, width: float | None, height: float | None, where: str) -> None:
-    """Refuse parameters (16,), see :data:`PARAMETER_NAMES`, and sizes that no camera has. None: a size is not stated.
-
-    Raises
-    ------
-    InputError
-        The message begins with ``where``.
-    """
+    """Refuse parameters (16,), see :data:`PARAMETER_NAMES`, and sizes that no camera has; None: not stated."""
     if not np.isfinite(flat).all():
         raise InputError("E-CAMERA-NOT-FINITE", f"{where}: a camera parameter is not a finite number; correct it")
     if (far := np.abs(flat).max()) > FARTHEST:

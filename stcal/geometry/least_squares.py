@@ -110,13 +110,7 @@ class Minimum(Generic[S, L]):
     steps: int
 
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
-        """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ².
-
-        Raises
-        ------
-        ConvergenceError
-            It is no minimum; the message begins with ``what`` and ends with ``remedy``.
-        """
+        """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ²."""
         if not (self.converged | (self.promised <= accepted)).all():
             raise ConvergenceError(
                 "E-NO-MINIMUM",
@@ -126,17 +120,12 @@ class Minimum(Generic[S, L]):
         return self
 
 
-def _one(take: np.ndarray, new, old):
-    """Return the new state if ``take``, else the old one; for a single problem."""
-    return new if take else old
-
-
 def minimise(
     state: S,
     linearise: Callable[[S], L],
     moved: Callable[[S, np.ndarray], S],
     cost: Callable[[S], float] | None = None,
-    select: Callable[[np.ndarray, Any, Any], Any] = _one,
+    select: Callable[[np.ndarray, Any, Any], Any] = lambda take, new, old: new if take else old,
     damping: float = 1e-4,
     least_damping: float = 1e-12,
     settled: float = SETTLED,
@@ -148,32 +137,21 @@ def minimise(
 
     Parameters
     ----------
-    state
-        Start of the descent; of h problems at once if the costs of ``linearise`` are (h,).
-    linearise
-        Returns the problem linearised about a state.
-    moved
-        Returns the state after a step (k,), or (h, k).
-    cost
-        Returns the cost of a state, for a single problem. To be given if it is cheaper than ``linearise``, which is
-        then called at accepted states only.
-    select
-        Given (take (h,), new, old) for h problems, returns the new state or :class:`Linear` where ``take``, else the
-        old one.
-    damping, least_damping
-        Damping at the start, and its lower limit, which regularises directions that nothing determines.
-    settled, least_gain
-        A minimum is reached when the predicted decrease of the next undamped step is at most ``settled`` times the
-        cost plus ``least_gain``, in σ².
-    max_steps
-        Largest number of steps tried.
-    hopeless
-        Excess of a problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`.
+    state : start of the descent; of h problems at once if the costs of ``linearise`` are (h,)
+    linearise : returns the problem linearised about a state
+    moved : returns the state after a step (k,), or (h, k)
+    cost : returns the cost of a state, for a single problem. To be given if it is cheaper than ``linearise``, which is
+        then called at accepted states only
+    select : given (take (h,), new, old) for h problems, returns the new state or :class:`Linear` where ``take``, else
+        the old one
+    damping, least_damping : damping at the start, and its lower limit, which regularises directions that nothing
+        determines
+    settled, least_gain : a minimum is reached when the predicted decrease of the next undamped step is at most
+        ``settled`` times the cost plus ``least_gain``, in σ²
+    max_steps : largest number of steps tried
+    hopeless : excess of a problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`
 
-    Returns
-    -------
-    Minimum
-        Holds whether the descent converged; see :meth:`Minimum.required`.
+    The result holds whether the descent converged; see :meth:`Minimum.required`.
     """
     current = linearise(state)
     damp = np.full(np.shape(current.cost), float(damping))
@@ -317,14 +295,10 @@ def descend(
 
     Parameters
     ----------
-    evaluate
-        Returns the normal equations at h poses.
-    poses
-        Starts of the descent.
-    settled
-        A step is the last if it lowers χ² by less than this value, or by less than this share of χ².
-    hopeless
-        Excess of a pose's χ² over the best one up to which the pose is followed to its end.
+    evaluate : returns the normal equations at h poses
+    poses : starts of the descent
+    settled : a step is the last if it lowers χ² by less than this value, or by less than this share of χ²
+    hopeless : excess of a pose's χ² over the best one up to which the pose is followed to its end
     """
     result = minimise(
         poses,

@@ -45,19 +45,10 @@ class Reduction:
 def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction:
     """Eliminate independent blocks of unknowns.
 
-    Parameters
-    ----------
-    block
-        (m, a, a) normal matrices of the blocks.
-    right
-        (m, a) right-hand sides of the blocks.
-    cross
-        (m, a, k) mixed parts of the normal matrix, blocks by other unknowns.
+    ``block`` : (m, a, a) normal matrices of the blocks; ``right`` : (m, a) right-hand sides of the blocks; ``cross`` :
+    (m, a, k) mixed parts of the normal matrix, blocks by other unknowns.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        A block is singular.
+    Raises LinAlgError: a block is singular.
     """
     m, a, k = cross.shape
     if a < LARGE:
@@ -71,8 +62,7 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
 
 
 def _solved(block: np.ndarray, cross: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (a, k + 1) of one symmetric block by Cholesky's factor: its inverse takes three times as
-    long."""
+    """Return the solutions (a, k + 1) of one symmetric block by Cholesky; an inverse takes three times as long."""
     both = np.column_stack([cross, right])
     factor, fault = dpotrf(block, lower=True)
     return np.linalg.solve(block, both) if fault else dpotrs(factor, both, lower=True)[0]
@@ -95,14 +85,8 @@ def blocks_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k).
 
-    Parameters
-    ----------
-    jacobian
-        (n, c, k) derivatives of each observation by the unknowns of its block, divided by σ.
-    residual
-        (n, c) observed minus computed, divided by σ.
-    index
-        (n,) block of each observation.
+    ``jacobian`` : (n, c, k) derivatives of each observation by the unknowns of its block, divided by σ; ``residual`` :
+    (n, c) observed minus computed, divided by σ; ``index`` : (n,) block of each observation.
     """
     n, _, k = jacobian.shape
     products = np.swapaxes(jacobian, 1, 2) @ np.concatenate([jacobian, residual[:, :, None]], axis=2)
@@ -124,10 +108,7 @@ def free_motions(xyz: np.ndarray, scale: bool) -> np.ndarray:
 def constrained_inverse(normal: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return the inverse of a normal matrix (k, k) with inner constraints: the datum of smallest trace over the points.
 
-    Parameters
-    ----------
-    normal
-        Singular in the directions ``free``, (k, f), which are orthonormal (S-transformation, Baarda 1973).
+    ``normal`` : singular in the directions ``free``, (k, f), which are orthonormal (S-transformation, Baarda 1973).
     """
     scale = float(np.median(np.diag(normal)[np.any(free != 0, axis=1)]))
     return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale

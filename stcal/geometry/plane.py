@@ -23,12 +23,8 @@ def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radiu
     ``C + (r²/C_z)(n_z·n − e_z)`` (from the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C];
     Hartley & Zisserman, sec. 2.2 and 8.3). ``e_z`` is the optical axis.
 
-    Parameters
-    ----------
-    xyz_camera, normal_camera : (..., 3) arrays
-        Centre and unit normal (either sign), camera frame.
-    radius_mm : (...) array
-        In the unit of ``xyz_camera``.
+    ``xyz_camera``, ``normal_camera`` : (..., 3) centre and unit normal (either sign), camera frame; ``radius_mm`` :
+    (...) in the unit of ``xyz_camera``.
     """
     c, n = np.asarray(xyz_camera, float), np.asarray(normal_camera, float)
     shift = n[..., 2:] * n - np.array([0.0, 0.0, 1.0])
@@ -38,19 +34,10 @@ def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radiu
 def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`.
 
-    Parameters
-    ----------
-    xyz_camera : (n, 3) array
-        Centres, camera frame; the circles lie wholly in front of it.
-    axes_camera : (3, 2) array
-        Orthonormal directions in the plane, camera frame.
-    radius_mm : (n,) array
-        In the unit of ``xyz_camera``.
+    ``xyz_camera`` : (n, 3) centres, camera frame; the circles lie wholly in front of it; ``axes_camera`` : (3, 2)
+    orthonormal directions in the plane, camera frame; ``radius_mm`` : (n,) in the unit of ``xyz_camera``.
 
-    Returns
-    -------
-    centre : (n, 2) array, shape : (n, 2, 2) array
-        Normalised; the rim is ``centre + shape @ unit circle``, shape symmetric.
+    Returns normalised; the rim is ``centre + shape @ unit circle``, shape symmetric.
     """
     dual = radius_mm[:, None, None] ** 2 * (axes_camera @ axes_camera.T) - xyz_camera[:, :, None] * xyz_camera[:, None]
     dual = -dual / dual[:, 2:, 2:]
@@ -96,10 +83,7 @@ class Plane:
 def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
     """Return the total-least-squares plane through (n, 3) points, its normal on the side of direction ``towards``.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three points, or collinear ones.
+    Raises DegenerateError: fewer than three points, or collinear ones.
     """
     normal, offset, rms = fit_planes(np.asarray(xyz, float)[None], towards)
     return Plane(normal[0], float(offset[0]), float(rms[0]))
@@ -134,10 +118,7 @@ def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.n
 def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
     """Return the 3×3 homography a_from_b of n ≥ 4 point pairs (n, 2): normalised DLT (Hartley & Zisserman, alg. 4.2).
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than four pairs, or three of the four on a line.
+    Raises DegenerateError: fewer than four pairs, or three of the four on a line.
     """
     b, a = np.asarray(xy_b, float), np.asarray(xy_a, float)
     if len(b) < 4:
@@ -222,26 +203,13 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
     """Return the pose that minimises the reprojection error of a plane's points.
 
-    Parameters
-    ----------
-    camera_from_plane : Rigid
-        Start of the descent, mm.
-    xy_plane : (n, 2) array
-        Points in the plane's frame, mm.
-    xy_normalised : (n, 2) array
-        Their ideal normalised image coordinates.
+    ``camera_from_plane`` : start of the descent, mm; ``xy_plane`` : (n, 2) points in the plane's frame, mm;
+    ``xy_normalised`` : (n, 2) their ideal normalised image coordinates.
 
-    Returns
-    -------
-    Rigid
-        camera_from_plane.
+    Returns camera_from_plane.
 
-    Raises
-    ------
-    DegenerateError
-        Points lie behind the camera at the start.
-    ConvergenceError
-        No minimum is reached.
+    Raises DegenerateError: points lie behind the camera at the start.
+    Raises ConvergenceError: no minimum is reached.
     """
     xyz = np.column_stack([xy_plane, np.zeros(len(xy_plane))])
 
@@ -314,12 +282,9 @@ def step_between(pose: PoseStack, second: PoseStack) -> np.ndarray:
 def distinct(poses: PoseStack, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
     """Return True if the second of two poses differs significantly from the first.
 
-    Parameters
-    ----------
-    poses : the two poses
-    normal : (6, 6) normal matrix of the first pose, by the stated σ
-    robust_sigma : robust σ of the residuals, in stated σ. If it exceeds 1, the stated σ are too small, and so is the σ
-        of the pose: without this factor two minima that the residuals cannot tell apart would count as two.
+    ``poses`` : the two poses; ``normal`` : (6, 6) normal matrix of the first pose, by the stated σ; ``robust_sigma`` :
+    robust σ of the residuals, in stated σ. If it exceeds 1, the stated σ are too small, and so is the σ of the pose:
+    without this factor two minima that the residuals cannot tell apart would count as two.
     """
     step = step_between(poses[[0]], poses[[1]])
     return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
@@ -342,12 +307,7 @@ def two_minima(
     target_from_plane : frame with the origin in the middle of the points, Z along the plane's normal
     failure : message of the ConvergenceError
     planar : True if all points lie in the plane. If the two starts then end in the same minimum, they may have been on
-        the same side, and the mirror image of the minimum is tried as a further start.
-
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+        the same side, and the mirror image of the minimum is tried as a further start
     """
     poses = start.plus(mirrored(start, target_from_plane)) if len(start) == 1 else start
     sigma = 1.0
@@ -381,11 +341,9 @@ def weights_of(length: np.ndarray) -> np.ndarray:
 def deciding_delta(flip_odds: float, sigma_margin: float, variance_factor: float) -> float:
     """Return the Δχ² of the second solution that decides for the first: −2 ln of the odds, times a variance factor.
 
-    Parameters
-    ----------
-    flip_odds : largest odds of the second solution, for Gaussian errors
-    sigma_margin : factor by which all σ may be too small without exceeding these odds
-    variance_factor : χ² over redundancy; it counts if it exceeds the margin's square
+    ``flip_odds`` : largest odds of the second solution, for Gaussian errors; ``sigma_margin`` : factor by which all σ
+    may be too small without exceeding these odds; ``variance_factor`` : χ² over redundancy; it counts if it exceeds the
+    margin's square.
     """
     return -2 * float(np.log(flip_odds)) * max(sigma_margin**2, variance_factor)
 
@@ -414,11 +372,8 @@ class Weighed:
 def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: PoseStack) -> Weighed:
     """Return the step of h poses that weights the points by the full covariance of their residuals.
 
-    Parameters
-    ----------
-    residual : (h, n, 2) measured minus projected
-    by_pose : (h, n, 2, 6) negative derivative of the residuals by left perturbations
-    covariance : (h, 2n, 2n)
+    ``residual`` : (h, n, 2) measured minus projected; ``by_pose`` : (h, n, 2, 6) negative derivative of the residuals
+    by left perturbations; ``covariance`` : (h, 2n, 2n).
     """
     h = len(residual)
     r, a = residual.reshape(h, -1, 1), by_pose.reshape(h, -1, 6)
@@ -452,10 +407,7 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
     The homography is computed by the normalised DLT, its derivative at the mean of the points. The Z axis of the plane
     points away from the camera.
 
-    Raises
-    ------
-    DegenerateError
-        The points do not determine a homography, or the plane is seen edge-on or from behind.
+    Raises DegenerateError: the points do not determine a homography, or the plane is seen edge-on or from behind.
     """
     xy, xy_image = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
     middle = xy.mean(0)

@@ -21,8 +21,7 @@ MAX_STEPS = 30
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneBundle:
-    """n observations of points of planes: ``image``, ``plane`` : (n,); ``xyz`` : (n, 3) in the plane; ``seen`` : (n, 2)
-    measured, ideal px."""
+    """Points of planes: ``image``, ``plane`` (n,); ``xyz`` (n, 3) in the plane; ``seen`` (n, 2) measured, ideal px."""
 
     image: np.ndarray
     plane: np.ndarray

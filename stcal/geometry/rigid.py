@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,19 +37,8 @@ def skew(v: ArrayLike) -> np.ndarray:
     return m - np.swapaxes(m, -1, -2)
 
 
-def _no_turn() -> Any:
-    return np.eye(3)
-
-
-def _no_shift() -> Any:
-    return np.zeros(3)
-
-
 def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
-    """Return the largest |R Rᵀ − 1| of a matrix with these rows, infinite if it is left-handed.
-
-    Plain Python numbers, since transforms are made by the thousand, and for nine numbers numpy takes ten times as long.
-    """
+    """Return the largest |R Rᵀ − 1| of rows, infinite if left-handed; numpy takes ten times as long for so few."""
     (a, b, c), (d, e, f), (g, h, i) = x, y, z
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
         return math.inf
@@ -102,8 +91,8 @@ class Rigid(_ByValue):
         Origin of b in a, mm.
     """
 
-    rotation: Turn = field(default_factory=_no_turn)
-    translation: Array = field(default_factory=_no_shift)
+    rotation: Turn = field(default_factory=lambda: cast(Any, np.eye(3)))
+    translation: Array = field(default_factory=lambda: cast(Any, np.zeros(3)))
 
     def __post_init__(self):
         if isinstance(self.rotation, Rotation):
@@ -431,16 +420,10 @@ def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
     """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
 
-    Parameters
-    ----------
-    xyz_a, xyz_b : (n, 3) arrays, n ≥ 3, not collinear
-    weights : (n,) array, optional
-        Not negative; the points of positive weight must not be collinear.
+    ``xyz_a``, ``xyz_b`` : (n, 3) arrays, n ≥ 3, not collinear; ``weights`` : (n,) not negative; the points of positive
+    weight must not be collinear.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three points, or collinear ones.
+    Raises DegenerateError: fewer than three points, or collinear ones.
     """
     return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
 
@@ -453,10 +436,7 @@ def align_similarity(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray |
 def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Affine:
     """Return a_from_b with twelve parameters by linear least squares; arguments as :func:`align_rigid`.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than four points, or b's points are coplanar to rounding.
+    Raises DegenerateError: fewer than four points, or b's points are coplanar to rounding.
     """
     a, b, w = _checked(xyz_a, xyz_b, weights, 4)
     mean_a, mean_b = w @ a, w @ b

@@ -31,14 +31,8 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
     degrees of freedom are the fewest that the ratio of two quantiles of the sample admits. Both are far below gross
     errors, which do not move them.
 
-    Parameters
-    ----------
-    length : (n,) array
-        Lengths of errors over their σ.
-    beyond : float
-        Probability.
-    together : int
-        Number of lengths that share an error, so that the sample tells as much as one of n / ``together``.
+    ``length`` : (n,) lengths of errors over their σ; ``beyond`` : probability; ``together`` : number of lengths that
+    share an error, so that the sample tells as much as one of n / ``together``.
     """
 
     def quantile(exceeded: float, freedom: float) -> float:
@@ -88,14 +82,8 @@ def huber_cost(length: np.ndarray, limit: float) -> np.ndarray:
 def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1.0) -> float:
     """Return σ of one coordinate from the median of lengths (n,); up to half of them may be outliers.
 
-    Parameters
-    ----------
-    length
-        (n,) Absolute values, or lengths over ``coordinates``.
-    coordinates
-        Number of coordinates in each length.
-    redundancy
-        Redundancy per observation: residuals are shorter than errors by its square root.
+    ``length`` : (n,) Absolute values, or lengths over ``coordinates``; ``coordinates`` : number of coordinates in each
+    length; ``redundancy`` : redundancy per observation: residuals are shorter than errors by its square root.
     """
     return _median(length) / (median_length(coordinates) * np.sqrt(redundancy))
 

@@ -80,22 +80,17 @@ def component_variances(
 
     Parameters
     ----------
-    residuals
-        (m, a) residuals near a solution.
-    jacobian
-        (m, a, k) derivative of the residuals by the parameters solved for; dependent columns do no harm.
-    known
-        (m, a, a) known part of the covariances.
-    free
-        (f, m, a, a) components, each to be multiplied by its variance.
-    first
-        (f,) initial variances.
-    bounds
-        (f,) smallest and largest variances.
-    caution
-        Redundancy of each variance that is not counted.
+    residuals : (m, a) residuals near a solution
+    jacobian : (m, a, k) derivative of the residuals by the parameters solved for; dependent columns do no harm
+    known : (m, a, a) known part of the covariances
+    free : (f, m, a, a) components, each to be multiplied by its variance
+    first : (f,) initial variances
+    bounds : (f,) smallest and largest variances
+    caution : redundancy of each variance that is not counted
     """
-    jacobian = _independent(jacobian)
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+    jacobian = u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)  # an orthonormal basis of its columns
 
     def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
         theta = np.exp(logs)
@@ -116,13 +111,6 @@ def component_variances(
     limits = np.log(np.column_stack(bounds))
     optimum = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})
     return np.exp(optimum.x)
-
-
-def _independent(jacobian: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (m, a, r) of the space that the columns of ``jacobian`` span."""
-    flat = jacobian.reshape(-1, jacobian.shape[2])
-    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
-    return u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)
 
 
 def sigma_factor(square: float, redundancy: float) -> float:

@@ -48,21 +48,12 @@ class Fault:
 
 
 def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
-    """Return the fault of the first of many matrices that is not a covariance.
+    """Return the fault of the first of many matrices that is not a covariance, None if all are.
 
     A covariance is finite, symmetric and without negative eigenvalues, up to rounding. The eigenvalues of the
     correlation matrix are tested, since the units of the rows differ.
 
-    Parameters
-    ----------
-    matrices : (m, n, n) array
-    rows : names of the rows, and the variances that count as zero
-    definite : True if eigenvalues must be positive, since the matrix will be inverted
-
-    Returns
-    -------
-    Fault or None
-        None if all matrices are covariances.
+    ``matrices`` : (m, n, n); ``definite`` : True if eigenvalues must be positive, since the matrix will be inverted.
     """
     size = matrices.shape[-1]
     nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)
@@ -88,10 +79,7 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
 
 
 def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
-    """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`.
-
-    Raises InputError: the message states measured and needed values; the caller adds whose covariance it is.
-    """
+    """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`."""
     if matrix.shape != (size, size):
         raise InputError(
             "E-COVARIANCE-SHAPE", f"{'×'.join(map(str, matrix.shape)) or 'a single number'}, {size}×{size} needed"

@@ -194,10 +194,7 @@ Rings = Annotated[tuple[tuple[Place, Place], ...], Field(max_length=1000)]
 
 
 def rings_of(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: bool, where: str) -> tuple:
-    """Return the dots with a hole, as (row, column); ``quarters`` : True if rows and columns are alike.
-
-    Raises InputError: a dot that the board does not have, or rings that look the same after a turn of the board.
-    """
+    """Return the dots with a hole, as (row, column); ``quarters`` : True if rows and columns are alike."""
     told = {(row, column) for row, column in rings}
     for row, column in told:
         if row >= rows or column >= columns:

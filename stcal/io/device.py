@@ -158,16 +158,10 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
 
     Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is.
 
-    Parameters
-    ----------
-    source : int or str
-        Number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), a video file, or a folder,
-        whose images come in order of name.
+    ``source`` : number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), a video file, or a
+    folder, whose images come in order of name.
 
-    Raises
-    ------
-    InputError
-        If it cannot be opened or gives no picture; in between, if no picture comes for ``PATIENCE_S``.
+    Raises InputError: it cannot be opened or gives no picture; in between, if no picture comes for ``PATIENCE_S``.
     """
     if isinstance(source, str) and Path(source).is_dir():
         paths = [file.path for file in find_images(source)[0]]
@@ -194,13 +188,7 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
 
 @contextmanager
 def frames_of(video: str | Path) -> Iterator[Iterator[np.ndarray]]:
-    """Open a video file, and return its frames, grey.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or has no frame.
-    """
+    """Open a video file, and return its frames, grey."""
     device = _device(str(video))
     try:
         frames = _every(device)
@@ -251,13 +239,7 @@ def _every(device: cv2.VideoCapture) -> Generator[np.ndarray, None, None]:
 
 
 def _newest(device: cv2.VideoCapture, what: str) -> Generator[np.ndarray, None, None]:
-    """Yield the newest picture of a camera or a stream, and leave out those that come meanwhile.
-
-    Raises
-    ------
-    InputError
-        If no picture comes for ``PATIENCE_S``.
-    """
+    """Yield the newest picture of a camera or a stream, and leave out those that come meanwhile."""
     ready, ended = threading.Condition(), threading.Event()
     newest: list[np.ndarray] = []
 

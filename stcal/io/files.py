@@ -110,10 +110,7 @@ def unwritable(path: Path, error: OSError) -> InputError:
 
 
 def save(path: Path, content: str | bytes) -> None:
-    """Write a file atomically; a missing folder is made.
-
-    Raises InputError: the file cannot be written.
-    """
+    """Write a file atomically; a missing folder is made."""
     if not path.name or path.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: is a folder; the name of a file needed")
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
@@ -130,10 +127,7 @@ def save(path: Path, content: str | bytes) -> None:
 
 
 def require_new_folder(out: Path, images: Path) -> None:
-    """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written.
-
-    Raises InputError: the message names the reason.
-    """
+    """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
     if real_place(images) in (real_place(out), *real_place(out).parents):
@@ -162,22 +156,8 @@ def require_written(
     most : largest difference of one value: rounding by the decimals of the file
     unit : unit of the values
 
-    Raises
-    ------
-    ConvergenceError
-        The file cannot be read again, or gives other values.
+    Raises ConvergenceError: the file cannot be read again, or gives other values.
     """
-    difference = _difference(path, read, reported)
-    if not difference <= most:
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
-            f"{most:g} allowed; do not use the file, and report this with its data",
-        )
-
-
-def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
-    """Returns the largest difference between a file and the reported values; infinite for another shape."""
     import numpy as np
 
     try:
@@ -188,9 +168,15 @@ def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "Ar
             f"{path}: written, and cannot be read again: {error}; do not use the file, and report this with its data",
         ) from error
     reported = np.asarray(reported, float)
-    if again.shape != reported.shape or (np.isnan(again) != np.isnan(reported)).any():
-        return float("inf")
-    return float(np.nanmax(np.abs(again - reported), initial=0.0))
+    difference = float("inf")
+    if again.shape == reported.shape and (np.isnan(again) == np.isnan(reported)).all():
+        difference = float(np.nanmax(np.abs(again - reported), initial=0.0))
+    if not difference <= most:
+        raise ConvergenceError(
+            "E-WRITTEN-DIFFERS",
+            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
+            f"{most:g} allowed; do not use the file, and report this with its data",
+        )
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:
@@ -199,10 +185,7 @@ def require_same(path: str | Path, read: Callable[[], object], content: object) 
 
 
 def save_folder(out: Path, files: dict[str, str]) -> None:
-    """Write all files into a new folder, or none of them.
-
-    Raises InputError: the files cannot be written.
-    """
+    """Write all files into a new folder, or none of them."""
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
         made = Path(folder) / "made"
@@ -262,11 +245,7 @@ PLAIN = {float, int, bool, type(None)}
 
 
 def _indented(value, line: str) -> str:
-    """Return the text of ``json.dumps`` with ``indent=1``, but faster.
-
-    The standard writer handles one number after the other; here lists of numbers, and lists of such lists, are encoded
-    at once. ``line`` : line break with the present indent.
-    """
+    """Return ``json.dumps`` with ``indent=1``, faster: lists of numbers at once; ``line`` : break and indent."""
     inner = line + " "
     if isinstance(value, dict):
         items = [f"{_key(key)}: {_indented(item, inner)}" for key, item in value.items()]
@@ -294,8 +273,6 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
     """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
 
     ``outputs``, ``inputs`` : (option, path); an input may be a folder.
-
-    Raises InputError: the message names the output, and what it would replace.
     """
     places: dict[Path, str] = {}
     for option, path in outputs:
@@ -306,7 +283,7 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
                 raise InputError(
                     "E-OUTPUT-IS-INPUT", f"{option} {path}: is an input of this command; give another name"
                 )
-            if input_place in place.parents and place.exists() and not _is_ours(place, input_place):
+            if input_place in place.parents and place.exists() and _is_read(place, input_place):
                 raise InputError(
                     "E-OUTPUT-IS-INPUT", f"{option} {path}: is a file of {given} {read}; give another name"
                 )
@@ -324,12 +301,8 @@ def real_place(path: str | Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _is_ours(place: Path, folder: Path) -> bool:
-    """Return True if no command reads this file of an input folder, so that it may be replaced.
-
-    In a run's folder these are the files that no run makes; in a folder of images, those with the suffix of a table or
-    a page.
-    """
+def _is_read(place: Path, folder: Path) -> bool:
+    """Return True if commands read this file of an input folder: a run's own, or no table or page."""
     if (folder / RUN_MARKER).exists():
-        return place.relative_to(folder).parts[0] not in RUN_ENTRIES
-    return place.name not in RUN_ENTRIES and place.suffix.lower() in NEVER_READ
+        return place.relative_to(folder).parts[0] in RUN_ENTRIES
+    return place.name in RUN_ENTRIES or place.suffix.lower() not in NEVER_READ

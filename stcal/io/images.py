@@ -151,8 +151,6 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
     """Return the image files below ``folder``, sorted by group and name, and the files that are skipped.
 
     ``folder`` : it may also be a single image.
-
-    Raises InputError: the folder is missing, or holds no image.
     """
     root = Path(folder)
     files: list[ImageFile] = []
@@ -194,8 +192,6 @@ def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list
     """Return the result of :func:`find_images` with the images ``exclude`` moved to the skipped files.
 
     ``exclude`` : names of images in results (``12/IMG_1003.jpg``), or their paths.
-
-    Raises InputError: as for :func:`find_images`; an excluded image does not exist, or no image is left.
     """
     return without_excluded(*find_images(folder), exclude, folder)
 
@@ -261,8 +257,6 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
 
     EXIF orientation is ignored: pixels are as the sensor gave them. Only where ``size``, width and height of the
     camera's images, is given and the image has its sides swapped, the image is turned as its EXIF says.
-
-    Raises InputError: the data are empty, truncated or unreadable.
     """
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
@@ -307,10 +301,7 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
 
 
 def _turn(data: bytes) -> int | None:
-    """Return the rotation that EXIF states for an image; None if it is not a multiple of 90°, or if EXIF contradicts
-    itself. A program that rotates the pixels without changing the orientation also leaves the old width and height in
-    EXIF.
-    """
+    """Return the turn that EXIF states; None if it is none by 90°, or if the size in EXIF shows that it was done."""
     turns = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
     try:
         with Image.open(BytesIO(data)) as image:
@@ -378,10 +369,7 @@ def _is_readable(file: ImageFile) -> bool:
 
 
 def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str]:
-    """Return width and height, px, of most of the images, and the name of one of them.
-
-    Raises InputError: no image is readable.
-    """
+    """Return width and height, px, of most of the images, and the name of one of them."""
     found = common_size(files)
     if found is None:
         raise InputError(
@@ -407,10 +395,7 @@ def size_fault(name: str, own: tuple[int, int], wanted: tuple[int, int], stated_
 
 
 def stated_size(data: bytes, name: str) -> tuple[int, int]:
-    """Return width and height, px, from the header of an image file, without decoding it.
-
-    Raises InputError: the data are no image, or have more pixels than any camera.
-    """
+    """Return width and height, px, from the header of an image file, without decoding it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -427,10 +412,7 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
 
 
 def grey_of(image: np.ndarray, name: str) -> np.ndarray:
-    """Return the grey image (height, width) of an array, grey or with three channels RGB.
-
-    Raises InputError: the array has another shape, or its values are not of 8 or 16 bit.
-    """
+    """Return the grey image (height, width) of an array, grey or with three channels RGB."""
     image = np.asarray(image)
     if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
         raise InputError(
@@ -457,10 +439,7 @@ def grey_fine(image: np.ndarray) -> np.ndarray:
 
 
 def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "image") -> None:
-    """Refuse an array that is not a grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px.
-
-    Raises InputError: the message begins with ``name``.
-    """
+    """Refuse an array that is not a grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px."""
     if not isinstance(image, np.ndarray):
         raise InputError("E-IMAGE-TYPE", f"{name}: {type(image).__name__}, no image; leave lost frames out")
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
@@ -534,10 +513,7 @@ def _bright_end(image: np.ndarray) -> float:
 
 @contextlib.contextmanager
 def _decoder_messages() -> Iterator[bytearray]:
-    """Collect the messages that C libraries write to standard error: the only sign that a decoder made up pixels.
-
-    Only one thread at a time may do this: a second one would restore the first one's file as standard error.
-    """
+    """Collect what C libraries write to standard error, the only sign of made-up pixels; by one thread at a time."""
     messages = bytearray()
     try:
         standard_error = os.dup(2)

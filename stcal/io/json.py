@@ -60,20 +60,16 @@ def first_mistake(
         shown = shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…"
         said = first["msg"].removeprefix("Value error, ")
         code, reason = "E-KEY-VALUE", f"{shown}: {said[0].lower()}{said[1:]}"
-    unknown = _unknown_beside(error) if code == "E-KEY-MISSING" else []
+    unknown = [
+        " ".join(str(other["loc"][-1]).split())[:LONGEST]
+        for other in (error.errors()[1:] if code == "E-KEY-MISSING" else ())
+        if other["type"] == "extra_forbidden" and other["loc"][:-1] == first["loc"][:-1]
+    ]
     if unknown:
         reason += f"; unknown key {', '.join(unknown)} in its place, perhaps misspelt"
     more = error.error_count() - 1 - len(unknown)
     suffix = f" (and {more} more)" if more else ""
     return InputError(code, ": ".join(part for part in (where, place, reason + suffix) if part))
-
-
-def _unknown_beside(error: ValidationError) -> list[str]:
-    """Returns the unknown keys of the table that lacks the key of the first mistake."""
-    first, *others = error.errors()
-    table = first["loc"][:-1]
-    unknown = [e["loc"][-1] for e in others if e["type"] == "extra_forbidden" and e["loc"][:-1] == table]
-    return [" ".join(str(key).split())[:LONGEST] for key in unknown]
 
 
 class Part(BaseModel):
@@ -186,10 +182,7 @@ ByName = Annotated[str, "name"]
 
 
 def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
-    """Return the object in a JSON file; messages name the kind of file, ``what``, and the ``remedy``.
-
-    Raises InputError: the file is unreadable, not JSON, or not an object with named keys.
-    """
+    """Return the object in a JSON file; messages name the kind of file, ``what``, and the ``remedy``."""
     where = f"{what} {path}".lstrip()
     try:
         content = json.loads(text_of(read_bytes(path, TABLE_BYTES)))
@@ -207,11 +200,7 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
 
 
 def checked(content: dict[str, Any], model: type[F]) -> F:
-    """Return the content of a file as a ``model``; keys that the model does not know are ignored.
-
-    Raises InputError: the file has another format, lacks a key or holds an invalid value; the message names place and
-    reason.
-    """
+    """Return the content of a file as a ``model``; keys that the model does not know are ignored."""
     try:
         return model.model_validate(content, extra="ignore")
     except ValidationError as error:

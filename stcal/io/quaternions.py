@@ -17,8 +17,6 @@ def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, reme
     """Refuse quaternions (m, 4) that are not of unit length.
 
     ``place`` : returns the place of row i in ``where``; ``remedy`` : end of the message.
-
-    Raises InputError: the message names the first such quaternion, its length, and the number of further ones.
     """
     with np.errstate(over="ignore"):  # quaternions that are refused
         length = np.linalg.norm(wxyz, axis=1)

@@ -155,17 +155,16 @@ class Table:
             )
         return bool(present)
 
-    def _order(self, prefix: str) -> list[str]:
+    def quaternion_columns(self, prefix: str) -> list[str]:
         """Return the names, without prefix, of the columns that hold w, x, y and z."""
-        quaternion_columns = [c.removeprefix(prefix) for c in self.columns if c in {prefix + q for q in QUATERNION}]
-        if self.quaternions == "wxyz" or len(quaternion_columns) < len(QUATERNION):
-            return list(QUATERNION)
-        return [quaternion_columns[3], *quaternion_columns[:3]]
+        present = [c.removeprefix(prefix) for c in self.columns if c in {prefix + q for q in QUATERNION}]
+        in_order = self.quaternions == "wxyz" or len(present) < len(QUATERNION)
+        return list(QUATERNION) if in_order else [present[3], *present[:3]]
 
     def poses(self, prefix: str = "") -> Poses:
         """Return the m transforms of the columns ``prefix + x`` … and ``prefix + qw`` …."""
         self.has_rotation(prefix)
-        wxyz = np.column_stack([self._near(prefix + c) for c in self._order(prefix)])
+        wxyz = np.column_stack([self._near(prefix + c) for c in self.quaternion_columns(prefix)])
         require_unit(wxyz, lambda i: f"line {self.lines[i]}", self.where, "is the order qw, qx, qy, qz?")
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
@@ -486,10 +485,7 @@ def _other_form(
 def _points_of_analyzer(
     used: Sequence[tuple[int, str]], comments: Sequence[str], where: str, quaternions: Order
 ) -> Table | None:
-    """Return the points of SpatialAnalyzer, a name and three numbers on each line; None for any other table.
-
-    Columns are ``name``, and ``collection``, ``group``, ``target`` where all names have these three parts.
-    """
+    """Return the points of SpatialAnalyzer, a name of one or three parts and three numbers each; None for others."""
     matches = [_COMMA_POINT.fullmatch(line.strip()) for _, line in used]
     commas = all(matches) and any("," in match[k] for match in matches if match for k in (2, 3, 4))
     if not commas:

@@ -68,10 +68,7 @@ class PoseEntry(Strict):
 
 
 def validated(content: Any, model: type[M], where: str) -> M:
-    """Return the content of a file as a ``model``.
-
-    Raises InputError: the content does not fit ``model``; the message begins with ``where`` and names place and reason.
-    """
+    """Return the content of a file as a ``model``."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -79,11 +76,7 @@ def validated(content: Any, model: type[M], where: str) -> M:
 
 
 def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
-    """Read and validate a TOML file; messages name the kind of file, ``what``, and the ``remedy`` for a missing one.
-
-    Raises InputError: the file is unreadable, not TOML, or does not fit ``model``; the message names file, place and
-    reason.
-    """
+    """Read and validate a TOML file; messages name the kind of file, ``what``, and the ``remedy`` for a missing one."""
     text = ""
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))

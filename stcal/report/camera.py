@@ -25,7 +25,9 @@ def shown(camera: Camera) -> list[str]:
         rows.append([name, f"{shown_value:.{digits}f}", NONE if sigma is None else f"{sigma[i]:.{digits}f}"])
     lines = [f"{camera.colmap_model}, {camera.width}×{camera.height} px; first pixel's centre at (0, 0)"]
     lines += text_table(rows, (10, 14, 12))
-    wide = [field_deg(camera, *ends) for ends in _ends(camera)]
+    (right, low), (x, y) = (camera.width - 0.5, camera.height - 0.5), camera.centre
+    opposite = (((-0.5, y), (right, y)), ((x, -0.5), (x, low)), ((-0.5, -0.5), (right, low)))
+    wide = [field_deg(camera, *ends) for ends in opposite]
     fields = ["–" if np.isnan(angle) else f"{angle:.2f}°" for angle in wide]
     lines.append(f"field of view: {fields[0]} across, {fields[1]} up, {fields[2]} over the diagonal")
     moved = moved_px(camera)[1]
@@ -68,13 +70,6 @@ def fitted_text(called: str, found: FittedLens, region: bool = False) -> list[st
     if found.share < 1:
         lines.append(f"in {1 - found.share:.0%} of the directions {where} reaches beyond 89° from the axis: unused")
     return lines
-
-
-def _ends(camera: Camera) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Return pairs of opposite pixels: left and right, top and bottom, corners."""
-    right, low = camera.width - 0.5, camera.height - 0.5
-    x, y = camera.centre
-    return [((-0.5, y), (right, y)), ((x, -0.5), (x, low)), ((-0.5, -0.5), (right, low))]
 
 
 def field_deg(camera: Camera, one: tuple[float, float], two: tuple[float, float]) -> float:

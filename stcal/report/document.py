@@ -75,10 +75,7 @@ def pdf_of(page: str) -> bytes:
 
 
 def require_pdf() -> None:
-    """Refuse, before the work, if no PDF can be made.
-
-    Raises InputError: the message names the missing library, and how to install it.
-    """
+    """Refuse, before the work, if no PDF can be made."""
     pdf_of("<p></p>")
 
 
@@ -287,14 +284,11 @@ def _lines(blocks: Iterable[Block]) -> Iterator[str]:
 
 
 def _macro(name: str, *values) -> str:
-
     return environment().globals[name](*values)
 
 
 def html(*blocks: Block):
     """Return blocks as markup: sentences as paragraphs, with a capital at their start and a full stop."""
-    from markupsafe import Markup, escape
-
     paragraph = Markup("<p>{}</p>")
     return Markup("\n").join(
         paragraph.format(with_code(sentence(block))) if isinstance(block, str) else escape(block)

@@ -188,10 +188,7 @@ class Drawing:
 
 
 def save(drawing: Drawing, path: Path) -> None:
-    """Saves a drawing on white, all of it or nothing, and makes its folder.
-
-    Raises InputError: the file's name does not end in ``.svg``.
-    """
+    """Saves a drawing on white, all of it or nothing, and makes its folder."""
     if path.suffix.lower() != ".svg":
         raise InputError("E-OUTPUT-SUFFIX", f"--plot {path}: a name ending in .svg needed")
     files.save(path, drawing.svg().replace(">", ' style="background:#fff">', 1).encode())

@@ -224,11 +224,7 @@ def _in_first_face(poses: Mapping[str, Rigid]) -> dict[str, Rigid]:
 
 
 def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) -> dict[str, np.ndarray]:
-    """Returns how far the points of printed faces are off, (n, 3) mm by face, drawn by the σ of the design.
-
-    One error of size and one shift of the edges of tags, of σ :data:`EDGE_SIGMA_PX` at the stated distance and a tilt
-    of 45°, are common to all faces.
-    """
+    """Returns the errors of printed faces' points, (n, 3) mm by face, with one of size and one of edges for all."""
     if not options.print_errors:
         return {}
     rng = np.random.default_rng([options.seed if options.body_seed is None else options.body_seed, 3])
@@ -254,8 +250,7 @@ def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) ->
 def _poses(
     scene: BodyScene, count: int, tilts_deg: Mapping[str, tuple[float, ...]], rng: np.random.Generator
 ) -> list[tuple[Rigid, dict[str, tuple[float, ...]]]]:
-    """Returns up to ``count`` random poses within the image in which two faces and more look at the camera, each with
-    the angles at which it and the photographs before, ``tilts_deg``, show each face."""
+    """Returns up to ``count`` random poses that show two faces or more, with all ``tilts_deg`` so far."""
     found: list[tuple[Rigid, dict[str, tuple[float, ...]]]] = []
     points = np.array(list(scene.circles_target().values()))
     middle = (points.min(0) + points.max(0)) / 2

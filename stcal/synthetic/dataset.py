@@ -172,8 +172,7 @@ IMAGE_FORMATS = ("jpg", "png")
 
 @contextmanager
 def new_dataset(folder: Path) -> Iterator[None]:
-    """Refuses a folder that is not empty, or that cannot be written within the block. If the block fails, the folder is
-    left as it was."""
+    """Refuses a folder that is not empty or not writable; if the block fails, the folder is left as it was."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"

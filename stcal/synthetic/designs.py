@@ -145,11 +145,8 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
 
     ``faces`` : ids of the faces that it is to have, such as ``1,2,3,4,5``; all of them if empty.
 
-    Raises
-    ------
-    InputError
-        The width is not a number above 0, the dictionary or an id in it does not exist, or a face does not, or fewer
-        than two remain.
+    Raises InputError: the width is not a number above 0, the dictionary or an id in it does not exist, or a face does
+    not, or fewer than two remain.
     """
     whole = _whole_body(kind, size, dictionary, first_id)
     kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]

@@ -116,22 +116,12 @@ def defocused(
 
     Parameters
     ----------
-    shares : list of (h, w) arrays
-        Sharp image of each outline, by squares of which ``cells`` make a pixel's side.
-    planes : list of (3,) arrays
-        A point of each plane, near the disc, camera frame, mm.
-    normal : (3,) array
-        Normal of the planes, camera frame.
-    corner_px : tuple of int
-        Pixel (x, y) in the corner of the images.
-    cells : int
-    camera : Camera
-    lens : ThinLens
-    blur_px : float
-        σ of the Gaussian blur that follows, which decides how many points of the lens are taken.
+    shares : list of (h, w) arrays; sharp image of each outline, by squares of which ``cells`` make a pixel's side
+    planes : list of (3,) arrays; a point of each plane, near the disc, camera frame, mm
+    normal : (3,) normal of the planes, camera frame
+    corner_px : pixel (x, y) in the corner of the images
+    blur_px : σ of the Gaussian blur that follows, which decides how many points of the lens are taken
 
-    Notes
-    -----
     The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion.
     """
     widest = max(float(lens.confusion_px(camera, point[2])) for point in planes)
@@ -160,10 +150,7 @@ def defocused(
 
 
 def _moved(share: np.ndarray, source_from_square: np.ndarray) -> np.ndarray:
-    """Returns the image taken from the places that an affine map (2, 3) of its squares gives.
-
-    cv2 rounds places to 1/32 square. Opposite points of the lens err oppositely.
-    """
+    """Returns the image at places that an affine map (2, 3) gives; cv2 rounds these to 1/32 square."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(share, source_from_square, share.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
 

@@ -71,13 +71,7 @@ class _Views:
 
 
 def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.ndarray:
-    """Returns the axes (3, 3) of the view that shows two faces equally well: rows right, up, towards the camera.
-
-    Raises
-    ------
-    DegenerateError
-        The faces are nearly parallel or opposite, so that no such view exists.
-    """
+    """Returns the axes (3, 3) of the view that shows two faces equally well: rows right, up, towards the camera."""
     angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal_a, normal_b)), normal_a @ normal_b))
     if not 5 <= angle <= 130:
         raise DegenerateError(
@@ -96,11 +90,6 @@ def place_group(
 
     In every view both faces are tilted by up to 67° and the board by up to 50°, all of target and board is inside
     the image, and neither covers the other. Among the views that satisfy this, those farthest apart are chosen.
-
-    Raises
-    ------
-    DegenerateError
-        No place of the board leaves enough such views.
     """
     best, shown = None, 0
     for _ in range(PLACES):

@@ -165,14 +165,10 @@ def _wall(scene: Scene, g: Group, rng) -> Rigid:
     return Rigid(rotation, middle + (depth - middle @ g.axes[2]) * g.axes[2])
 
 
-def _view_mm(painter: _Painter) -> float:
-    """Returns the approximate width of the view at the distance of the wall."""
-    distance = np.linalg.norm(painter.camera_from_target.translation) + WALL_BEHIND_MM
-    return float(distance * painter.camera.width / painter.camera.focal[0])
-
-
 def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
-    n = int(WALL_REACH * _view_mm(painter) / WALL_CELL_MM)
+    distance = np.linalg.norm(painter.camera_from_target.translation) + WALL_BEHIND_MM
+    view_mm = float(distance * painter.camera.width / painter.camera.focal[0])  # width at the wall, about
+    n = int(WALL_REACH * view_mm / WALL_CELL_MM)
     row, column = np.mgrid[-n:n, -n:n].reshape(2, -1)
     light = (row + column) % 2 == 0
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -199,10 +195,7 @@ def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
 
 
 def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: float | None) -> None:
-    """Draws the mirror image of target and board in a table below; faintly, and of the circles alone, if None.
-
-    What the table adds is ``reflectance`` times the brightness above its own.
-    """
+    """Draws target and board mirrored in a table by its ``reflectance``; of the circles alone, if None."""
     whole, share, up = reflectance is not None, FAINT if reflectance is None else reflectance, g.axes[1]
     outlines = np.vstack([*(scene.face_outline(f.id) for f in scene.target.faces), scene.board_outline(g.name)])
     at = (outlines @ up).min() - TABLE_BELOW_MM
@@ -382,11 +375,7 @@ def _add_circles(
     rim_mm: np.ndarray,
     options: RenderOptions,
 ) -> np.ndarray:
-    """Blurs the picture and adds the circles.
-
-    The lens blurs before the sensor samples: blurring coverage per pixel instead would shift centres by up to
-    0.004 px. Therefore each circle is blurred on a finer grid, and added; the background around it is even.
-    """
+    """Blurs the picture and adds the circles, each blurred on a finer grid: by pixels, centres move by 0.004 px."""
     blur_px, lens = options.blur_px, options.lens
     top = circles.xyz_camera + np.maximum(-rim_mm, 0)[:, None] * circles.normal_camera
     outlines = rim_points(top, circles.normal_camera, circles.radius_mm)
@@ -419,11 +408,7 @@ def _add_circles(
 def _fine_coverage(
     camera: Camera, box, centre: np.ndarray, normal: np.ndarray, radius: float, steep: bool
 ) -> np.ndarray:
-    """Returns the share of each ¼ px square of a box that one disc covers, (4·(y1 - y0), 4·(x1 - x0)) float32.
-
-    Rays through pixels are intersected with the disc's plane. Away from the rim the distance from the disc's centre
-    decides; near the rim the pixel is divided into cells.
-    """
+    """Returns the share of each ¼ px square of a box that one disc covers, (4·(y1 - y0), 4·(x1 - x0)) float32."""
     x0, y0, x1, y1 = box
     ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
     outside = _relative_distance(ideal, centre, normal, radius)

@@ -221,7 +221,15 @@ def make_scene(
     """
     options = options or SceneOptions()
     if camera is not None:
-        return _seen_by_camera(options, target, board, nominal, camera_model(camera))
+        if options.fisheye_deg is not None:
+            raise InputError(
+                "E-OPTION-CONFLICT", "scene: camera and fisheye_deg given, which are two cameras; give one of them"
+            )
+        model = camera_model(camera)
+        if not (model.width and model.height):
+            raise InputError("E-CAMERA-SIZE", f"camera file {model.source} states no image size; add it to the file")
+        scene = make_scene(seen_by(options, model), target, board, nominal)
+        return replace(scene, camera=model.calibrated(0, 0))
     if options.fisheye_deg is not None:
         perspective = replace(wide_options(options), fisheye_deg=None)
         return seen_wide(make_scene(perspective, target, board, nominal), options.fisheye_deg, options.seed)
@@ -243,23 +251,6 @@ def make_scene(
             raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
     return Scene(target, board, camera, target_from_face, circles, groups, options.seed, options.margin_mm)
-
-
-def _seen_by_camera(
-    options: SceneOptions,
-    target: TargetDesign | None,
-    board: BoardDesign | None,
-    nominal: dict[str, Rigid] | None,
-    camera: CameraModel,
-) -> Scene:
-    if options.fisheye_deg is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT", "scene: camera and fisheye_deg given, which are two cameras; give one of them"
-        )
-    if not (camera.width and camera.height):
-        raise InputError("E-CAMERA-SIZE", f"camera file {camera.source} states no image size; add it to the file")
-    scene = make_scene(seen_by(options, camera), target, board, nominal)
-    return replace(scene, camera=camera.calibrated(0, 0))
 
 
 def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
@@ -414,14 +405,8 @@ def seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
 
     Target, boards and camera centres stay the same. The camera model is COLMAP's OPENCV_FISHEYE.
 
-    Parameters
-    ----------
-    scene : Scene
-        Scene made with :func:`wide_options`.
-    field_deg : float
-        Field of view over the diagonal, without distortion.
-    seed : int
-        Seed of the random turns.
+    ``scene`` : scene made with :func:`wide_options`; ``field_deg`` : field of view over the diagonal, without
+    distortion; ``seed`` : seed of the random turns.
     """
     original, rng = scene.camera, np.random.default_rng([seed, 9])
     half = np.radians(field_deg) / 2

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,8 +106,6 @@ def read_two(
     The result is None where both files are the package's own tables. The rows are joined by image or time, or by their
     order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
     are those at the camera's times, within ``tolerance_s``.
-
-    Raises InputError: the message says what is wrong with a file, or that no rows belong together.
     """
     keys = keys_of(key)
     contents = [
@@ -144,8 +142,7 @@ def read_two(
 
 
 def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
-    """Returns the robot's stream and the times of these rows of the camera; None where names are no times, or where
-    the robot has no samples beside those of the images, or none between which its pose is known."""
+    """Returns the robot's stream and the times of these rows of the camera; None without times or a dense stream."""
     times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
     if times[0] is None or times[1] is None or len(set(times[0])) < max(len(times[0]), len(rows) + 1):
         return None
@@ -156,10 +153,7 @@ def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
 
 
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
-    """Returns the robot's poses of a file; None where it is one of the package's own tables.
-
-    Raises InputError: the message says what is wrong with the file.
-    """
+    """Returns the robot's poses of a file; None where it is one of the package's own tables."""
     content = read_content(path, statements.of("robot"), key, quaternions)
     return None if content is None else settled(_side(content, "robot", path), "robot", content, path, statements)
 
@@ -179,10 +173,7 @@ def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
 
 
 def require_own(path: Path, quaternions: Order = "wxyz") -> None:
-    """Refuse a table without poses in its columns.
-
-    Raises InputError: the message says which columns are needed.
-    """
+    """Refuse a table without poses in its columns."""
     table = read_table(path, "table", quaternions)
     if not todays(table):
         raise _no_poses(table)
@@ -199,8 +190,7 @@ def _no_poses(table: Table) -> InputError:
 def _by_time(
     robot: Posed, camera: Posed, setup: str | None, where: str, tolerance_s: float, always: bool
 ) -> Told | None:
-    """Returns the robot's poses at the camera's times. Returns None where either side has no times, or, unless
-    ``always``, where all times of the camera are times of the robot."""
+    """Returns the robot's poses at the camera's times; None without, or, unless ``always``, with equal times."""
     times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
     if times[0] is None or times[1] is None:
         if always:
@@ -220,10 +210,9 @@ def _by_time(
             f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
         )
     rows = np.flatnonzero(taken.kept)
-    of_camera = None if camera.covariance is None else camera.covariance[rows]
-    common = None if camera.common is None else camera.common[rows]
     names = tuple(camera.names[i] for i in rows)
-    pairs = HandEyePoses(taken.base_from_flange, camera.poses[rows], None, of_camera, names, where, common)
+    at_images = replace(robot, poses=taken.base_from_flange, covariance=None)
+    pairs = _pairs(at_images, camera, range(len(rows)), rows.tolist(), names, where)
     left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
     dropped = (
         ("covariances of the robot's poses are not used: they are of other times",)
@@ -249,10 +238,7 @@ def _side(content: Content, role: Role, path: Path) -> Side:
 
 
 def settled(side: Side, role: Role, content: Content, path: Path, statements: Said) -> Posed:
-    """Returns poses in the direction that is needed, mm, with a line on how they were read.
-
-    Raises InputError: the unit cannot be recognised, or an option contradicts the file.
-    """
+    """Returns poses in the direction that is needed, mm, with a line on how they were read."""
     statements = statements.of(role)
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
     if len(far):
@@ -277,8 +263,7 @@ def settled(side: Side, role: Role, content: Content, path: Path, statements: Sa
 
 
 def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
-    """Returns the direction that the file or the user states. The default is base_from_flange and camera_from_board,
-    and for trajectories the pose of the moving body in its world."""
+    """Returns the direction that the user or the file states; by default that of the method, or of a trajectory."""
     option = statements.frames_of(role)
     if option is not None:
         if side.frames is not None and side.frames.stated and side.frames.name != option:
@@ -297,8 +282,7 @@ def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
 
 
 def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
-    """Returns the factor from a unit of length to mm, how the unit is known, and the unit where it was guessed from the
-    size of lengths."""
+    """Returns the factor to mm, how the unit is known, and the unit if it was guessed from the size of lengths."""
     stated = side.unit
     if stated is not None and stated.stated:
         return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
@@ -342,8 +326,6 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
     """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched.
 
     The description of the match is empty where the names are the same.
-
-    Raises InputError: no rows belong together.
     """
     if not robot.names and not camera.names:
         if len(robot) != len(camera):
@@ -400,7 +382,6 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
 
 
 def trailing_number(name: str) -> int | None:
-    """Returns the number at the end of a name: 7 for ``img07.png``. Returns None where the name ends otherwise, or is a
-    time."""
+    """Returns the number at the end of a name: 7 for ``img07.png``; None where there is none, or for a time."""
     match = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
     return int(match[1]) if match else None

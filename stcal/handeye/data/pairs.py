@@ -227,7 +227,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
 
 def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
-    """Returns poses ``wanted``, their covariances and common errors, from columns of ``wanted`` or of its inverse."""
+    """Returns poses ``wanted``, covariances and common errors, from the columns of ``wanted`` or of its inverse."""
     names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
@@ -413,7 +413,7 @@ class Motions:
         return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
 
     def with_log(self, method: str) -> "Motions":
-        """Returns the motions that satisfy :meth:`has_log`; raises DegenerateError: fewer than two do."""
+        """Returns the motions that satisfy :meth:`has_log`."""
         good = self.has_log()
         if good.sum() < 2:
             raise DegenerateError(

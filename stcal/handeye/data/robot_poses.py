@@ -38,10 +38,10 @@ class RobotPoses:
         return Path(self.where.removeprefix("robot poses ")).name
 
     def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
-        """Returns the row by image, the images of rows without a partner, and how they were matched if not by name.
-        Where no name fits, times or numbers at the ends of names match; poses without names, the order.
+        """Returns the row by image, the images of rows without a partner, and how they were matched.
 
-        Raises InputError: a name fits two images, or poses without names are not as many as the images.
+        The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
+        the ends of names; poses without names, by order. The last result is empty where images are matched by name.
         """
         if not self.images:
             if len(names) != len(self.base_from_flange):
@@ -99,8 +99,10 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
     """Read the robot's poses in any format of :mod:`stcal.handeye.data.formats`, or CSV with columns ``image`` or
     ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
-    Raises InputError: missing columns, values that are not finite, quaternions not of unit length, or an image that has
-    two rows.
+    A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
+    ``statements`` : the user's statements about what a file of another program does not state itself.
     """
     path, statements = Path(path), statements or Said()
     poses = read_robot(path, statements, "image", quaternions)

@@ -52,7 +52,7 @@ class Stream:
 
     @classmethod
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
-        """Returns the stream of samples in any order; raises InputError: fewer than two samples, or two of one time."""
+        """Returns the stream of samples that may be in any order."""
         if len(times) < 2:
             raise InputError(
                 "E-TIMES-FEW", f"{where}: {len(times)} sample with a time, 2 needed; give the whole stream"
@@ -198,8 +198,7 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
 
 
 def stamps_of(names: Sequence[str]) -> list[Decimal] | None:
-    """Returns the times that names mean, in s. Returns None where a name is not a time, or where all are whole numbers
-    that may count images."""
+    """Returns the times that names mean, in s; None where one is none, or where all may count images."""
     parsed = [time_of(name) for name in names]
     times = [time for time in parsed if time is not None]
     if not times or len(times) < len(parsed):

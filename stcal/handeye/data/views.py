@@ -175,7 +175,7 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
 
 
 def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Returns residuals (2k,) of a view's corners over σ, and their derivative (2k, 6) by the board's pose."""
+    """Returns residuals (2k,) of a view's corners in σ, and their derivative (2k, 6) by the board's pose."""
     weight = view.whitening()
     rotated = view.xyz_board @ camera_from_board.rotation.T
     px, by_point = project_jacobian(camera, rotated + camera_from_board.translation)
@@ -221,8 +221,7 @@ def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
 
 
 def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
-    """Returns the rows of each plane with enough corners, and board_from_plane, with Z the normal. A plane ends where
-    the next corner is far above it, as adjusted corners leave theirs by a little."""
+    """Returns the rows of the corners of each plane with enough of them, and board_from_plane, Z the normal."""
     normals, planes = view.normals(), []
     extent = np.linalg.norm(np.ptp(view.xyz_board, axis=0))
     open_rows = np.ones(len(view), bool)

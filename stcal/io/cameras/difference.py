@@ -78,10 +78,6 @@ class SizedLens:
         met = np.linalg.norm(self.project(unit) - pixels, axis=1) < MET_PX
         return np.where((met & self.lens.determined(pixels))[:, None], unit, np.nan)
 
-    def determined(self, pixels: np.ndarray) -> np.ndarray:
-        """Return a mask (n,) of the pixels (n, 2) that lie in the region in which the lens was determined."""
-        return self.lens.determined(pixels)
-
 
 @require_arguments
 def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
@@ -136,7 +132,7 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     apart = np.full(flat.shape, np.nan)
     seen = two.project(turn @ first[good])
     if isinstance(two, SizedLens):
-        seen = np.where(two.determined(seen)[:, None], seen, np.nan)
+        seen = np.where(two.lens.determined(seen)[:, None], seen, np.nan)
     apart[good] = seen - flat[good]
     return CameraDifference(pixels, apart.reshape(pixels.shape), turn)
 
@@ -257,8 +253,6 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
     """Return the supported camera model that is nearest to a lens over the image.
 
     ``lens`` : lens to approximate; ``width``, ``height`` : image size, px.
-
-    Raises InputError: the lens projects nearly no ray into the image.
     """
     rays, pixels, share = _rays(lens, width, height)
     straight = _best(lens, rays, pixels, share, (width, height), False)
@@ -320,10 +314,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
 def _fitted(
     model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int], turn: bool
 ) -> tuple[Camera, Rigid]:
-    """Fit one model by least squares; weights grow with the radius, since outer rays represent a larger area.
-
-    Returns the camera, and camera_from_lens, the identity without ``turn``.
-    """
+    """Return the fitted model and the axes' turn; weights grow with the radius, as outer rays represent more area."""
     about = lens.project(np.array([[0, 0, 1], [SMALL, 0, 1], [0, SMALL, 1]]))
     focal = np.linalg.norm(about[1:] - about[0], axis=1) / SMALL
     start = Camera(*size, focal, about[0], np.zeros(12), FISHEYE in model)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
-from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, opencv_lens
 from stcal.io.cameras.keys import pass_over
 from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
@@ -36,6 +36,8 @@ NUMBERS = {
     **{number: name for name, (number, _) in COLMAP_FOREIGN.items()},
 }
 """The names of COLMAP's models by their numbers in binary files and databases."""
+WRITE_AHEAD = b"\2\2"
+"""Bytes 18 and 19 of a database in SQLite's mode of a write-ahead log (sqlite.org/fileformat.html, 1.3)."""
 SQUARE = 1e-9
 """Largest ratio of skew to focal length that counts as no skew."""
 MARGIN = {2: 1, 3: 2}
@@ -112,7 +114,7 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
         return _on_plane(rays, "eucm", own)
     xy = rays[:, :2] / rays[:, 2:]
     if model == "FOV":
-        return _scaled(xy, "fov", own)
+        return _of_fov(xy, own[0])
     r2 = (xy**2).sum(axis=1)
     if model == "DIVISION":  # ideal = distorted / (1 + k r²)
         return xy * (2 / (1 + np.sqrt(1 - 4 * own[0] * r2)))[:, None]
@@ -125,10 +127,7 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
 
 
 def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
-    """Return the camera of a COLMAP database, or the one of number ``choice``; the file is opened read-only.
-
-    Raises InputError: there is no camera, there are several and no choice, or the model is unknown.
-    """
+    """Return the camera of a COLMAP database, or the one of number ``choice``; the file is opened read-only."""
     try:
         # Without its log a database is read as it stands: SQLite would write files beside it.
         how = "mode=ro" if _has_log(path) else "mode=ro&immutable=1"
@@ -139,7 +138,9 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         return of_colmap(model, width, height, np.frombuffer(params, "<f8"), str(path))
     except (sqlite3.Error, KeyError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:100]
-        if isinstance(error, sqlite3.Error) and _logs(path) and not _has_log(path):
+        with open(path, "rb") as stream:
+            head = stream.read(20)
+        if isinstance(error, sqlite3.Error) and head[18:] == WRITE_AHEAD and not _has_log(path):
             raise InputError(
                 "E-CAMERA-UNREADABLE",
                 f"camera file {path}: a database whose newest content is in {path.name}-wal, which is missing or empty "
@@ -148,12 +149,6 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {path}: no database of COLMAP ({reason}); check it"
         ) from error
-
-
-def _logs(path: Path) -> bool:
-    """Return True if a database is in SQLite's mode of a write-ahead log (sqlite.org/fileformat.html, 1.3)."""
-    with open(path, "rb") as stream:
-        return stream.read(20)[18:] == b"\2\2"
 
 
 def _has_log(path: Path) -> bool:
@@ -167,10 +162,7 @@ def numbered(cameras: Collection[str], choice: str) -> str:
 
 
 def one_of(names: list[str], choice: str, source: str) -> str:
-    """Return the name of the camera ``choice`` of a file, or of its only camera.
-
-    Raises InputError: there is no camera, the choice is unknown, or there are several cameras and no choice.
-    """
+    """Return the name of the camera ``choice`` of a file, or of its only camera."""
     if not names:
         raise InputError("E-CAMERA-NONE", f"camera file {source}: no camera in it, 1 needed")
     if choice not in names and (choice or len(names) > 1):
@@ -193,11 +185,15 @@ def require_finite(numbers, source: str) -> None:
         )
 
 
-def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str) -> CameraModel | ForeignLens:
+def of_opencv(
+    lens, given: np.ndarray, width: float, height: float, source: str, skew: float = 0.0
+) -> CameraModel | ForeignLens:
     """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
 
-    Raises InputError: the number of coefficients is wrong, or values are impossible.
+    ``skew`` : px, u = fx x + skew y + cx.
     """
+    if not abs(skew) <= SQUARE * abs(lens[0]):
+        return of_parts(lens, skew, given, "perspective", width, height, source)
     if len(given) not in (12, 14) or not given[8:].any():
         return camera_from_opencv(lens, given, False, width, height, source)
     camera_from_opencv(lens, given[:8], False, width, height, source)  # refuses impossible values
@@ -213,20 +209,6 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str)
     return ForeignLens(called, project, int(width) or None, int(height) or None, source)
 
 
-def of_skewed(
-    lens, skew: float, given: np.ndarray, width: float, height: float, source: str
-) -> CameraModel | ForeignLens:
-    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, or a foreign lens if it has skew.
-
-    ``skew`` : px, u = fx x + skew y + cx.
-
-    Raises InputError: the number of coefficients is wrong, or values are impossible.
-    """
-    if abs(skew) <= SQUARE * abs(lens[0]):
-        return camera_from_opencv(lens, given, False, width, height, source)
-    return of_parts(lens, skew, given, "perspective", width, height, source)
-
-
 def of_parts(
     lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, source: str, xi: float = 0.0
 ) -> ForeignLens:
@@ -240,11 +222,6 @@ def of_parts(
     kind : perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
         camodocal's MEI
     width, height : image size, px; 0 if the file states none
-
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, or values are impossible.
     """
     camera = camera_from_opencv(lens, given, kind == "equidistant", width, height, source)
     if not abs(skew) < abs(camera.focal[0]):
@@ -264,7 +241,7 @@ def of_parts(
     return ForeignLens(called, project, camera.width, camera.height, source)
 
 
-def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignLens:
+def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size, source: str) -> ForeignLens:
     """Return the lens of Kalibr's models omni, eucm, ds or pinhole with radtan, equidistant, fov or no distortion.
 
     Raises
@@ -280,8 +257,7 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
     """
     first = {"omni": 1, "eucm": 2, "ds": 2, "pinhole": 0}[lens]
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[distortion]
-    numbers = np.array(values["intrinsics"], float)
-    coefficients = np.array(values.get("distortion_coeffs", []) if count else [], float)
+    coefficients = given if count else np.zeros(0)
     if (
         numbers.shape != (first + 4,)
         or coefficients.shape != (count,)
@@ -297,11 +273,15 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
         raise InputError(
             "E-CAMERA-FOCAL", f"camera file {source}: focal length {focal.tolist()}; positive numbers needed"
         )
-    width, height = (int(side) for side in values.get("resolution", (0, 0)))
+    width, height = map(int, size)
+    fisheye = distortion == "equidistant"
+    in_opencv_order = opencv_lens(np.zeros(0) if distortion == "fov" else coefficients, fisheye, source)[0]
+    flat = Camera(1, 1, [1, 1], [0, 0], in_opencv_order, fisheye)
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return centre + focal * _kalibr_distorted(_on_plane(rays, lens, shape), distortion, coefficients)
+            xy = _on_plane(rays, lens, shape)
+            return centre + focal * (_of_fov(xy, coefficients[0]) if distortion == "fov" else flat.distort(xy))
 
     return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None, source)
 
@@ -323,31 +303,14 @@ def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
     return rays[:, :2] / np.where(below > 0, below, np.nan)[:, None]
 
 
-def _kalibr_distorted(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
-    if kind != "radtan":
-        return _scaled(xy, kind, k)
-    (x, y), r2 = xy.T, (xy**2).sum(axis=1)
-    radial = xy * (1 + k[0] * r2 + k[1] * r2**2)[:, None]
-    tangential = [2 * k[2] * x * y + k[3] * (r2 + 2 * x * x), k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y]
-    return radial + np.column_stack(tangential)
-
-
-def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
-    """Return normalised coordinates (n, 2) with the radial distortion equidistant, fov, or none."""
-    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius all these models are linear
-    if kind == "fov":
-        return xy * (np.arctan(2 * r * np.tan(k[0] / 2)) / (k[0] * r))[:, None]
-    if kind == "equidistant":
-        angle = np.arctan(r)
-        return xy * (angle * (1 + angle[:, None] ** (2 * np.arange(1, 5)) @ k) / r)[:, None]
-    return xy
+def _of_fov(xy: np.ndarray, omega: float) -> np.ndarray:
+    """Return normalised coordinates (n, 2) with the radial distortion of the model fov."""
+    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius the model is linear
+    return xy * (np.arctan(2 * r * np.tan(omega / 2)) / (omega * r))[:, None]
 
 
 def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
-    """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2).
-
-    Raises InputError: the name is unknown, or numbers are missing.
-    """
+    """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2)."""
     match = SPLINED.fullmatch(name)
     if match is None:
         raise InputError(

@@ -70,10 +70,7 @@ def is_mrcal(text: str) -> bool:
 
 
 def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined.
-
-    Raises InputError: the text is no such file, or has another lens model.
-    """
+    """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined."""
     try:
         values = ast.literal_eval(text.strip())
         lens, numbers = values["lensmodel"], [float(v) for v in values["intrinsics"]]
@@ -128,11 +125,7 @@ def is_colmap_binary(content: bytes) -> bool:
 
 
 def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of ``cameras.bin``, or the one of number ``choice``.
-
-    Raises InputError: the content has another form, there are several cameras and no choice, or the model is not
-    supported.
-    """
+    """Return the camera of ``cameras.bin``, or the one of number ``choice``."""
     try:
         (count,) = struct.unpack_from("<Q", content, 0)
         at, cameras = 8, {}

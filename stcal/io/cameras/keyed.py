@@ -98,11 +98,11 @@ def _camera(
         )
     if listed:
         _require_order(lens, width, height, keys)
-    if kind == "unified" or not abs(skew) <= SQUARE * abs(lens[0]):
+    if kind == "unified" or (kind == "equidistant" and not abs(skew) <= SQUARE * abs(lens[0])):
         return of_parts(lens, skew, given, kind, width, height, keys.source, xi)
     if kind == "equidistant":
         return camera_from_opencv(lens, given, True, width, height, keys.source)
-    return of_opencv(lens, given, width, height, keys.source)
+    return of_opencv(lens, given, width, height, keys.source, skew)
 
 
 SAYS_LENS = {
@@ -114,10 +114,7 @@ SAYS_LENS = {
 
 
 def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) -> str:
-    """Return the kind of lens: perspective, equidistant, or unified.
-
-    Raises InputError: it is another one, or two keys contradict each other.
-    """
+    """Return the kind of lens: perspective, equidistant, or unified; refuse others, and keys that disagree."""
     kinds = {"xi": "unified"} if xi else {}
     for name, value in said.items():
         word = plain("" if value is None else value)
@@ -225,8 +222,7 @@ def _of_kalibr(keys: Keys) -> Lens:
     assert numbers is not None  # by which the format is recognised
     given = np.zeros(0) if given is None else given
     if lens != "pinhole" or distortion == "fov":
-        values = {"intrinsics": numbers, "distortion_coeffs": given, "resolution": size[:2]}
-        return of_kalibr(lens, distortion, values, keys.source)
+        return of_kalibr(lens, distortion, numbers, given, size[:2], keys.source)
     if numbers.size != 4:
         raise keys.fault("E-CAMERA-COEFFICIENTS", f"intrinsics of {numbers.size} numbers; 4 needed")
     if distortion == "none" and given.any():

@@ -194,10 +194,7 @@ class Keys:
         return not {plain(key) for key in self.left}.isdisjoint(map(plain, names))
 
     def take(self, *names: str) -> object:
-        """Return the value of the key that has one of these names; None if there is none.
-
-        Raises InputError: two keys of these names differ.
-        """
+        """Return the value of the key that has one of these names; None if there is none."""
         wanted = [*map(plain, names)]
         found = {
             key: value for key, value in self.left.items() if plain(key) in wanted and not isinstance(value, Mapping)
@@ -221,10 +218,7 @@ class Keys:
         return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Return one number; ``default`` where there is no such key.
-
-        Raises InputError: there is no such key and no default, or it has another count of numbers.
-        """
+        """Return one number; ``default`` where there is no such key."""
         numbers = self.numbers(name)
         if numbers is None and default is None:
             raise self.fault("E-CAMERA-CONTENT", f"no {name}; add it")
@@ -233,10 +227,7 @@ class Keys:
         return float(default if numbers is None else numbers[0])  # type: ignore[arg-type]
 
     def size(self) -> tuple[float, float, bool]:
-        """Return width and height, px, 0 if the file states none; and whether they are from a list of both.
-
-        Raises InputError: a side is no number, or two keys contradict each other.
-        """
+        """Return width and height, px, 0 if the file states none; and whether they are from a list of both."""
         stated = [self.take(f"image_{side}", side) for side in ("width", "height")]
         if any(isinstance(side, bool) for side in stated):
             raise self.fault("E-CAMERA-SIZE", f"image_width and image_height are {stated}; numbers of pixels needed")

@@ -19,7 +19,7 @@ from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.foreign import ForeignLens, of_skewed, one_of
+from stcal.io.cameras.foreign import ForeignLens, of_opencv, one_of
 from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.model import CameraModel
 
@@ -69,11 +69,7 @@ def is_mat(content: bytes) -> bool:
 
 
 def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
-    """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras.
-
-    Raises InputError: the file is of version 7.3 (HDF5), has objects in place of structures, no camera, or several and
-    no choice.
-    """
+    """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras."""
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
@@ -103,8 +99,6 @@ def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
 
     SciPy follows any other type into foreign memory, which ends the process. ``data`` : elements in a row; ``order`` :
     ``<`` or ``>`` for the order of bytes; ``arrays`` : whether arrays may be among them.
-
-    Raises ValueError: an element is damaged.
     """
     at = count = 0
     while at < len(data):
@@ -146,10 +140,7 @@ def _require_array(data: bytes, order: str) -> None:
 
 
 def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of ``toStruct(cameraParameters)`` or ``toStruct(cameraIntrinsics)``, as a structure or as JSON.
-
-    Raises InputError: the lens is a fisheye lens, or a field is missing.
-    """
+    """Return the camera of ``toStruct`` of cameraParameters or cameraIntrinsics, as a structure or as JSON."""
     unread = {key: _plain_value(value) for key, value in values.items() if key not in TAKEN}
     require_known(unread, source, HARMLESS)
     if "MappingCoefficients" in values:
@@ -178,7 +169,7 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
     k = [0.0, 0.0] if radial is None else [*radial, 0.0, 0.0][: max(len(radial), 2)]
     p = [0.0, 0.0] if tangential is None else tangential
     lens = [fx, fy, cx - PIXEL_ORIGIN, cy - PIXEL_ORIGIN]
-    return of_skewed(lens, float(skew), np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source)
+    return of_opencv(lens, np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source, float(skew))
 
 
 def _plain_value(value: object) -> object:
@@ -226,7 +217,7 @@ def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
     focal, centre, k = (_known(values, key, source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
     width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
     skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
-    lens = of_skewed([*focal, *centre], skew, k, width, height, source)
+    lens = of_opencv([*focal, *centre], k, width, height, source, skew)
     if isinstance(lens, ForeignLens) or lens.colmap_model != "OPENCV":
         return lens
     if not all(f"{key}_error" in values for key in BOUGUET):

@@ -51,8 +51,6 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | Fo
     """Return the camera of a ``<calibration>`` with frame or fisheye projection.
 
     With ``b2``, ``p3`` or ``p4``, and a frame camera with ``k4``, it is a foreign lens.
-
-    Raises InputError: the projection is another one, a key may change it and is not known, or a value is impossible.
     """
     texts: dict[str, str] = {}
     for child in root:
@@ -101,11 +99,7 @@ def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: floa
 
 
 def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraModel | ForeignLens:
-    """Return a sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance.
-
-    Raises InputError: there is no calibrated sensor, there are several and no choice, or the covariance is invalid;
-    further errors as :func:`from_calibration`.
-    """
+    """Return a sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance."""
     sensors = {}
     for number, sensor in enumerate(root.iter("sensor")):
         calibrations = sensor.findall("calibration")

@@ -80,10 +80,7 @@ class CameraModel:
         return replace(self, width=width, height=height)
 
     def require_inside(self, width: int, height: int, image: str) -> None:
-        """Refuse an image without the principal point: a file that states no size may belong to another camera.
-
-        Raises InputError: the camera file and the image do not belong together.
-        """
+        """Refuse an image without the principal point: a file that states no size may belong to another camera."""
         x, y = self.centre
         if not (0 < x < width and 0 < y < height):
             raise InputError(
@@ -212,10 +209,7 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
 
 
 def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
-    """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : their file, for messages.
-
-    Raises InputError: the camera model is not supported, the number of parameters is wrong, or values are impossible.
-    """
+    """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : file, for messages."""
     if colmap_model not in COLMAP_LAYOUT:
         known = ", ".join(COLMAP_LAYOUT)
         raise InputError(
@@ -252,11 +246,6 @@ def camera_from_opencv(
     fisheye, tangential : equidistant projection; and whether ``given`` has p1, p2
     width, height : image size, px; 0 if the file states none
     path : camera file, for messages
-
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, no supported model has them, or values are impossible.
     """
     distortion, kind = opencv_lens(given, fisheye, f"camera file {path}", tangential)
     return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None, Path(path))

@@ -54,8 +54,6 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     """Return the camera that a photograph's EXIF describes.
 
     ``path`` : JPEG, TIFF or PNG file.
-
-    Raises InputError: the file is unreadable, or states no focal length.
     """
     try:
         data = read_bytes(path, IMAGE_BYTES)

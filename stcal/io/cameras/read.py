@@ -47,8 +47,6 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
 
     ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of the camera in a file
     of several.
-
-    Raises InputError: the file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
     """
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
@@ -100,10 +98,7 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
 
 
 def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple[int, int] | None) -> Camera:
-    """Return the camera of a file; ``size`` is taken where the file states none.
-
-    Raises InputError: no size is known.
-    """
+    """Return the camera of a file; ``size`` is taken where the file states none."""
     width, height = size or (0, 0)
     if not (model.width or width) or not (model.height or height):
         raise InputError(
@@ -160,11 +155,6 @@ def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray |
     return covariance
 
 
-def _starts_with(path: Path, head: bytes) -> bool:
-    with open(path, "rb") as stream:
-        return stream.read(len(head)) == head
-
-
 def _from_colmap(text: str, name: str, source: str) -> CameraModel | ForeignLens:
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cameras = {row[0]: row[1:] for row in rows}
@@ -187,8 +177,11 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     """Read the lens of a camera file, also of an unsupported model; arguments and errors as :func:`read_camera`."""
     path, name = Path(path), name or _chosen.get()
     try:
-        if path.is_file() and _starts_with(path, SQLITE):
-            return of_database(path, name)
+        if path.is_file():
+            with open(path, "rb") as stream:
+                is_database = stream.read(len(SQLITE)) == SQLITE
+            if is_database:
+                return of_database(path, name)
         content = read_bytes(path, SETTINGS_BYTES)
         for recognised, read in BINARY_FORMATS:
             if recognised(content):

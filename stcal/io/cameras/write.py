@@ -51,10 +51,7 @@ def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None
 
 
 def form_of(path: str | Path, form: str | None) -> CameraForm:
-    """Return the form of a camera file to write: ``form``, or that of the suffix if it is None.
-
-    Raises InputError: there is no such form.
-    """
+    """Return the form of a camera file to write: ``form``, or that of the suffix if it is None."""
     suffix = Path(path).suffix.lower()
     kind = SUFFIXES.get(suffix) if form is None else form
     if kind not in WRITERS:

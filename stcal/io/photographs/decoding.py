@@ -122,10 +122,7 @@ def is_heic(data: bytes) -> bool:
 
 
 def let_pillow_read_heic(name: str) -> None:
-    """Register the package that reads HEIC with Pillow.
-
-    Raises InputError: it is not installed; the message begins with ``name``.
-    """
+    """Register the package that reads HEIC with Pillow."""
     if find_spec("pillow_heif") is None:
         raise InputError("E-IMAGE-EXTRA", f"{name}: {UNREAD['.heic']}")
     import pillow_heif
@@ -134,10 +131,7 @@ def let_pillow_read_heic(name: str) -> None:
 
 
 def heic_grey(data: bytes, name: str) -> np.ndarray:
-    """Return the grey pixels of a HEIC photograph as they are stored, without the rotation that its container states.
-
-    Raises InputError: the package is missing, or the data are damaged or mirrored.
-    """
+    """Return the grey pixels of a HEIC photograph as they are stored, without the turn that its container states."""
     let_pillow_read_heic(name)
     lenient, ImageFile.LOAD_TRUNCATED_IMAGES = ImageFile.LOAD_TRUNCATED_IMAGES, False  # WeasyPrint turns it on
     try:

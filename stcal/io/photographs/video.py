@@ -52,10 +52,7 @@ class _Frame:
 
 
 def checked_every(every: str | int) -> str | int:
-    """Return ``auto`` or the number of frames.
-
-    Raises InputError: neither of them.
-    """
+    """Return ``auto`` or the number of frames."""
     if every == AUTO:
         return AUTO
     with contextlib.suppress(ValueError):
@@ -124,10 +121,8 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
 
     A warning lists them. Frames that are blurred more than others are left out.
 
-    Raises
-    ------
-    InputError
-        The video cannot be read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be written.
+    Raises InputError: the video cannot be read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be
+    written.
     """
     video, folder, every = Path(video), Path(folder), checked_every(every)
     written: list[tuple[Path, int, float]] = []

@@ -17,7 +17,6 @@ from stcal.io.poses.rotations import (
     said_convention,
     turned_values,
 )
-from stcal.io.quaternions import COLUMNS as QUATERNION
 from stcal.io.table import ANGLES, Table
 
 TRIPLES = {
@@ -72,15 +71,12 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
     """Return the rotations in the columns that begin with a prefix; None if there are none.
 
     ``rotation`` : name of the convention, from ``--rotation``, for angles whose columns leave it open.
-
-    Raises InputError: only some columns of a rotation exist, values are no rotation, or the convention must be given.
     """
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:
         table.has_rotation(prefix)
-        quaternion_columns = [c for c in table.columns if c in {prefix + q for q in QUATERNION}]
+        columns = [prefix + name for name in table.quaternion_columns(prefix)]
         by_order = table.quaternions != "wxyz"
-        columns = [quaternion_columns[3], *quaternion_columns[:3]] if by_order else [prefix + q for q in QUATERNION]
         words = "quaternions x, y, z, w by the order of their columns" if by_order else "quaternions by name"
         matrices = of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where)
         return Turned(matrices, words, tuple(columns))
@@ -126,7 +122,8 @@ def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
                 convention = convention_of(named[unit])
             else:
                 convention = said_convention(rotation, what, table.where)
-            if unit and convention.unit not in ("", unit) and "-" in (rotation or "") and _own_unit(rotation):
+            says_unit = (rotation or "").endswith(tuple(f"-{name}" for name in ANGLES))  # a robot's name implies one
+            if unit and says_unit and convention.unit not in ("", unit):
                 raise InputError(
                     "E-OPTION-CONTRADICTS",
                     f"{table.where}: {names[0]} and --rotation {rotation} are of two units; correct one",
@@ -147,11 +144,6 @@ def _four(table: Table, prefix: str, rotation: str | None) -> Turned | None:
     values = np.column_stack([table.numbers(column) for column in names])
     turned, words = turned_values(values, rotation, "q1, q2, q3, q4", places_of(table), table.where)
     return Turned(turned, words, names, stated=False)
-
-
-def _own_unit(rotation: str | None) -> bool:
-    """Return True if the option states a unit itself, instead of a robot's name that implies one."""
-    return (rotation or "").endswith(tuple(f"-{unit}" for unit in ANGLES))
 
 
 def fixed(value: float, digits: int) -> str:

@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.io.poses.columns import fixed
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
@@ -63,13 +63,12 @@ def read_messages(text: str) -> list[Static]:
 
 
 def _message(each: Static) -> dict:
-    w, x, y, z = (float(v) for v in Poses.of([each.pose]).quaternions()[0])
     return {
         "header": {"frame_id": each.parent},
         "child_frame_id": each.child,
         "transform": {
             "translation": dict(zip("xyz", metres(each.pose), strict=True)),
-            "rotation": {"x": x, "y": y, "z": z, "w": w},
+            "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
         },
     }
 
@@ -113,10 +112,7 @@ def read_ros2_commands(text: str) -> list[Static]:
 
 
 def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it.
-
-    Raises InputError: a name has white space, at which ``roslaunch`` would split it.
-    """
+    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it."""
     lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
     for static in statics:
         names = static.parent, static.child
@@ -125,11 +121,7 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
                 "E-FRAME-NAME",
                 f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name",
             )
-        words = [
-            *plain_numbers(metres(static.pose), METRE_DIGITS),
-            *plain_numbers(xyzw(static.pose), QUATERNION_DIGITS),
-            *names,
-        ]
+        words = [*_pose_words(static.pose), *names]
         node = f"{static.child}_broadcaster".replace("/", "_")
         lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
         lines.append(f"      args={quoteattr(' '.join(words))} />")
@@ -167,9 +159,13 @@ def read_ros2_launch(text: str) -> list[Static]:
 
 
 def _arguments(each: Static) -> list[str]:
-    values = [*plain_numbers(metres(each.pose), METRE_DIGITS), *plain_numbers(xyzw(each.pose), QUATERNION_DIGITS)]
-    pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *zip(ARGUMENTS, values, strict=True)]
+    values = zip(ARGUMENTS, _pose_words(each.pose), strict=True)
+    pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *values]
     return [word for pair in pairs for word in pair]
+
+
+def _pose_words(pose: Rigid) -> list[str]:
+    return [*plain_numbers(metres(pose), METRE_DIGITS), *plain_numbers(xyzw(pose), QUATERNION_DIGITS)]
 
 
 def _static_of_arguments(words: list[str]) -> Static:
@@ -207,10 +203,7 @@ def from_roll_pitch_yaw(angles) -> np.ndarray:
 
 
 def require_form(form: str, forms: Collection[str]) -> None:
-    """Refuses a form of ``--export`` that is not one of ``forms``.
-
-    Raises InputError: the form is unknown; the message names the known ones.
-    """
+    """Refuses a form of ``--export`` that is not one of ``forms``."""
     if form not in forms:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(forms)} needed")
 
@@ -236,10 +229,7 @@ class ImageLine:
 
 
 def image_lines(text: str, where: str) -> list[ImageLine]:
-    """Return the images of ``images.txt``, also of one from which empty lines were removed.
-
-    Raises InputError: a line is neither an image's nor a list of points; the message names it.
-    """
+    """Return the images of ``images.txt``, also of one from which empty lines were removed."""
     images: list[ImageLine] = []
     pending: tuple[int, list[float], str] | None = None  # an image whose second line is to come
     for number, line in enumerate(text.splitlines(), 1):

@@ -72,10 +72,7 @@ class Convention:
 
 
 def convention_of(name: str) -> Convention:
-    """Return the convention of a name that the user gives, such as ``kuka-abc``, ``ZYX``, ``zyx-rad``, ``rotvec-deg``.
-
-    Raises InputError: the name is unknown.
-    """
+    """Return the convention of a name that the user gives, such as ``kuka-abc``, ``ZYX`` or ``rotvec-deg``."""
     if name in ALIASES:
         return Convention(*ALIASES[name])
     order, _, unit = name.partition("-")
@@ -91,10 +88,7 @@ def convention_of(name: str) -> Convention:
 
 
 def said_convention(rotation: str | None, what: str, where: str, count: int = 3) -> Convention:
-    """Return the convention of the option ``--rotation``; ``what`` : names of the columns, or their description.
-
-    Raises InputError: the option is not given, or its convention has another number of values.
-    """
+    """Return the convention of the option ``--rotation``; ``what`` : names of the columns, or their description."""
     if rotation is None:
         likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
         form = "quaternions" if count == len("wxyz") else "Euler angles in any order of axes or rotation vectors"
@@ -114,8 +108,6 @@ def rotations(
     """Return matrices (m, 3, 3) of Euler angles or rotation vectors (m, 3), and the convention used, in words.
 
     ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations.
-
-    Raises InputError: values are not finite, their unit is ambiguous, or they are too large for radians.
     """
     require_finite(values, places, where)
     unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
@@ -155,10 +147,7 @@ def turned_values(
 
 
 def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
-    """Return matrices (m, 3, 3) projected onto rotations, since files state few digits.
-
-    Raises InputError: a matrix is no rotation; the message names it, the deviation, and its likely cause.
-    """
+    """Return matrices (m, 3, 3) projected onto rotations, since files state few digits."""
     require_finite(rotation, places, where)
     u, size, vt = np.linalg.svd(rotation)
     off = np.abs(size - 1).max(axis=1)
@@ -180,10 +169,7 @@ def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarra
 
 
 def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
-    """Return the rotations (m, 3, 3) of quaternions (m, 4), w first.
-
-    Raises InputError: a quaternion is not of unit length.
-    """
+    """Return the rotations (m, 3, 3) of quaternions (m, 4), w first."""
     require_finite(wxyz, places, where)
     require_unit(wxyz, places.__getitem__, where, "correct it")
     return np.array(Poses.from_quaternions(wxyz, np.zeros((len(wxyz), 3))).rotation)

@@ -35,6 +35,7 @@ NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
+OF_IMAGES = ("--poses", "--camera", "--board")
 PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | Told
 
@@ -77,8 +78,6 @@ def one_source(
     out.
 
     Two tables of the package's own are joined as tables.
-
-    Raises InputError: as in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
     if second is None:
         return source, ()
@@ -207,9 +206,6 @@ def read_input(
     ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``statements`` :
     the user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose
     joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
-
-    Raises InputError: a file is missing or not of the required form, one file too many was given, or no image shows the
-    board.
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
@@ -238,23 +234,25 @@ def read_input(
 
 
 def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Path | None) -> tuple[Path, Path, Path]:
-    images = {"--poses": poses, "--camera": camera, "--board": board}
-    missing = [name for name, path in images.items() if path is None]
+    missing = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is None]
     if poses is None or camera is None or board is None:
         raise InputError("E-OPTION-MISSING", f"image folder {source}: {', '.join(missing)} needed with images")
     return poses, camera, board
 
 
+def _place(source: Source) -> str:
+    if isinstance(source, Path):
+        return str(source)
+    return source.where if isinstance(source, Table) else source.pairs.where
+
+
 def _require_no_images(source: Source, poses: Path | None, camera: Path | None, board: Path | None) -> None:
-    images = {"--poses": poses, "--camera": camera, "--board": board}
-    extra = [name for name, path in images.items() if path is not None]
+    extra = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is not None]
     if isinstance(source, Path) and not source.exists():
         raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed")
     if extra:
-        description = f"{source} is a file of poses"
-        if not isinstance(source, Path):
-            description = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
-        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {description}")
+        held = "is a file of poses" if isinstance(source, Path) else "are poses"
+        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {_place(source)} {held}")
 
 
 def _require_by_name(timing: Timing) -> None:
@@ -273,13 +271,10 @@ def _require_timed(source: Source, timing: Timing) -> None:
             "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
         )
     if timing.offset and not (isinstance(source, Told) and source.timed is not None):
-        where = (
-            source.where if isinstance(source, Table) else source if isinstance(source, Path) else source.pairs.where
-        )
         raise InputError(
             "E-OPTION-NEEDS",
-            f"{where}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images and "
-            "--poses, each with times",
+            f"{_place(source)}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or "
+            "images and --poses, each with times",
         )
 
 
@@ -294,10 +289,7 @@ def _require_unsaid(statements: Said, where: str) -> None:
 
 
 def setup_of(statements: Said, told: str | None, where: str) -> Setup:
-    """Returns the setup that the user states, or that a file states, or eye-in-hand.
-
-    Raises InputError: the user and the file contradict each other.
-    """
+    """Returns the setup that the user states, or that a file states, or eye-in-hand."""
     if statements.setup and told and statements.setup != told:
         raise InputError(
             "E-OPTION-CONTRADICTS", f"{where}: of a setup {told}, --setup {statements.setup}; leave the option out"
@@ -329,10 +321,7 @@ def _from_images(
     timing: Timing | None,
     arm: Arm | None = None,
 ) -> HandEyeInput:
-    """Returns the pairs of all images that show the board and have a pose.
-
-    Raises InputError: no image shows the board, or no image has a pose.
-    """
+    """Returns the pairs of all images that show the board and have a pose."""
     design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
     at_images = robot_at_images(robot, [file.name for file in files], timing)
@@ -406,10 +395,7 @@ def dry_run(
     timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> list[str]:
-    """Returns lines on how the inputs are understood, without looking for the board in images.
-
-    Raises InputError: for the reasons given in :func:`read_input`.
-    """
+    """Returns lines on how the inputs are understood, without looking for the board in images."""
     if isinstance(source, Path) and source.is_dir():
         return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, statements, timing, robot)
     inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)

@@ -22,7 +22,7 @@ from stcal.handeye.data.formats.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.poses.rotations import of_quaternions, require_finite, said_convention, turned_values
 from stcal.io.table import is_comment, read_table, separator_stated
-from stcal.io.toml import load_yaml
+from stcal.io.toml import load_documents
 
 KNOWN = (
     "a table with named columns, a TUM trajectory, 4×4 matrices in JSON, npy, npz or OpenCV's FileStorage, samples of "
@@ -74,8 +74,6 @@ def read_content(path: Path, statements: Said, key: str = "image", quaternions: 
     better messages.
 
     ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
-
-    Raises InputError: the message says what is wrong with the file, or names the formats that are read.
     """
     if path.is_dir():
         raise InputError("E-POSES-NOT-FOUND", f"{path}: a folder; one file needed: {KNOWN}")
@@ -113,10 +111,7 @@ def _numbers(line: str) -> list[float] | None:
 
 
 def _table_of(file: File, of_line: Callable[[str], list[float] | None], count: int) -> tuple[np.ndarray, tuple]:
-    """Returns the numbers (m, count) of all lines, and their places.
-
-    Raises InputError: a line holds something else; the message names it.
-    """
+    """Returns the numbers (m, count) of all lines, and their places; refuses a line that holds something else."""
     values = []
     for number, line in file.lines:
         row = of_line(line)
@@ -144,11 +139,7 @@ def _of_universal(file: File) -> Content:
 
 
 def _of_tum(file: File) -> Content:
-    """Returns poses from lines of timestamp tx ty tz qx qy qz qw. A comment may state another order of the quaternion.
-    Times in whole nanoseconds without such a comment, as in EuRoC, leave the order open.
-
-    Raises InputError: a row occurs twice, a quaternion is not of unit length, or its order must be stated.
-    """
+    """Returns poses of lines timestamp tx ty tz qx qy qz qw; a comment, or --rotation, may state another order."""
     values, places = _table_of(file, _numbers, TUM)
     names = tuple(re.split(r"[\s,;]+", line.strip())[0] for _, line in file.lines)
     comments = (line for line in file.text.splitlines() if is_comment(line))
@@ -166,15 +157,15 @@ def _of_tum(file: File) -> Content:
     return Content("TUM trajectory (timestamp, place, quaternion)", (side,))
 
 
-def _refuse_rows(file: File) -> Content:
-    values = _numbers(file.first) or _numbers(re.split(r"[\s,;]+", file.first, maxsplit=1)[1]) or []
-    raise _not_known(file.where, f"rows of {len(values)} numbers without a header")
-
-
-def _is_rows(file: File) -> bool:
-    """True if the first line is numbers, or a name and numbers."""
+def _row_of_numbers(file: File) -> list[float] | None:
+    """Returns the numbers of the first line, with or without a name before them; None for any other line."""
     name, *others = re.split(r"[\s,;]+", file.first, maxsplit=1)
-    return _numbers(file.first) is not None or bool(others and ":" not in name and name != "-" and _numbers(others[0]))
+    named = others and ":" not in name and name != "-"
+    return _numbers(file.first) or (_numbers(others[0]) if named else None)
+
+
+def _refuse_rows(file: File) -> Content:
+    raise _not_known(file.where, f"rows of {len(_row_of_numbers(file) or [])} numbers without a header")
 
 
 def _is_table(file: File) -> bool:
@@ -208,28 +199,19 @@ def _of_yaml(file: File) -> Content:
             "E-FILE-TOO-LARGE",
             f"{file.where}: {len(file.text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read",
         )
-    headless = re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", file.text)
-    parts = [part for part in re.split(r"^---[ \t]*$", headless, flags=re.MULTILINE) if part.strip()]
     try:
-        value = load_yaml(parts[0])
+        documents = [each for each in load_documents(file.text) if each is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError(
             "E-YAML-INVALID", f"{file.where}: not YAML ({' '.join(str(error).split())[:100]}); {KNOWN} needed"
         ) from error
-    if len(parts) > 1 or not isinstance(value, list | dict):
-        raise _not_known(file.where, f"{len(parts)} documents of YAML" if len(parts) > 1 else "not understood")
-    return _of_values(file, value, "YAML")
-
-
-def _of_npy(file: File) -> Content:
-    return _of_values(file, _array(file.data, file.where), "NumPy array")
+    if len(documents) != 1 or not isinstance(documents[0], list | dict):
+        raise _not_known(file.where, f"{len(documents)} documents of YAML" if documents[1:] else "not understood")
+    return _of_values(file, documents[0], "YAML")
 
 
 def _of_npz(file: File) -> Content:
-    """Returns the poses of an archive of arrays. Names of arrays that are not numbers are passed over.
-
-    Raises InputError: the file is damaged, or larger than any such file is when unpacked.
-    """
+    """Returns the poses of an archive of arrays; arrays of other things than numbers are passed over."""
     arrays: dict[str, Any] = {}
     others = []
     try:
@@ -259,10 +241,7 @@ def _of_npz(file: File) -> Content:
 
 
 def _array(data: bytes, where: str) -> np.ndarray | list[str]:
-    """Returns the array of an npy file, or its strings, which are mostly names of images.
-
-    Raises InputError: the file is damaged, or holds something else.
-    """
+    """Returns the array of an npy file, or its strings, which are mostly names of images."""
     stream = io.BytesIO(data)
     try:
         array = np.load(stream, allow_pickle=False)
@@ -287,7 +266,7 @@ def _damaged(where: str, error: Exception) -> InputError:
     )
 
 
-FORMATS: tuple[tuple[Callable[[File], bool], Callable[[File], Content | None]], ...] = (
+FORMATS: tuple[tuple[Callable[[File], object], Callable[[File], Content | None]], ...] = (
     (
         lambda file: file.data.startswith(NPY),
         lambda file: _of_values(file, _array(file.data, file.where), "NumPy array"),
@@ -296,7 +275,7 @@ FORMATS: tuple[tuple[Callable[[File], bool], Callable[[File], Content | None]], 
     (_is_json, lambda file: _of_values(file, json.loads(file.text), "JSON")),
     (lambda file: bool(_UNIVERSAL.fullmatch(file.first)), _of_universal),
     (lambda file: len(_numbers(file.first) or ()) == TUM, _of_tum),
-    (_is_rows, _refuse_rows),
+    (_row_of_numbers, _refuse_rows),
     (_is_table, _of_table),
     (lambda file: True, _of_yaml),
 )

@@ -124,8 +124,6 @@ class Said:
     ) -> "Said":
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
         ``robot=`` and ``camera=``, and of ``--poses-are``.
-
-        Raises InputError: a name is not known, or is given twice.
         """
         whole: dict[str, str] = {}
         by_role: list[tuple[Role, str, str]] = []
@@ -181,10 +179,7 @@ class Said:
 
 
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rotations and translations of homogeneous matrices (m, 4, 4).
-
-    Raises InputError: a last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
-    """
+    """Returns the rotations and translations of homogeneous matrices (m, 4, 4)."""
     require_finite(matrices, places, where)
     bad = np.flatnonzero(np.abs(matrices[:, 3:] - [0, 0, 0, 1]).max(axis=(1, 2)) > 0)
     if len(bad):
@@ -198,10 +193,7 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
 
 
 def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:
-    """Refuse a name that two poses have. ``kind`` says whether it names an image or a time stamp.
-
-    Raises InputError: a name occurs twice.
-    """
+    """Refuse a name that two poses have. ``kind`` says whether it names an image or a time stamp."""
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:
@@ -257,8 +249,7 @@ def frames_of(key: str) -> Frames | None:
 
 
 def inverse_name(key: str) -> str:
-    """Returns a name with its two frames changed about, like ``t_cam2target`` of ``t_target2cam``; empty where the name
-    is of another form."""
+    """Returns a name with its two frames exchanged, such as ``t_cam2target``; empty for a name of another form."""
     for between in ("_from_", "_wrt_", "_in_", "2"):
         head, separator, tail = key.partition(between)
         if separator:

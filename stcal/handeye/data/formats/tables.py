@@ -27,10 +27,7 @@ def todays(table: Table) -> bool:
 
 
 def read_columns(table: Table, key: str, statements: Said) -> Content | None:
-    """Returns the poses in the columns of a table; None where it has none.
-
-    Raises InputError: some columns of a pose are missing, or the convention must be stated.
-    """
+    """Returns the poses in the columns of a table; None where it has none."""
     names, sides = _row_names(table, key), []
     for frame in EVERY_FRAME:
         side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, statements)
@@ -51,8 +48,7 @@ def read_columns(table: Table, key: str, statements: Said) -> Content | None:
 
 
 def _row_names(table: Table, key: str) -> tuple[str, ...]:
-    """Returns the image or time of each row as text, since nanoseconds have more digits than a float; empty where no
-    column names the rows."""
+    """Returns image or time of each row, as text: nanoseconds have more digits than a float; empty without a column."""
     lower = {name.lower(): name for name in table.columns}
     column = next((name for name in (key, *NAMES) if name in table), None)
     column = column or next((lower[name] for name in NAMES if name in lower), None)

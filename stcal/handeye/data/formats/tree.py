@@ -38,10 +38,7 @@ ROS = Unit("m", "as in ROS")
 
 
 def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | None:
-    """Returns the poses in plain values; None where there are none.
-
-    Raises InputError: a pose is not valid, or there are more than two sides.
-    """
+    """Returns the poses in plain values; None where there are none."""
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
             raise InputError(
@@ -73,8 +70,7 @@ def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | 
 
 
 def numbers(value: Any) -> np.ndarray | None:
-    """Returns an array of numbers from lists, arrays or OpenCV's matrix; None for anything else, and for ragged
-    lists."""
+    """Returns an array of numbers from lists, arrays or OpenCV's matrix; None for others, and for ragged lists."""
     if isinstance(value, Mapping):
         if not {"rows", "cols", "data"} <= value.keys():
             return None
@@ -93,8 +89,7 @@ def numbers(value: Any) -> np.ndarray | None:
 
 
 def _all_numbers(value: Any) -> bool:
-    """True if all values are numbers or null. Text that looks like a number is not a number; a null is reported later
-    with its place."""
+    """True if all values are numbers or null, which is reported later with its place; text is no number."""
     if isinstance(value, list):
         return all(_all_numbers(item) for item in value)
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
@@ -119,10 +114,7 @@ def _name_in(value: Mapping) -> str:
 
 
 def _side_of(value: Any, where: str, frames: Frames | None = None) -> Side | None:
-    """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else.
-
-    Raises InputError: a value is no matrix where those before it are, or a matrix is not valid.
-    """
+    """Returns the matrices of a list, of a stack, or of a mapping by name; None for anything else."""
     names: tuple[str, ...] = ()
     if isinstance(value, Mapping):
         if (found := _matrix(value)) is not None:
@@ -157,8 +149,7 @@ def _side_of(value: Any, where: str, frames: Frames | None = None) -> Side | Non
 
 
 def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None:
-    """Returns the samples of easy_handeye, ROS 1 and 2. For a camera that stands still it writes the robot's poses
-    inverted."""
+    """Returns easy_handeye's samples, in which the robot's poses are inverted for a camera that stands still."""
     samples, parameters = value.get("samples", value), value.get("parameters")
     if isinstance(samples, Mapping) and {"hand_world_samples", "camera_marker_samples"} <= samples.keys():
         lists = [samples["hand_world_samples"], samples["camera_marker_samples"]]
