@@ -156,17 +156,6 @@ def test_circles_carry_covariances_in_the_target_frame(scene, labels_only):
     assert 2 < sigma_um < 30
 
 
-def test_eccentricity_has_the_size_of_the_notes():
-    """At 1 m, f = 5580 px, r = 8 mm and 45°: 0.18 px (field notes, from the dual conic)."""
-    from stcal.geometry.plane import circle_image_offset
-
-    normal = np.array([[0, np.sin(np.pi / 4), -np.cos(np.pi / 4)]])
-    centre = np.array([[0, 0, 1000.0]])
-    shifted = circle_image_offset(centre, normal, np.array([8.0]))
-    size = 5580 * np.linalg.norm(shifted[0, :2] / shifted[0, 2] - centre[0, :2] / centre[0, 2])
-    assert size == pytest.approx(0.18, abs=0.005)
-
-
 def test_eccentricity_of_a_model_uses_the_fitted_planes(scene, labels_only):
     observed = labels_only.observations(scene, 0.0, np.random.default_rng(0))
     model = labels_only.models(scene, observed)[0]

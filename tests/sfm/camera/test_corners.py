@@ -147,8 +147,7 @@ def test_corners_are_dots_without_extent():
         corner_grid(TagLayout((("DICT_4X4_50", 1),), np.zeros((1, 4, 2))))
 
 
-@pytest.mark.slow
-def test_a_folder_without_the_board(photographs, tmp_path):
+def test_a_folder_without_the_board(tmp_path):
     with fails_with("E-IMAGES-FOLDER … does not exist"):
         calibrate_camera_by_corners(tmp_path / "none", ChessboardDesign(7, 10, 12.0))
 
