@@ -9,7 +9,6 @@ from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import chain_faces, measure_chains
 from stcal.sfm.adjust.faces import FaceInGroup, face_frame
 from stcal.sfm.adjust.refine import adjust
-from stcal.sfm.adjust.uncertainty import Derivatives
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 
@@ -57,17 +56,6 @@ def test_the_normal_is_taken_towards_the_camera():
 def test_a_missing_frame_circle_is_named():
     with fails_with("E-FACE-FRAME-CIRCLES … 1:3 and 1:5"):
         face_frame(FACE, circles(keep="12467abc"), "plane", np.array([0, 0, 1.0]))
-
-
-def test_covariances_of_circles_are_the_blocks_of_that_of_all():
-    rng = np.random.default_rng(1)
-    root = rng.normal(size=(6, 6))
-    derivatives = Derivatives(
-        {}, np.zeros((2, 3)), Rigid(), {}, rng.normal(size=(2, 3, 6)), {}, rng.normal(size=(2, 3, 4)), 0.02
-    )
-    every = derivatives.all_circles_covariance(root @ root.T)
-    for i, own in enumerate(derivatives.circle_covariance(root @ root.T)):
-        np.testing.assert_allclose(own, every[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-12)
 
 
 # Chains ---------------------------------------------------------------------------------------------------------

@@ -32,20 +32,6 @@ def test_poses_and_circles_come_back(written, scene):
     assert content["centre_sigma_factor"] == 1.25
 
 
-def test_the_triangle_is_that_of_the_joint_covariance(written):
-    """Its blocks on the diagonal are the circles' own, and it is symmetric and not negative when put together."""
-    _, content = written
-    joint = content["circles_joint_covariance_mm2"]
-    size = 3 * len(joint["labels"])
-    full = np.zeros((size, size))
-    full[np.triu_indices(size)] = joint["upper_triangle"]
-    full += np.triu(full, 1).T
-    for i, label in enumerate(joint["labels"]):
-        own = full[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
-        np.testing.assert_allclose(own, content["circle_covariance_mm2"][label], atol=1e-15)
-    assert np.linalg.eigvalsh(full).min() > -1e-9 * np.trace(full)
-
-
 def test_sigma_of_a_distance_is_that_of_the_faces(written):
     """From the reference, which is held, to another face: what the other's translation may do along the line."""
     target, content = written

@@ -16,7 +16,6 @@ from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 
 NOISE_PX = 0.01
-TWO = (("1", "2"), ("1", "4"))
 
 
 def position_error_um(scene, observations, camera, refine_camera: bool) -> float:
@@ -35,20 +34,16 @@ def position_error_um(scene, observations, camera, refine_camera: bool) -> float
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sets", "groups"), [(1, TWO), pytest.param(3, None, marks=pytest.mark.full)])
-def test_wrong_intrinsics_are_refined(sets, groups):
+def test_wrong_intrinsics_are_refined():
     """0.03 % in f, 2 px in c, 1 % in k1: within 1.5 times the error with the true camera; several times it without."""
-    errors = []
-    for seed in range(sets):
-        scene = make_scene(SceneOptions(seed=seed, images_per_group=6 if groups is None else 4, groups=groups))
-        observations = observe(scene, NOISE_PX, np.random.default_rng(seed))
-        true = scene.camera
-        k1 = np.array([0.01 * true.distortion[0], *[0] * 11])
-        centre = true.centre + np.array([2, 2])
-        wrong = replace(true, focal=1.0003 * true.focal, centre=centre, distortion=true.distortion + k1)
-        cases = ((true, False), (wrong, True), (wrong, False))
-        errors.append([position_error_um(scene, observations, camera, refined) for camera, refined in cases])
-    known, refined, held = np.sqrt(np.mean(np.square(errors), axis=0))
+    scene = make_scene(SceneOptions(seed=0, images_per_group=4, groups=(("1", "2"), ("1", "4"))))
+    observations = observe(scene, NOISE_PX, np.random.default_rng(0))
+    true = scene.camera
+    k1 = np.array([0.01 * true.distortion[0], *[0] * 11])
+    centre = true.centre + np.array([2, 2])
+    wrong = replace(true, focal=1.0003 * true.focal, centre=centre, distortion=true.distortion + k1)
+    cases = ((true, False), (wrong, True), (wrong, False))
+    known, refined, held = (position_error_um(scene, observations, camera, refine) for camera, refine in cases)
     assert 0.5 * known < refined < 1.5 * known
     assert held > 5 * known
 

@@ -172,18 +172,14 @@ def result():
 
 
 @pytest.mark.slow
-def test_text_and_file_have_all_models(result):
+def test_text_page_and_file_have_all_models(result):
     summary = CalibrationFile.of(result)
-    text = calibration_report(result, summary, "images").text()
+    report = calibration_report(result, summary, "images")
+    text, page = report.text(), report.page()
     assert re.search(r"views held out, 5 parts: residual RMS 0\.0\d+ px after their poses were fitted", text)
     assert re.search(r"\* +OPENCV +8 +0\.0\d+ +0\.0000", text)
     assert [each.model for each in summary.models] == ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"]
     assert summary.held_out.folds == 5
-
-
-@pytest.mark.slow
-def test_the_page_shows_sigma_and_models(result):
-    page = calibration_report(result, CalibrationFile.of(result), "images").page()
     assert page.count("data:image/svg+xml") == 4
     for words in ("σ of a projection over the image", "difference of two halves", "Lens models", "SIMPLE_RADIAL"):
         assert words in page

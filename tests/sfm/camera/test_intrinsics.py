@@ -67,18 +67,16 @@ def error(result, truth=TRUE) -> np.ndarray:
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("count", [3, pytest.param(40, marks=pytest.mark.full)])
-def test_truth_within_predicted_sigma(count):
+def test_truth_within_predicted_sigma():
     # Of 40 calibrations from nothing the normalised squared error of 8 parameters scatters by 8 % about 1.
     squares, factors = [], []
-    for seed in range(count):
+    for seed in range(40):
         result = calibrated(views_of(np.random.default_rng(seed)))
         e = error(result)
         squares.append(e @ np.linalg.solve(result.covariance, e) / 8)
         factors.append(result.factors.centres)
-    wider = np.sqrt(40 / count)
-    assert abs(np.mean(squares) - 1) < 0.2 * wider
-    assert abs(np.mean(factors) - 1) < 0.02 * wider
+    assert abs(np.mean(squares) - 1) < 0.2
+    assert abs(np.mean(factors) - 1) < 0.02
     # Of a 24 mm lens on a 22 mm sensor, 1 px is 4e-4: σ of 0.02 px centres must be far below.
     assert 0.05 < result.sigma()[0] < 0.2
 
@@ -193,16 +191,14 @@ def test_a_model_that_does_not_fit_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, pytest.param(4, marks=pytest.mark.slow)])
-def test_split_half_passes_honest_views(count):
+def test_split_half_passes_honest_views():
     p = []
-    for seed in range(count):
+    for seed in range(4):
         views = views_of(np.random.default_rng(seed))
         p.append(split_half(calibrated(views), views, BOARD).p_value)
     assert min(p) > 1e-3
     assert max(p) < 1 - 1e-3
-    if count > 1:
-        assert np.mean(p) == pytest.approx(0.5, abs=0.43)  # uniform: σ of the mean 0.14
+    assert np.mean(p) == pytest.approx(0.5, abs=0.43)  # uniform: σ of the mean 0.14
 
 
 @pytest.mark.slow
@@ -328,19 +324,10 @@ def test_two_views_are_refused_and_another_size_is_named(stcal_sfm, small_set):
     assert "12/IMG_1002.jpg: 600×400 px, but the majority of the images says 1296×864 px" in message
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--model", "FISHEYE"], "camera model FISHEYE: not supported; use one of SIMPLE_PINHOLE"),
-        (["--out", "target.toml"], "--out target.toml: exists; give another name, or --overwrite to replace it"),
-    ],
-)
-def test_impossible_options(stcal_sfm, small_dataset, monkeypatch, more, message):
-    monkeypatch.chdir(small_dataset)
-    monkeypatch.setattr("pathlib.Path.write_text", lambda *_, **__: pytest.fail("nothing may be written"))
-    code, _, printed = stcal_sfm("calibrate-camera", "images", "--out", "new.txt", *more)
-    assert code == 2
-    assert message in printed
+def test_an_unknown_model_ends_the_command(stcal_sfm, small_dataset, tmp_path):
+    words = "calibrate-camera", small_dataset / "images", "--out", tmp_path / "new.txt", "--model", "FISHEYE"
+    ended = stcal_sfm(*words)
+    assert (ended[0], ended.error) == (2, "E-CAMERA-MODEL")
 
 
 def bowed(rng, bow_mm: float) -> np.ndarray:

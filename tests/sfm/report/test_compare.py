@@ -21,28 +21,13 @@ from tests.shared import own_copy, unsealed_copy
 COVARIANCE = "target_from_face_covariance"
 
 
-def spoilt_covariance(change):
-    def spoil(content) -> None:
-        content[COVARIANCE]["2"] = change(np.array(content[COVARIANCE]["2"])).tolist()
-
-    return spoil
-
-
-def correlated(matrix: np.ndarray) -> np.ndarray:
-    matrix[3, 4] = matrix[4, 3] = 9 * np.sqrt(matrix[3, 3] * matrix[4, 4])
-    return matrix
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda content: content.update(unit="m"), r"unit: 'm': input should be 'mm'"),
         (lambda content: content.update(format="stcal faces 2"), r"format: 'stcal faces 2': .*'stcal faces 1'"),
-        (spoilt_covariance(lambda c: c[:5, :5]), rf"{COVARIANCE}\.2: 5×5, 6×6 needed; give"),
-        (spoilt_covariance(lambda c: -c), rf"{COVARIANCE}\.2: variance -\S+ of rx, 0 or more needed; give"),
-        (spoilt_covariance(lambda c: c * np.nan), rf"{COVARIANCE}\.2: holds values that are not finite; give"),
-        (spoilt_covariance(correlated), rf"{COVARIANCE}\.2: correlation 9 of x and y, −1 to 1 needed; give"),
-        (spoilt_covariance(np.triu), rf"{COVARIANCE}\.2: not symmetric by 100 % at r\w, \w+; give"),
+        (lambda content: content[COVARIANCE]["2"].pop(), rf"{COVARIANCE}\.2: 5×6, 6×6 needed; give"),
+        (lambda content: content[COVARIANCE].update({"2": (-np.eye(6)).tolist()}), rf"{COVARIANCE}\.2: variance -1 of"),
     ],
 )
 def test_what_faces_json_may_not_hold(small_run, small_dataset, tmp_path, spoil, message):
