@@ -22,31 +22,20 @@ def circle_conic(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: f
 
 
 def ellipse_of_conic(conic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre (2,) and shape (2, 2) of an ellipse; the rim is ``centre + shape @ unit circle``, shape symmetric.
-
-    Raises
-    ------
-    ValueError
-        The conic is no real ellipse but a parabola, a hyperbola, a point, or empty.
-    """
+    """Centre (2,) and shape (2, 2) of an ellipse; the rim is ``centre + shape @ unit circle``, shape symmetric."""
     q = conic[:2, :2]
-    if np.linalg.det(q) <= 0:
-        raise ValueError("conic: not an ellipse; the circle must lie wholly in front of the camera")
     centre = -np.linalg.solve(q, conic[:2, 2])
     level = -(conic[2, 2] + conic[:2, 2] @ centre)
-    value, vector = np.linalg.eigh(q)
-    if level * value[0] <= 0:
-        raise ValueError("conic: no real points; an ellipse of positive size needed")
-    value = value / level
+    value, vector = np.linalg.eigh(q / level)
     return centre, (vector / np.sqrt(value)) @ vector.T
 
 
-def conic_of_ellipse(centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return the conic matrix (3, 3) of the ellipse ``centre + shape @ unit circle``; see :func:`ellipse_of_conic`."""
-    inverse = np.linalg.inv(shape)
-    to_unit = np.column_stack([inverse, -inverse @ centre])
-    m = np.vstack([to_unit, [0, 0, 1.0]])
-    return m.T @ np.diag([1.0, 1.0, -1.0]) @ m
+def area_and_centroid(polygon: np.ndarray) -> tuple[float, np.ndarray]:
+    """Of a polygon (n, 2), by Green's theorem."""
+    middle = polygon.mean(0)
+    p, q = polygon - middle, np.roll(polygon - middle, -1, axis=0)
+    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+    return abs(cross.sum()) / 2, middle + ((p + q) * cross[:, None]).sum(0) / (3 * cross.sum())
 
 
 def simulate_centres(
