@@ -148,10 +148,6 @@ def test_all_corners_of_a_real_charuco_board(shared_data):
     assert seen == [24] * 16
 
 
-TAG = 'type = "tags"\n[[tag]]\ndictionary = "4x4_50"\nid = 1\nsize_mm = 20.0\n'
-CHARUCO = 'type = "charuco"\nrows = 7\ncolumns = 5\nsquare_mm = 30.0\nmarker_mm = 20.0\ndictionary = "6x6_250"\n'
-
-
 def test_a_tag_stands_where_the_file_puts_it(tmp_path):
     path = tmp_path / "board.toml"
     path.write_text(

@@ -79,13 +79,12 @@ def test_svg_has_the_target_in_mm(files):
 
 @pytest.mark.slow
 def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
-    for paper in ("Letter",):
-        drawn = draw(files / "target.toml", files / f"{paper}.pdf", paper.lower())
-        sizes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", drawn.path.read_bytes())
-        assert len(sizes) == len(drawn.sheets) == 5
-        for sheet, size in zip(drawn.sheets, sizes, strict=True):
-            np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
-            assert sorted([sheet.width, sheet.height]) == sorted(PAPERS[paper])
+    drawn = draw(files / "target.toml", files / "target.pdf", "letter")
+    sizes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", drawn.path.read_bytes())
+    assert len(sizes) == len(drawn.sheets) == 5
+    for sheet, size in zip(drawn.sheets, sizes, strict=True):
+        np.testing.assert_allclose(np.array(size, float) * POINT_MM, [sheet.width, sheet.height], atol=1e-3)
+        assert sorted([sheet.width, sheet.height]) == sorted(PAPERS["Letter"])
 
 
 @pytest.mark.slow

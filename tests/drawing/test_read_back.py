@@ -16,6 +16,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_images, label_single  # noqa: F401
 from stcal.synthetic.designs import second_design
 from tests.drawing.raster import camera_of, obliquely, page_image, pages_of, pixel_from_page, shapes_of
+from tests.support.circle_images import area_and_centroid
 
 CIRCLE_PX, CORNER_PX = 0.1, 0.3
 """How well centres and corners are found again in an image without noise, blurred a little: edges of 8-bit pixels, and
@@ -30,13 +31,6 @@ def rims_px(sheet, page) -> dict[str, np.ndarray]:
     rim = np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1)
     discs = [s for s in shapes_of(sheet) if isinstance(s, Disc)]
     return {s.name: pixel_from_page(page, [s.x, s.y] + s.radius * rim) for s in discs}
-
-
-def middle(rim: np.ndarray) -> np.ndarray:
-    """Centre of the ellipse that a rim is."""
-    ahead = np.roll(rim, -1, axis=0)
-    area = rim[:, 0] * ahead[:, 1] - ahead[:, 0] * rim[:, 1]
-    return ((rim + ahead) * area[:, None]).sum(0) / (3 * area.sum())
 
 
 def seen_ways(image, places):
@@ -59,7 +53,7 @@ def test_faces_are_read_back(target: TargetDesign, tmp_path):
             detection = detect_image(image, camera, target, None, EllipseOptions())
             found = label_single("page", ".", detection, target).observations
             assert set(found.labels) == set(rims)
-            expected = [middle(rims[label]) for label in found.labels]
+            expected = [area_and_centroid(rims[label])[1] for label in found.labels]
             assert np.linalg.norm(found.centre_px - expected, axis=1).max() < CIRCLE_PX
 
 
@@ -72,7 +66,7 @@ def test_dots_are_read_back():
         (sighting,) = detection.boards
         (cells,) = sighting.numberings.tolist()
         assert {f"board:{row}:{column}" for row, column in cells} == set(rims)
-        expected = [middle(rims[f"board:{row}:{column}"]) for row, column in cells]
+        expected = [area_and_centroid(rims[f"board:{row}:{column}"])[1] for row, column in cells]
         off = detection.centres.centre_px[sighting.rows] - expected
         assert np.linalg.norm(off, axis=1).max() < CIRCLE_PX
 

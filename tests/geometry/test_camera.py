@@ -38,23 +38,10 @@ def test_projection_is_opencvs(distortion, xy, depth_mm):
     xyz = np.column_stack([xy, np.ones(len(xy))]) * depth_mm
     expected = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix_of(camera), distortion)[0].reshape(-1, 2)
     np.testing.assert_allclose(camera.project(xyz), expected, atol=1e-9)  # px; rounding at 5000 px is 1e-12
+    np.testing.assert_allclose(camera.normalised_from_pixel(expected), xy, atol=1e-11)  # 1e-12 through slopes of 0.1
 
 
-@given(lenses, normalised)
-def test_inverse_is_opencvs_with_tight_criteria(distortion, xy):
-    camera = camera_of(distortion)
-    pixels = camera.pixel_from_normalised(xy)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-13)
-    found = camera.normalised_from_pixel(pixels)
-    opencv = cv2.undistortPointsIter(pixels[:, None], matrix_of(camera), distortion, None, None, criteria)[:, 0]
-    # Where OpenCV's fixed-point iteration diverges it returns the distorted point: not a value to compare with.
-    settled = np.abs(camera.pixel_from_normalised(opencv) - pixels).max(-1) < 1e-8
-    np.testing.assert_allclose(found[settled], opencv[settled], atol=1e-11)
-    np.testing.assert_allclose(found, xy, atol=1e-11)  # 1e-12 through a slope of at least 0.1
-
-
-def test_opencvs_iteration_does_settle_on_a_common_lens():
-    # So that the comparison above compares something: a consumer lens, all points of the image.
+def test_inverse_is_opencvs_in_all_of_the_image():
     camera = camera_of([-0.12, 0.08, 1e-3, -5e-4, 0.01])
     grid = np.stack(np.meshgrid(np.linspace(0, WIDTH, 20), np.linspace(0, HEIGHT, 15)), -1).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-13)
@@ -69,18 +56,6 @@ def test_distort_and_undistort_are_inverse_in_either_order(distortion, xy):
     camera = camera_of(distortion)
     np.testing.assert_allclose(camera.distort(camera.undistort(0.5 * xy)), 0.5 * xy, atol=1.1e-12)
     np.testing.assert_allclose(camera.undistort(camera.distort(xy)), xy, atol=1e-11)
-
-
-@given(lenses, normalised)
-def test_jacobian_is_the_derivative(distortion, xy):
-    camera, step = camera_of(distortion), 1e-5
-    value, jac = camera.distort_jacobian(xy)
-    np.testing.assert_array_equal(value, camera.distort(xy))
-    for axis in range(2):
-        d = np.eye(2)[axis] * step
-        numeric = (camera.distort(xy + d) - camera.distort(xy - d)) / (2 * step)
-        # Central differences: step² times the third derivative (about 3), and rounding of 1e-16 / 1e-5.
-        np.testing.assert_allclose(jac[..., axis], numeric, atol=2e-9)
 
 
 def test_points_keep_their_shape():
@@ -175,6 +150,7 @@ def test_thin_prisms_are_opencvs(s, xy):
 
 
 CAMERAS = {
+    "rational": camera_of([-0.2, 0.1, 2e-3, -1e-3, 0.05, 0.1, -0.05, 0.02]),
     "prisms": Camera(
         WIDTH, HEIGHT, [5580, 5570], [2600, 1700], [-0.1, 0.03, 1e-3, -2e-3, 0.01, 0.02, 0, 0, 2e-3, -1e-3, 1e-3, 5e-4]
     ),
@@ -183,13 +159,15 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_derivatives_of_wide_lenses_are_those_of_differences(name):
+def test_derivatives_are_those_of_differences(name):
     camera = CAMERAS[name]
     xy = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2)) * (4 if camera.fisheye else 1)
     xy[0] = 0, 1e-5  # where the angle's series is taken
     moved = [camera.distort(xy + sign * step) for step in 1e-6 * np.eye(2) for sign in (1, -1)]
     by_difference = np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=-1) / 2e-6
-    np.testing.assert_allclose(camera.distort_jacobian(xy)[1], by_difference, atol=1e-9)
+    value, by_xy = camera.distort_jacobian(xy)
+    np.testing.assert_array_equal(value, camera.distort(xy))
+    np.testing.assert_allclose(by_xy, by_difference, atol=1e-9)
     jacobian, parameters = camera.parameter_jacobian(xy), camera.parameters()
     unused = {10, 11, 13, 15} if camera.fisheye else set()
     for k in sorted(set(range(16)) - unused):

@@ -74,13 +74,6 @@ def test_similarity_and_rigid_compose_in_either_order(a_from_b, b_from_c, xyz):
     np.testing.assert_allclose(mixed @ xyz, c_from_a @ (a_from_b @ xyz), rtol=1e-12, atol=100 * TOLERANCE_MM)
 
 
-@given(similarities, vectors, vectors)
-def test_similarity_multiplies_lengths_by_its_scale(a_from_b, p, q):
-    moved = a_from_b @ np.array([p, q])
-    expected = a_from_b.scale * np.linalg.norm(p - q)
-    assert np.linalg.norm(moved[0] - moved[1]) == pytest.approx(expected, abs=10 * TOLERANCE_MM)
-
-
 @given(rotation_vectors(), vectors)
 def test_exp_and_log_are_inverse_below_half_a_turn(w, t):
     twist = np.concatenate([w, t])

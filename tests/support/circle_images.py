@@ -22,12 +22,20 @@ def circle_conic(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: f
 
 
 def ellipse_of_conic(conic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre (2,) and symmetric shape (2, 2) of an ellipse; the rim is ``centre + shape @ unit circle``."""
+    """Centre (2,) and shape (2, 2) of an ellipse; the rim is ``centre + shape @ unit circle``, shape symmetric."""
     q = conic[:2, :2]
     centre = -np.linalg.solve(q, conic[:2, 2])
-    value, vector = np.linalg.eigh(q)
-    value = value / -(conic[2, 2] + conic[:2, 2] @ centre)
+    level = -(conic[2, 2] + conic[:2, 2] @ centre)
+    value, vector = np.linalg.eigh(q / level)
     return centre, (vector / np.sqrt(value)) @ vector.T
+
+
+def area_and_centroid(polygon: np.ndarray) -> tuple[float, np.ndarray]:
+    """Of a polygon (n, 2), by Green's theorem."""
+    middle = polygon.mean(0)
+    p, q = polygon - middle, np.roll(polygon - middle, -1, axis=0)
+    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+    return abs(cross.sum()) / 2, middle + ((p + q) * cross[:, None]).sum(0) / (3 * cross.sum())
 
 
 def simulate_centres(

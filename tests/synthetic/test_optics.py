@@ -192,22 +192,6 @@ def test_scenery_is_out_of_focus_too(scene):
     assert steepest(ThinLens(1.4, 24.0, 700.0)) < 0.5 * steepest(None)
 
 
-def test_without_options_pixels_are_as_they_were(scene):
-    # Values of 16 bits across the rims of three circles, as rendered before there were lenses and rims.
-    seen, picture = image_circles(scene, "12", 0), render(scene, "12", 0, PLAIN).astype(int)
-    for i, known in PIXELS.items():
-        x, y = np.rint(seen.centre_px[i]).astype(int)
-        assert np.abs(picture[y, x : x + 12 : 2] - known).max() <= 2  # rounding differs between machines
-
-
-PIXELS = {
-    0: [46260, 46236, 38479, 4567, 1030, 1028],
-    12: [46260, 46260, 43819, 9197, 1294, 1285],
-    82: [46260, 46260, 46259, 43744, 9445, 1295],
-}
-"""Number of the circle → every second pixel to the right of its centre."""
-
-
 def test_truth_states_lens_and_rim(scene):
     plain = TruthFile.of(scene).content()
     assert "optics" not in plain

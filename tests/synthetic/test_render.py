@@ -8,6 +8,7 @@ import pytest
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
 from tests.outcome import fails_with
+from tests.support.circle_images import area_and_centroid
 
 OPTIONS = SceneOptions(seed=1, width=648, height=432, images_per_group=2, groups=(("1", "2"), ("1", "5")))
 PLAIN = RenderOptions(noise=0, vignetting=0, gradient=0, spread=0)
@@ -24,14 +25,6 @@ def second():
     return make_scene(replace(OPTIONS, groups=None), *second_design())
 
 
-def _green(polygon):
-    """Area and centroid of a polygon (n, 2) by Green's theorem."""
-    middle = polygon.mean(0)
-    p, q = polygon - middle, np.roll(polygon - middle, -1, axis=0)
-    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    return abs(cross.sum()) / 2, middle + ((p + q) * cross[:, None]).sum(0) / (3 * cross.sum())
-
-
 def _blobs(scene, group, image, options):
     """Measured and exact area and centroid (n, 3), and the images of the centres (n, 2), of free-standing circles."""
     picture = render(scene, group, image, options).astype(float)
@@ -45,7 +38,7 @@ def _blobs(scene, group, image, options):
             continue
         (x0, y0), (x1, y1) = np.floor(rim.min(0) - EDGE_PX).astype(int), np.ceil(rim.max(0) + EDGE_PX).astype(int) + 1
         y, x = np.mgrid[y0:y1, x0:x1]
-        area, centroid = _green(rim)
+        area, centroid = area_and_centroid(rim)
         window = picture[y0:y1, x0:x1]
         distance = np.sqrt((x[..., None] - rim[:, 0]) ** 2 + (y[..., None] - rim[:, 1]) ** 2).min(-1)
         bright = window - np.median(window[(distance > EDGE_PX - 1) & (distance < EDGE_PX)])

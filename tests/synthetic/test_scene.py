@@ -10,7 +10,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
 from tests.outcome import fails_with
-from tests.support.circle_images import simulate_centres
+from tests.support.circle_images import area_and_centroid, simulate_centres
 
 OPTIONS = SceneOptions(seed=3, width=1296, height=864, images_per_group=4)
 
@@ -136,7 +136,7 @@ def test_simulated_centres_are_ellipse_centres(distortion, tolerance_px):
     exact = simulate_centres(scene, "12", 1, 0.0, np.random.default_rng(0))
     assert len(exact) == seen.must_find.sum()
     rim = scene.camera.project(rim_points(seen.xyz_camera, seen.normal_camera, seen.radius_mm, 720))
-    centroid = {label: _centroid(points) for label, points in zip(seen.labels, rim, strict=True)}
+    centroid = {label: area_and_centroid(points)[1] for label, points in zip(seen.labels, rim, strict=True)}
     assert max(np.abs(exact[label] - centroid[label]).max() for label in exact) < tolerance_px
     truth = dict(zip(seen.labels, seen.centre_px, strict=True))
     offset = np.array([exact[label] - truth[label] for label in exact])
@@ -188,10 +188,3 @@ def test_a_plate_of_which_nothing_is_stated_says_what_is_assumed():
         make_scene(replace(exact, margin_mm=30.0), pair, nominal=nominal)
     scene = make_scene(replace(exact, margin_mm=20.0), pair, nominal=nominal)
     assert scene.face_outline("1")[:, 0].max() == pytest.approx(across)
-
-
-def _centroid(polygon: np.ndarray) -> np.ndarray:
-    middle = polygon.mean(0)
-    p, q = polygon - middle, np.roll(polygon - middle, -1, axis=0)
-    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    return middle + ((p + q) * cross[:, None]).sum(0) / (3 * cross.sum())
