@@ -60,13 +60,18 @@ def words_of(path: str) -> str:
     return path.replace("stcal-sfm", "stcal sfm", 1).partition(" ")[2]
 
 
+def examples_of(path: str) -> list[str]:
+    """Returns typical calls of a command; ``path`` : its words, with the program's."""
+    return [f"{path} {arguments}".rstrip() for arguments in EXAMPLES.get(words_of(path), ())]
+
+
 class Command(TyperCommand):
     """A command whose help has its options in panels, and examples."""
 
     def format_epilog(self, ctx, formatter) -> None:
         """Writes the examples, each on one line to copy."""
         path = ctx.command_path
-        examples = [f"{path} {arguments}".rstrip() for arguments in EXAMPLES.get(words_of(path), ())]
+        examples = examples_of(path)
         if examples:
             with formatter.section("Examples" if len(examples) > 1 else "Example"):
                 formatter.write("".join(f"  {line}\n" for line in examples))
