@@ -62,12 +62,10 @@ def stated(saved, tmp_path):
 def test_with_nothing_stated_it_is_the_runs_own_covariance(saved, plain):
     """The run is read from files, so to their digits and the adjustment's last step."""
     assert {row.measurand.name for row in plain.of_kind("position")} == {"2", "4", "5"}
-    for row in plain.of_kind("position"):
-        own = saved.faces.target_from_face_covariance[row.measurand.name]
-        np.testing.assert_allclose(row.covariance, own[3:, 3:], rtol=0, atol=1e-3 * np.abs(own[3:, 3:]).max())
-    for row in plain.of_kind("rotation"):
-        own = saved.faces.target_from_face_covariance[row.measurand.name]
-        np.testing.assert_allclose(row.covariance, own[:3, :3], rtol=0, atol=1e-3 * np.abs(own[:3, :3]).max())
+    for kind, part in (("position", slice(3, 6)), ("rotation", slice(3))):
+        for row in plain.of_kind(kind):
+            own = saved.faces.target_from_face_covariance[row.measurand.name][part, part]
+            np.testing.assert_allclose(row.covariance, own, rtol=0, atol=1e-3 * np.abs(own).max())
 
 
 def test_contributions_add_up_as_squares(plain):
@@ -260,8 +258,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
 
 
 def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
-    copy = tmp_path / "run"
-    own_copy(small_run, copy)
+    copy = own_copy(small_run, tmp_path / "run")
     (copy / "report.html").write_text("x")
     code, text, _ = stcal_sfm("budget", copy)
     assert code == 0
@@ -269,8 +266,7 @@ def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
 
 
 def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
-    copy = tmp_path / "run"
-    own_copy(small_run, copy)
+    copy = own_copy(small_run, tmp_path / "run")
     report = json.loads((copy / "report.json").read_text())
     title = report["checks"][1]["title"]
     report["checks"][1]["verdict"] = "failed"
@@ -329,8 +325,7 @@ def test_fields_that_are_none(stcal_sfm, small_run):
 
 
 def test_a_chain_has_no_budget(stcal_sfm, small_run, tmp_path):
-    copy = tmp_path / "run"
-    unsealed_copy(small_run, copy)
+    copy = unsealed_copy(small_run, tmp_path / "run")
     faces = json.loads((copy / "faces.json").read_text())
     (copy / "faces.json").write_text(json.dumps(faces | {"solve": "chain"}))
     assert_error(stcal_sfm("budget", copy), INPUT, "solved by chain, which states no covariance", "--solve joint")

@@ -189,10 +189,6 @@ def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab, place
     assert first(few, lab, images).key != CAUSE
 
 
-def test_a_sound_set_has_no_cause(few, lab):
-    assert CAUSE not in lab.check(few, lab.observe(few))
-
-
 def seen_circles(scene, image):
     """Places, normals (camera frame) and radii, mm, of the circles of an image."""
     seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))

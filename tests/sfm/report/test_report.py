@@ -309,14 +309,6 @@ def test_left_out_with_reasons():
     assert ["1", "group a: face <6> has no frame"] in rows
 
 
-def test_odd_names_of_faces_and_groups_are_drawn():
-    """No font has every script."""
-    report = make()
-    report["faces"] = {"$x^{": report["faces"]["1"], "面": report["faces"]["2"]}
-    report["groups"][0]["name"] = "_$\\frac"
-    assert "_$\\frac" in Page(report_html(report, OVERLAYS)).text
-
-
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
     [(None, 1, "–"), (float("nan"), 1, "–"), (-0.04, 1, "0.0"), (-100.0, 0, "-100"), (1.23456, 4, "1.2346")],
