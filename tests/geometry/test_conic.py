@@ -45,25 +45,13 @@ def test_offset_point_projects_to_the_centre_of_the_fitted_ellipse(circle):
     xyz = circle_image_offset(centre, normal, radius)
     # Points on an exact conic: the fit is limited by rounding, magnified by the aspect of up to 4 : 1.
     np.testing.assert_allclose(xyz[:2] / xyz[2], fitted_centre(rim(*circle)), atol=1e-11)
-
-
-@given(circles())
-def test_offset_does_not_depend_on_the_sign_of_the_normal(circle):
-    centre, normal, radius = circle
-    np.testing.assert_array_equal(
-        circle_image_offset(centre, normal, radius), circle_image_offset(centre, -normal, radius)
-    )
+    np.testing.assert_array_equal(circle_image_offset(centre, -normal, radius), xyz)
 
 
 def test_offset_of_the_field_notes():
     # 1 m, f = 5580 px, r = 8 mm, 45°: 0.18 px (FIELD_NOTES.md).
     xyz = circle_image_offset([0, 0, 1000.0], np.array([np.sqrt(0.5), 0, -np.sqrt(0.5)]), 8.0)
     assert np.hypot(*(5580 * xyz[:2] / xyz[2])) == pytest.approx(0.18, abs=0.005)
-
-
-def test_a_circle_seen_square_on_the_axis_has_no_offset():
-    xyz = circle_image_offset([0, 0, 500.0], [0, 0, -1.0], 20.0)
-    np.testing.assert_allclose(xyz, [0, 0, 500], atol=1e-12)
 
 
 def test_offset_takes_stacks():

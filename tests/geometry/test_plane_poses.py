@@ -17,23 +17,14 @@ from stcal.geometry.plane import (
     two_minima,
     weigh,
 )
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid
+from tests.geometry import test_pose_descent
 from tests.outcome import fails_with
 
 XYZ = np.array([[x, y, 0.0] for x in (-30, -10, 10, 30) for y in (-20, 0, 20)])
 SIGMA = 1e-4
 MIDDLE = Rigid(np.eye(3), np.zeros(3))
-
-
-def seen(poses):
-    """Normalised coordinates (h, n, 2), their derivative (h, n, 2, 6), and whether all points lie before the camera."""
-    turned = np.einsum("hij,nj->hni", poses.rotation, XYZ)
-    at = turned + poses.translation[:, None]
-    by_point = np.zeros((*at.shape[:2], 2, 3))
-    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / at[..., 2]
-    by_point[..., 2] = -at[..., :2] / at[..., 2:] ** 2
-    by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
-    return at[..., :2] / at[..., 2:], by_pose, (at[..., 2] > 0).all(1)
+seen = partial(test_pose_descent.seen, xyz=XYZ, scale=1.0)
 
 
 def descend(measured, poses, huber):

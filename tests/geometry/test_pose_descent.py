@@ -12,15 +12,15 @@ XYZ = RNG.uniform(-50, 50, (12, 3))
 TRUTH = Rigid.exp([0.2, -0.1, 0.4, 10, -20, 400])
 
 
-def seen(poses):
-    """Normalised coordinates in thousandths (h, n, 2), and their derivative (h, n, 2, 6)."""
-    turned = np.einsum("hij,nj->hni", poses.rotation, XYZ)
+def seen(poses, xyz=XYZ, scale=1e3):
+    """Coordinates (h, n, 2), their derivative (h, n, 2, 6), and whether all points lie before the camera."""
+    turned = np.einsum("hij,nj->hni", poses.rotation, xyz)
     at = turned + poses.translation[:, None]
     by_point = np.zeros((*at.shape[:2], 2, 3))
-    by_point[..., 0, 0] = by_point[..., 1, 1] = 1e3 / at[..., 2]
-    by_point[..., 2] = -1e3 * at[..., :2] / at[..., 2:] ** 2
+    by_point[..., 0, 0] = by_point[..., 1, 1] = scale / at[..., 2]
+    by_point[..., 2] = -scale * at[..., :2] / at[..., 2:] ** 2
     by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
-    return 1e3 * at[..., :2] / at[..., 2:], by_pose, (at[..., 2] > 0).all(1)
+    return scale * at[..., :2] / at[..., 2:], by_pose, (at[..., 2] > 0).all(1)
 
 
 MEASURED = seen(Poses.of([TRUTH]))[0][0] + RNG.normal(0, 0.01, (12, 2))

@@ -85,21 +85,6 @@ def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, ratio, coeffici
     np.testing.assert_allclose(found.centre, camera.centre, rtol=0, atol=4e-12)  # +0.5 − 0.5 at 20 000 px: one ulp
 
 
-def test_pycolmap_reads_what_is_written(tmp_path):
-    camera = Camera(1000, 800, [1000, 1100], [500, 400], COLMAP_CASES["FULL_OPENCV"][4:])
-    write_cameras_txt(tmp_path / "cameras.txt", Camera.of(camera, "FULL_OPENCV"))
-    (tmp_path / "images.txt").write_text("")
-    (tmp_path / "points3D.txt").write_text("")
-    reconstruction = pycolmap.Reconstruction()
-    try:
-        reconstruction.read_text(str(tmp_path))
-        theirs = reconstruction.cameras[1]
-    except (ValueError, RuntimeError, KeyError) as error:
-        pytest.fail(f"pycolmap does not read it: {error}")
-    assert (theirs.model_name, theirs.width, theirs.height) == ("FULL_OPENCV", 1000, 800)
-    np.testing.assert_allclose(theirs.params, COLMAP_CASES["FULL_OPENCV"], rtol=1e-15)
-
-
 @pytest.mark.parametrize("suffix", ["yaml", "yml", "xml", "json"])
 def test_file_storage_of_opencv(tmp_path, suffix):
     path = tmp_path / f"camera.{suffix}"

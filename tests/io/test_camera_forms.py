@@ -74,11 +74,13 @@ def test_a_comment_does_not_tell_the_form(tmp_path):
     assert read_camera(tmp_path / "cameras.txt").colmap_model == "PINHOLE"
 
 
-def test_colmap_reads_the_binary_file(tmp_path):
+@pytest.mark.parametrize(("form", "suffix"), [("colmap", "txt"), ("colmap-bin", "bin")])
+def test_colmap_reads_what_is_written(tmp_path, form, suffix):
     for model in LENSES:
-        (tmp_path / "cameras.bin").write_bytes(written(camera_of(model), "colmap-bin", "cam0").content)
-        for name in ("images.bin", "points3D.bin"):
-            (tmp_path / name).write_bytes(bytes(8))
+        content = written(camera_of(model), form, "cam0").content
+        (tmp_path / f"cameras.{suffix}").write_bytes(content if isinstance(content, bytes) else content.encode())
+        for name in ("images", "points3D"):
+            (tmp_path / f"{name}.{suffix}").write_bytes(bytes(8) if suffix == "bin" else b"")
         (found,) = pycolmap.Reconstruction(tmp_path).cameras.values()
         assert found.model.name == model
         assert list(found.params) == camera_of(model).colmap_params()

@@ -111,9 +111,6 @@ def test_bouguets_results_with_their_sigmas(tmp_path):
     np.testing.assert_allclose(camera.distortion[:4], BOUGUET["kc"][:4])
     errors = [*BOUGUET["fc_error"], *BOUGUET["cc_error"], *BOUGUET["kc_error"][:4]]
     np.testing.assert_allclose(np.sqrt(np.diag(model.covariance)), np.array(errors) / 3)
-
-
-def test_bouguets_results_without_sigmas(tmp_path):
     own = {key: value for key, value in BOUGUET.items() if not key.endswith("_error")}
     assert read_camera(saved(tmp_path / "Calib_Results.mat", own)).covariance is None
 
