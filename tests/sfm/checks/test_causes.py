@@ -17,9 +17,9 @@ from stcal.sfm.checks.verdict import ranked
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 from stcal.sfm.runs import solve
 from stcal.sfm.runs.solve import GroupSolution, refine_or_explain
-from stcal.synthetic.scene import SceneOptions, image_circles, make_scene
+from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
-from tests.sfm.checks.test_checks import Lab
+from tests.sfm.checks.test_checks import Lab, seen_circles
 
 
 @pytest.fixture(scope="module")
@@ -189,18 +189,11 @@ def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab, place
     assert first(few, lab, images).key != CAUSE
 
 
-def seen_circles(scene, image):
-    """Places, normals (camera frame) and radii, mm, of the circles of an image."""
-    seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
-    rows = [seen.labels.index(label) for label in image.labels]
-    return seen.xyz_camera[rows], seen.normal_camera[rows], seen.radius_mm[rows]
-
-
 def centroids(scene, images):
     """Images of the circles' centres, as of centroids that nothing corrects."""
     made = []
     for image in images:
-        xyz, normal, radius = seen_circles(scene, image)
+        xyz, normal, radius, _ = seen_circles(scene, image)
         shift = scene.camera.project(circle_image_offset(xyz, normal, radius)) - scene.camera.project(xyz)
         made.append(replace(image, centre_px=image.centre_px - shift))
     return made
@@ -243,7 +236,7 @@ def test_a_file_that_is_far_off_is_compared_with_the_true_camera(few, name):
 
 def elsewhere(image, scene, shift_mm):
     """The image with all faces ``shift_mm`` off their place, board and camera where they were."""
-    xyz, normal, radius = seen_circles(scene, image)
+    xyz, normal, radius, _ = seen_circles(scene, image)
     on_face = np.array([isinstance(label, CircleLabel) for label in image.labels])
     before, after = (
         scene.camera.project(circle_image_offset(at, normal, radius)) for at in (xyz, xyz + on_face[:, None] * shift_mm)

@@ -40,6 +40,13 @@ def full_scene():
     return make_scene(options)
 
 
+def seen_circles(scene, image):
+    """Places, normals (camera frame), radii, mm, and tilts of the circles of an image."""
+    seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
+    own = [seen.labels.index(label) for label in image.labels]
+    return seen.xyz_camera[own], seen.normal_camera[own], seen.radius_mm[own], seen.tilt_rad[own]
+
+
 class Lab:
     """Simulated runs."""
 
@@ -57,9 +64,8 @@ class Lab:
 
     @staticmethod
     def _shapes(scene, image):
-        seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
-        own = [seen.labels.index(label) for label in image.labels]
-        conics = (circle_conic(seen.xyz_camera[k], seen.normal_camera[k], seen.radius_mm[k]) for k in own)
+        xyz, normal, radius, _ = seen_circles(scene, image)
+        conics = (circle_conic(*circle) for circle in zip(xyz, normal, radius, strict=True))
         return np.array([ellipse_of_conic(conic)[1] for conic in conics])
 
     def check(self, scene, images, camera=None, board=None, solve="chain"):
@@ -164,11 +170,9 @@ def test_a_rim_is_said_alone(full_scene, lab):
     """0.6 mm before all circles: their radii are smaller than designed because of it, and are no fault of their own."""
     images = []
     for image in lab.observe(full_scene):
-        seen = image_circles(full_scene, image.group, int(image.name.rpartition("/")[2]))
-        own = [seen.labels.index(label) for label in image.labels]
-        tangent, radius = np.tan(seen.tilt_rad[own]), seen.radius_mm[own]
+        _, _, radius, tilt_rad = seen_circles(full_scene, image)
         is_circle = np.array([isinstance(label, CircleLabel) for label in image.labels])
-        lost = np.where(is_circle, lost_radius_mm(0.6, tangent, radius), 0.0)
+        lost = np.where(is_circle, lost_radius_mm(0.6, np.tan(tilt_rad), radius), 0.0)
         images.append(replace(image, shape=image.shape * (1 - lost / radius)[:, None, None]))
     checks = lab.check(full_scene, images)
     assert not_passed(checks) == {"rim": "suspicious"}
