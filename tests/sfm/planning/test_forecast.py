@@ -95,14 +95,14 @@ def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> 
 
 
 def errors_of(models: list[MetricModel], setup: Setup, expected: Forecast, draws: int, seed: int):
-    """Pose errors by face, (draws, 6), of adjusted simulations."""
+    """Pose errors by face, (draws, 6), of adjusted simulations, and the last adjustment."""
     rng = np.random.default_rng(seed)
     truth = covariance_of(models, setup.board, setup.camera).xyz_model
     rows = []
     for _ in range(draws):
         joint = adjust_jointly(drawn(models, setup, rng), setup.board, setup.camera)
         rows.append((joint.xyz_model - truth).ravel())
-    return {face: np.array(rows) @ expected.derivatives.faces[face].T for face in expected.face_covariance}
+    return {face: np.array(rows) @ expected.derivatives.faces[face].T for face in expected.face_covariance}, joint
 
 
 def require_chi2(errors: np.ndarray, covariance: np.ndarray):
@@ -117,7 +117,7 @@ def require_chi2(errors: np.ndarray, covariance: np.ndarray):
 def test_forecast_is_the_spread_of_simulations(exact, common, draws):
     setup, models = setup_of(exact, common=common), models_of(exact)
     expected = forecast(models, setup)
-    errors = errors_of(models, setup, expected, draws, 1)
+    errors, _ = errors_of(models, setup, expected, draws, 1)
     assert set(errors) == {"2", "4"}
     for face, rows in errors.items():
         require_chi2(rows, expected.face_covariance[face])
@@ -230,11 +230,25 @@ def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, commo
 
 @pytest.mark.slow
 def test_advised_views_do_what_is_said(known, advice):
-    """The forecast with them is that which was foretold."""
-    expected = after(known, [choice.view for choice in advice.choices], advice.now)
+    """Photographed in simulation: errors as forecast, and σ falls from the run to the adjustment as forecast."""
+    models = {model.group: model for model in known.models}
+    for choice in advice.choices:
+        models[choice.view.group] = joined(models[choice.view.group], choice.view.model)
+    views = [choice.view for choice in advice.choices]
+    expected = after(known, views, advice.now)
     assert expected.worst() == (advice.choices[-1].face, pytest.approx(advice.choices[-1].sigma_mm))
-    face, sigma_mm = advice.now.worst()
-    assert expected.position_sigma_mm()[face] < 0.9 * sigma_mm
+    errors, joint = errors_of(list(models.values()), known.setup, expected, 8, 3)
+    _, before = errors_of(list(known.models), known.setup, advice.now, 1, 4)
+    for face, rows in errors.items():
+        require_chi2(rows, expected.face_covariance[face])
+    face = advice.now.worst()[0]
+    stated = [
+        np.sqrt(np.trace(advice.now.derivatives.face_covariance(j.covariance_mm2)[face][3:, 3:]))
+        for j in (before, joint)
+    ]
+    forecasts = [each.position_sigma_mm()[face] for each in (advice.now, expected)]
+    assert forecasts[1] < 0.9 * forecasts[0]
+    assert stated[1] / stated[0] == pytest.approx(forecasts[1] / forecasts[0], rel=0.1)
 
 
 def offered(known):
