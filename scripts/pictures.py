@@ -31,7 +31,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 def found(result: Path, out: Path) -> None:
     """A photograph, and beside it what was found there: the overlay of the run, cut to the circles."""
     photograph, overlay = Image.open(SAMPLE / "images" / FOUND_IN), Image.open(result / "overlays" / FOUND_IN)
-    box = box_of_circles(result / "detections.csv", FOUND_IN, photograph.size)
+    box = box_of_circles(result / "labels.csv", FOUND_IN, photograph.size)
     halves = [cut(image, box, photograph.width) for image in (photograph.convert("RGB"), overlay)]
     side_by_side = Image.new("RGB", (2 * HALF_WIDTH_PX + 8, halves[0].height), "white")
     for k, half in enumerate(halves):

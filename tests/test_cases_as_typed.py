@@ -126,7 +126,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         for refused in (name in ("invbc", "uncal"),)
     ),
     "ros_none": (Typed(INPUT, "E-CAMERA-KEY", ("binning_x = 2", "set it to 0")),),
-    "rotated_tags": (Typed(COMPUTATION, says=(*3 * HALF_A_TURN[1:], "3 scenes, 0 accepted")),),
+    "rotated_tags": (Typed(COMPUTATION, says=("3 scenes, 0 accepted", *3 * HALF_A_TURN[1:])),),
     "scara_4dof_inverted_cam": (
         Typed(INPUT, "E-HANDEYE-CONVENTION", ("board_from_camera", "rename them in the file"), {}, ("column",)),
     ),
