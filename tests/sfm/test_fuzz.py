@@ -93,9 +93,9 @@ def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
         kept, "CALLS", [call for call in CALLS if call.command == "sfm run" and "~run" in call.words][:1]
     )
     monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob(".stcal/cache/[0-9a-f]*.npz")))
-    assert kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures == ()
+    assert kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 1).failures == ()
     monkeypatch.setattr(io_cache, "_digest", lambda _: ALL_ARE_EQUAL)
-    assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures] == ["silent wrong"]
+    assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 1).failures] == ["silent wrong"]
 
 
 BRIEF = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2]
