@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextvars import ContextVar
 from functools import cache
+from multiprocessing import resource_tracker
 from typing import TypeVar
 
 from stcal.errors import InputNote
@@ -251,17 +252,22 @@ def _starting() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deaf_to_interrupts():
-    """Lets processes that start in the context ignore Ctrl-C before their imports; SIGTERM waits for its end."""
+    """Hides Ctrl-C from processes that start in the context, also before their imports; signals here wait for its end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     received: list[int] = []
-    handlers = [(signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))]
-    handlers.append((signal.SIGTERM, signal.signal(signal.SIGTERM, lambda number, _: received.append(number))))
+    ends = (signal.SIGINT, signal.SIGTERM)
+    handlers = {number: signal.signal(number, lambda number, _: received.append(number)) for number in ends}
+    if sys.platform != "win32":
+        resource_tracker.ensure_running()  # its start would let Ctrl-C through again
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # new processes inherit it
     try:
         yield
     finally:
-        for number, handler in handlers:
+        if sys.platform != "win32":
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for number, handler in handlers.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         for number in received[:1]:
             signal.raise_signal(number)

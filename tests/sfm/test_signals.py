@@ -95,9 +95,10 @@ signal.pause()
 
 
 @pytest.mark.slow
-def test_sigterm_while_a_process_starts_waits_until_that_has_what_it_begins_with():
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+def test_a_signal_while_a_process_starts_waits_until_that_has_what_it_begins_with(name):
     """The server has forked it, and it reads from this process what to do: cut off there, it would print a stack."""
-    begin = """
+    begin = f"""
 import os, signal, sys, time
 from multiprocessing import forkserver
 from stcal.parallel import run_parallel
@@ -106,11 +107,11 @@ connect = forkserver.connect_to_new_process
 
 def asked(fds):
     found = connect(fds)
-    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.{name})
     time.sleep(0.2)
     return found
 
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
+signal.signal(signal.{name}, lambda *_: sys.exit(7))
 forkserver.connect_to_new_process = asked
 list(run_parallel(abs, [(-1,), (-2,)], 2))
 """

@@ -292,7 +292,7 @@ def test_views_give_a_camera_file_that_runs_take_as_prior(stcal_sfm, small_datas
     views, out = views_of(np.random.default_rng(10), count=8), tmp_path / "camera.txt"
     cameras = []
     nothing = SimpleNamespace(images=(), skipped=())
-    monkeypatch.setattr(calibration, "_detect", lambda _, camera, *__: cameras.append(camera) or nothing)
+    monkeypatch.setattr(calibration, "detect_files", lambda _, camera, *__, **___: cameras.append(camera) or nothing)
     monkeypatch.setattr(calibration, "board_views", lambda *_: views)
     code, printed, _ = stcal_sfm("calibrate-camera", small_dataset / "images", "--out", out, "--workers", 1)
     assert code == 0
