@@ -252,7 +252,7 @@ def _starting() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deaf_to_interrupts():
-    """Hides Ctrl-C from processes that start in the context, also before their imports; signals here wait for its end."""
+    """Hides Ctrl-C from processes that start in the context; SIGINT and SIGTERM here wait for its end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -74,7 +74,7 @@ def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
         assert np.mean([trial.error_mm for trial in used]) < 1.5
 
 
-def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path):
+def test_a_scene_takes_about_twice_as_long_as_opencvs_tags(folder, images, tmp_path):
     layout = half_calibrated(images, PLAN, range(16)).layout
     photograph = cv2.imread(str(folder / "images" / images.names[5]), cv2.IMREAD_GRAYSCALE)
     for k, each in enumerate(expose(photograph, np.geomspace(1 / 4, 4, 5))):
@@ -83,17 +83,18 @@ def test_a_scene_takes_little_longer_than_its_decoding(folder, images, tmp_path)
     model = CameraModel(
         images.camera.focal, images.camera.centre, images.camera.distortion, "PINHOLE", None, None, "cal_data.yaml"
     )
+    usual = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250))
     ratios = []
     for _ in range(7):  # the first warms up
         start = time.process_time()
-        _ = [decode(file.path.read_bytes(), file.name) for file in scenes[0].files]  # in memory together, as there
+        for file in scenes[0].files:
+            usual.detectMarkers(decode(file.path.read_bytes(), file.name))
         middle = time.process_time()
         result = next(iter(run(scenes, layout, model)))
         ratios.append((time.process_time() - middle) / (middle - start))
     assert result.verdict.decision == "accept"
-    # Three times the decoding on two cores, all of which work. Decoding is whole numbers and memory, edges are floating
-    # point: the ratio is 4 on one processor and was 6 on another, so that a tenth is the processor's.
-    assert min(ratios[1:]) < 2 * 3 * 1.1
+    # 1.9 on one processor: OpenCV's detection is half of it; edges by area and the pose follow. A third is leeway.
+    assert min(ratios[1:]) < 2.5
 
 
 def test_exposures_together_see_more(folder, images):
