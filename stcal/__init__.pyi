@@ -27,7 +27,7 @@ from .io.cameras.difference import load_lens as load_lens
 from .io.cameras.model import CameraPrior as CameraPrior
 from .io.cameras.model import camera_prior as camera_prior
 from .io.cameras.read import load_camera as load_camera
-from .io.cameras.write import save_camera as save_camera
+from .io.cameras.read import save_camera as save_camera
 from .io.device import OpenCVSource as OpenCVSource
 from .io.device import SimulatedSource as SimulatedSource
 from .io.join import join_tables as join_tables

@@ -46,7 +46,7 @@ def convert(
 ) -> None:
     """Convert a camera file to the form of another program, and say what that form cannot hold."""
     from stcal.io.cameras.keys import collecting_passed_over
-    from stcal.io.cameras.write import form_of, save_camera
+    from stcal.io.cameras.read import form_of, save_camera
 
     kind = form_of(out, form)
     with collecting_passed_over() as passed_over:

@@ -404,7 +404,7 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
     from stcal.geometry.camera import Camera
-    from stcal.io.cameras.write import save_camera
+    from stcal.io.cameras.read import save_camera
 
     reprojection = outcome.result.reprojection
     if reprojection is None:

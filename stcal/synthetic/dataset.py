@@ -15,7 +15,7 @@ from stcal.boards.file import save_run_board
 from stcal.boards.target import save_body
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.io.cameras.write import save_camera
+from stcal.io.cameras.read import save_camera
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel

@@ -56,7 +56,7 @@ def calibrate_camera(
     from stcal.boards.file import load_flat_board
     from stcal.design import BoardDesign
     from stcal.geometry.camera import Camera
-    from stcal.io.cameras.write import save_camera
+    from stcal.io.cameras.read import save_camera
     from stcal.io.design import board_of, target_of
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile

@@ -1,4 +1,4 @@
-"""Reading of camera files of any kind, which is recognised by the content."""
+"""Reading of camera files of any kind, recognised by the content; and saving, where each file is read again."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import yaml
@@ -16,12 +17,12 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, MAX_SIDE_PX, Camera, parameter_names
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
-from stcal.io.cameras.keyed import READ, from_ini, from_keys
+from stcal.io.cameras.forms import SUFFIXES, WRITERS, CameraForm, name_to_write, written
+from stcal.io.cameras.keyed import READ, from_ini, from_keys, is_ini, values_of
 from stcal.io.cameras.model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
 from stcal.io.cameras.photograph import is_photograph
-from stcal.io.cameras.texts import is_ini, values_of
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_written, save, text_of
 
 SQLITE = b"SQLite format 3\0"
 """First bytes of an SQLite database."""
@@ -215,3 +216,68 @@ TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str, str], Camer
     (lambda text: True, lambda text, name, source: from_keys(values_of(text), name, source)),
 )
 """For each text format the same; what no other test recognises has keys and values."""
+
+
+WRITTEN_PX = 1e-6
+"""Largest difference of a projected point, px. Forms with few decimals, such as OpenCV's, round by 1e-8 px."""
+ACROSS = 9
+"""Number of points across the image, and down it, by which cameras are compared."""
+
+
+@require_arguments
+def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None, name: str = "") -> tuple[str, ...]:
+    """Save a camera to a file of this or another program, and require that it is read as the same camera.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    camera : Camera
+        Camera to save, with its covariance if it has one.
+    form : str, optional
+        ``colmap``, ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``metashape`` …; if None, that of the suffix: ``.txt``
+        colmap, ``.yaml`` opencv, ``.cameramodel`` mrcal, ``.xml`` metashape, ``.mat`` matlab.
+    name : str
+        Name of the camera, for forms that have a place for it.
+
+    Returns
+    -------
+    tuple of str
+        What the form has no place for, such as σ; nothing for ``colmap``.
+
+    Raises
+    ------
+    InputError
+        No form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
+    """
+    converted = written(camera, form_of(path, form), name_to_write(name))
+    save(Path(path), converted.content)
+    require_camera_written(path, camera)
+    return converted.lost
+
+
+def form_of(path: str | Path, form: str | None) -> CameraForm:
+    """Return the form of a camera file to write: ``form``, or that of the suffix if it is None."""
+    suffix = Path(path).suffix.lower()
+    kind = SUFFIXES.get(suffix) if form is None else form
+    if kind not in WRITERS:
+        unknown = f"form {form} unknown" if form else f"no form of suffix {suffix or 'none'}"
+        raise InputError(
+            "E-OPTION-FORM",
+            f"{path}: {unknown}; give the form (--form), one of {', '.join(WRITERS)}, or one of the suffixes "
+            f"{', '.join(SUFFIXES)}",
+        )
+    return cast(CameraForm, kind)
+
+
+def require_camera_written(path: str | Path, camera: Camera) -> None:
+    """Read a written camera file again, and require that it projects points all over the image to the same pixels."""
+    size = np.array([camera.width, camera.height])
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, ACROSS)]), axis=-1) * size
+    rays = camera.normalised_from_pixel(grid)
+    rays = rays[np.isfinite(rays).all(axis=-1)]
+
+    def again() -> np.ndarray:
+        return read_camera(path).sized(*size).pixel_from_normalised(rays)
+
+    require_written(path, again, camera.pixel_from_normalised(rays), WRITTEN_PX, "px")

@@ -18,7 +18,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.write import save_camera
+from stcal.io.cameras.read import save_camera
 from stcal.io.files import (
     BOARD,
     CAMERA,
