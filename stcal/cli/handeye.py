@@ -15,15 +15,15 @@ from stcal.errors import InputError
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
-    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.pairs import Setup
+    from stcal.handeye.data.record import Said
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export import CameraFrame
     from stcal.handeye.report.outcome import Outcome
     from stcal.parallel import Progress
     from stcal.robot import Robot
-    from stcal.workflows.handeye.inputs import HandEyeInput, Source
-    from stcal.workflows.handeye.robot_at_images import Timing
+    from stcal.workflows.handeye_inputs import HandEyeInput, Source
+    from stcal.workflows.robot_at_images import Timing
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +74,13 @@ class PoseFiles:
 
     def statements(self) -> "Said":
         """Returns the user's statements about what the files do not state."""
-        from stcal.handeye.data.formats.record import Said
+        from stcal.handeye.data.record import Said
 
         return Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
 
     def pairs(self, timing: "Timing") -> "Source":
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
-        from stcal.workflows.handeye.inputs import one_source
+        from stcal.workflows.handeye_inputs import one_source
 
         if self.source is None and self.first is not None and self.second is not None:
             said = self.statements()
@@ -91,7 +91,7 @@ class PoseFiles:
 
     def understood(self, pairs: "Source", timing: "Timing", robot: "Robot | None") -> list[str]:
         """Returns in lines how the files are understood, without solving anything."""
-        from stcal.workflows.handeye.inputs import dry_run
+        from stcal.workflows.handeye_inputs import dry_run
 
         images = self.poses, self.camera, self.board
         return dry_run(pairs, *images, self.quaternions, self.statements(), timing, robot)
@@ -100,7 +100,7 @@ class PoseFiles:
         self, pairs: "Source", timing: "Timing", robot: "Robot | None", progress: "Progress | None"
     ) -> "HandEyeInput":
         """Returns the poses, from :meth:`pairs`."""
-        from stcal.workflows.handeye.inputs import read_handeye
+        from stcal.workflows.handeye_inputs import read_handeye
 
         return read_handeye(
             pairs,
@@ -232,9 +232,9 @@ def handeye(
     from stcal.handeye.report.page import outcome_report
     from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.handeye.calibrate import calibrate_handeye
-    from stcal.workflows.handeye.inputs import without_flips
-    from stcal.workflows.handeye.robot_at_images import Timing
+    from stcal.workflows.calibrate_handeye import calibrate_handeye
+    from stcal.workflows.handeye_inputs import without_flips
+    from stcal.workflows.robot_at_images import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
@@ -338,7 +338,7 @@ def _require_fitting(
 ) -> None:
     """Checks that the options of camera and method are compatible."""
     from stcal.handeye import METHODS
-    from stcal.workflows.handeye.calibrate import ALL
+    from stcal.workflows.calibrate_handeye import ALL
 
     if camera_out and not (refine_camera or with_arm):
         raise InputError(
@@ -375,7 +375,7 @@ def _require_frames(
 def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":
     """Returns the options of differential evolution, with the defaults for bounds that were not given."""
     from stcal.handeye import EvolutionOptions
-    from stcal.workflows.handeye.calibrate import ALL
+    from stcal.workflows.calibrate_handeye import ALL
 
     turn = _bounds("--de-bounds-deg", bounds_deg, math.radians(1))
     shift = _bounds("--de-bounds-mm", bounds_mm, 1.0)
@@ -436,8 +436,8 @@ def plan(
     from stcal.handeye.plan import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
-    from stcal.workflows.handeye.calibrate import plan_handeye
-    from stcal.workflows.handeye.robot_at_images import Timing
+    from stcal.workflows.calibrate_handeye import plan_handeye
+    from stcal.workflows.robot_at_images import Timing
 
     robot, timing = load_robot(robot_file) if robot_file else None, Timing()
     pairs = files.pairs(timing)

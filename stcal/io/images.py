@@ -18,9 +18,9 @@ import numpy as np
 from PIL import ExifTags, Image
 
 from stcal.errors import InputError
+from stcal.io import decoding
+from stcal.io.decoding import ends_properly, is_png, patterns_seen, png_intact
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
-from stcal.io.photographs import decoding
-from stcal.io.photographs.decoding import ends_properly, is_png, patterns_seen, png_intact
 
 USUAL = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 SUFFIXES = (*USUAL, *decoding.readable())

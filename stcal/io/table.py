@@ -10,11 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
-from stcal.io.quaternions import COLUMNS as QUATERNION
-from stcal.io.quaternions import require_unit
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}
@@ -26,6 +24,7 @@ COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:
 """Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
 COMMON = re.compile(r"common\d+_.+")
 """Names of columns with errors that all poses have in common."""
+QUATERNION = ("qw", "qx", "qy", "qz")
 POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 
@@ -546,3 +545,20 @@ def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> 
     """Read a written table again, and require that its poses are ``poses``, by the prefix of their columns."""
     for prefix, own in poses.items():
         require_poses_written(path, lambda prefix=prefix: read_table(path, "poses").poses(prefix), own)
+
+
+def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, remedy: str) -> None:
+    """Refuse quaternions (m, 4) that are not of unit length.
+
+    ``place`` : returns the place of row i in ``where``; ``remedy`` : end of the message.
+    """
+    with np.errstate(over="ignore"):  # quaternions that are refused
+        length = np.linalg.norm(wxyz, axis=1)
+    bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))
+    if len(bad):
+        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        raise InputError(
+            "E-QUATERNION-LENGTH",
+            f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{suffix}; "
+            f"{remedy}",
+        )

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
-from stcal.io.quaternions import READINGS
+from stcal.io.poses.rotations import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
 from stcal.locate.pipeline import Located
 

@@ -21,7 +21,7 @@ from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
 from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, require_common_size
-from stcal.io.photographs.video import AUTO, write_frames
+from stcal.io.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, kept_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface

@@ -19,8 +19,8 @@ from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.solve import handeye
-from stcal.io.quaternions import INVERTED
-from stcal.workflows.handeye.inputs import HandEyeInput, without_flips
+from stcal.io.poses.rotations import INVERTED
+from stcal.workflows.handeye_inputs import HandEyeInput, without_flips
 from tests.outcome import fails_with
 from tests.support.handeye import (
     BASE_FROM_BOARD,

@@ -15,9 +15,8 @@ from stcal.boards.file import load_flat_board, load_run_board
 from stcal.boards.several import load_boards
 from stcal.boards.target import load_body
 from stcal.errors import InputError, InputNote, StcalError
-from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, require_own
-from stcal.handeye.data.robot_poses import read_robot_poses
+from stcal.handeye.data.record import Said
 from stcal.io.design import load_target
 from stcal.io.files import text_of
 from stcal.io.table import read_table
@@ -26,6 +25,7 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 from stcal.robot.urdf import load_urdf
 from stcal.sfm.budget.sources import StatedSize, statement_of
+from stcal.workflows.robot_at_images import read_robot_poses
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(

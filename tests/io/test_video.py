@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from stcal.errors import InputNote
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import find_images
-from stcal.io.photographs.video import AUTO, MOVED, chosen_frames, sharpness, write_frames
+from stcal.io.video import AUTO, MOVED, chosen_frames, sharpness, write_frames
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.body import (

@@ -9,10 +9,9 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.formats.recognise import read_content
-from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
-from stcal.handeye.data.formats.tables import read_columns, todays
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance, inverse_jacobian
+from stcal.handeye.data.recognise import read_columns, read_content, todays
+from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table

@@ -16,15 +16,14 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
-from stcal.handeye.data.formats.record import FRAMES
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.record import FRAMES
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.remarks import Aside, Grave, of_still, spoken
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
-from stcal.io.poses.rotations import ROTATION_VECTOR
-from stcal.io.quaternions import INVERTED as CONJUGATED
-from stcal.io.quaternions import LAST, ORDERS, Reading
+from stcal.io.poses.rotations import INVERTED as CONJUGATED
+from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR, Reading
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """Factors by which a variant must reduce the product of the median residuals in rotation and translation, and the

@@ -10,8 +10,8 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import camera_from_opencv
+from stcal.io.decoding import heic_turns, is_heic, let_pillow_read_heic
 from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.photographs.decoding import heic_turns, is_heic, let_pillow_read_heic
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
 """First bytes of JPEG, TIFF and PNG."""

@@ -1,7 +1,7 @@
-"""Conventions and units of the numbers that state a rotation."""
+"""Conventions and units of the numbers that state a rotation, and mistakes in the order of quaternions."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
-from stcal.io.quaternions import require_unit
-from stcal.io.table import ANGLES
+from stcal.io.table import ANGLES, require_unit
 
 ROTATION_VECTOR = "rotvec"
 MOST_RADIANS = 4 * np.pi
@@ -58,7 +57,7 @@ class Convention:
 
     @property
     def count(self) -> int:
-        """The count of numbers that state a rotation."""
+        """The count of numbers that state a rotation, and mistakes in the order of quaternions."""
         return 4 if self.order in QUATERNIONS else 3
 
     def words(self) -> str:
@@ -184,3 +183,59 @@ def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> Non
             "E-TABLE-NUMBER",
             f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{suffix}; take it out",
         )
+
+
+EXPLAINS = 0.2
+"""A mistake explains a misfit if its correction reduces the misfit below this share."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A hypothesis on the true content of columns that were read as w, x, y, z.
+
+    ``held`` : True content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
+    among the components read; ``conjugated`` : True if the sign of the vector part is inverted.
+    """
+
+    held: str
+    remedy: str
+    order: tuple[int, ...] = (0, 1, 2, 3)
+    conjugated: bool = False
+
+    def rotations(self, read: np.ndarray) -> np.ndarray:
+        """Return the rotations (m, 3, 3) that this hypothesis makes of the rotations ``read`` (m, 3, 3)."""
+        wxyz = Poses(read, np.zeros((len(read), 3))).quaternions()[:, self.order]
+        corrected = Poses.from_quaternions(wxyz, np.zeros((len(read), 3))).rotation
+        return np.swapaxes(corrected, 1, 2) if self.conjugated else corrected
+
+    def poses(self, read: Poses) -> Poses:
+        """Return the poses ``read`` with corrected rotations; translations are unchanged."""
+        return Poses(self.rotations(read.rotation), read.translation)
+
+
+LAST = Reading("x, y, z, w in the order of their columns", "give --quaternions xyzw", (3, 0, 1, 2))
+FIRST = Reading(
+    "z, w, x, y in the columns qw, qx, qy, qz", "leave --quaternions xyzw out, or name the columns so", (1, 2, 3, 0)
+)
+ORDERS = (LAST, FIRST)
+INVERTED = Reading("conjugated (the first frame seen from the second)", "change the sign of qw", conjugated=True)
+READINGS = (
+    LAST,
+    FIRST,
+    INVERTED,
+    *(
+        Reading(f"{each.held}, and conjugated", f"{each.remedy} and change the sign of qw", each.order, True)
+        for each in ORDERS
+    ),
+)
+
+
+def explaining(read: np.ndarray, misfit: Callable[[np.ndarray], float]) -> tuple[Reading, float] | None:
+    """Return the reading of rotations (m, 3, 3) that explains their misfit, and its misfit; None if no reading does.
+
+    ``misfit`` : returns one number for rotations (m, 3, 3). A reading explains the misfit if it reduces it below the
+    share :data:`EXPLAINS`. No reading does if all fit alike, as with the same orientation in all rows.
+    """
+    misfit_of = {reading: misfit(reading.rotations(read)) for reading in READINGS}
+    best = min(misfit_of, key=misfit_of.__getitem__)
+    return (best, misfit_of[best]) if misfit_of[best] < EXPLAINS * misfit(read) else None

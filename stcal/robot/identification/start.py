@@ -11,7 +11,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
-from stcal.io.quaternions import EXPLAINS
+from stcal.io.poses.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
 from stcal.robot.kinematics.dh import FITS, require_convention, require_orientations

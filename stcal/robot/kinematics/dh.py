@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.quaternions import EXPLAINS, explaining
+from stcal.io.poses.rotations import EXPLAINS, explaining
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.model import (
     Chain,

@@ -12,8 +12,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
-from stcal.io.quaternions import COLUMNS
-from stcal.io.table import read_table
+from stcal.io.table import QUATERNION, read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
 from stcal.report.svg import COLOURS, DASH, INK, Axes, Box, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
@@ -381,7 +380,7 @@ def evaluated_csv(result: Evaluation) -> str:
     turned, points = len(robots[0].rotation_rad) > 0, data.positions is not None
     head = ["line", "target", *joint_columns(robots[0].robot)]
     measured = ("x_mm", "y_mm", "z_mm") if points else ("distance_mm", "from_row")
-    head += [*measured, *(COLUMNS if turned else ()), "wrong"]
+    head += [*measured, *(QUATERNION if turned else ()), "wrong"]
     modelled = []
     for evaluated in robots:
         name = re.sub(r"\W+", "_", evaluated.robot.name)

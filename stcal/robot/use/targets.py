@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
-from stcal.io.quaternions import EXPLAINS, READINGS
+from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention

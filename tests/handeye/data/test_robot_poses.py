@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.robot_poses import read_robot_poses
+from stcal.handeye.data.record import Said
+from stcal.workflows.robot_at_images import read_robot_poses
 from tests.outcome import fails_with
 
 

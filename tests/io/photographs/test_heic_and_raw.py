@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stcal.io import decoding
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.images import decode, find_images
-from stcal.io.photographs import decoding
 from tests.outcome import fails_with
 
 HEIGHT, WIDTH = 96, 128

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.io.decoding import patterns_seen
 from stcal.io.images import find_images
-from stcal.io.photographs.decoding import patterns_seen
 from tests.outcome import fails_with
 
 Y, X = np.mgrid[:240, :320]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.robot_poses import read_robot_poses
-from stcal.workflows.handeye.inputs import one_source, read_input
+from stcal.handeye.data.record import Said
+from stcal.workflows.handeye_inputs import one_source, read_input
+from stcal.workflows.robot_at_images import read_robot_poses
 from tests.handeye.written import FORMATS, REFUSED
 from tests.outcome import fails_with
 from tests.support.handeye import simulated

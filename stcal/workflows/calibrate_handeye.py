@@ -37,8 +37,8 @@ from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED
 from stcal.robot.use.compensation import joint_columns
-from stcal.workflows.handeye.inputs import HandEyeInput, naming_left_out
-from stcal.workflows.handeye.robot_at_images import Arm
+from stcal.workflows.handeye_inputs import HandEyeInput, naming_left_out
+from stcal.workflows.robot_at_images import Arm
 
 ALL, AUTO = "all", "auto"
 """Words in place of a method's name: all methods, compared; the way of solving that predicts best."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import (
+from stcal.handeye.data.record import (
     FRAMES,
     MATRICES,
     Content,

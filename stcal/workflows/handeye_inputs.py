@@ -13,10 +13,9 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
-from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
-from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
+from stcal.handeye.data.record import Said
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
@@ -29,7 +28,7 @@ from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.workflows.board_views import detect_boards, kind_of
-from stcal.workflows.handeye.robot_at_images import Arm, Timing, read_arm, robot_at_images
+from stcal.workflows.robot_at_images import Arm, RobotPoses, Timing, read_arm, read_robot_poses, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
