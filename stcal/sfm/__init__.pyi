@@ -1,4 +1,4 @@
-from .budget.of_run import uncertainty_budget as uncertainty_budget
+from .budget.page import uncertainty_budget as uncertainty_budget
 from .camera.calibrate import calibrate_camera as calibrate_camera
 from .checks.verdict import Check as Check
 from .checks.verdict import Trial as Trial

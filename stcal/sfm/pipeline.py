@@ -34,15 +34,13 @@ from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
-from stcal.sfm.detect.board_alone import is_board_alone
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays, seen_by
-from stcal.sfm.detect.labels import LabelledImage, label_images
+from stcal.sfm.detect.labels import LabelledImage, is_board_alone, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.folder import overlays_beside, write_run
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -65,7 +63,7 @@ from stcal.sfm.runs.solve import (
     usable_groups,
     wrong_file,
 )
-from stcal.sfm.runs.transaction import frames_folder, require_ours, run_folder
+from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""

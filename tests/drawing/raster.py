@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from pypdfium2 import PdfDocument
 
-from stcal.drawing.formats import POINT_MM, pdf
+from stcal.drawing.draw import POINT_MM, pdf
 from stcal.geometry.camera import COEFFICIENTS, Camera
 
 PER_MM = 4

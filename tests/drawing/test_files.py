@@ -12,8 +12,7 @@ import stcal
 from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
-from stcal.drawing.draw import SUFFIXES, draw
-from stcal.drawing.formats import POINT_MM, pdf
+from stcal.drawing.draw import POINT_MM, SUFFIXES, draw, pdf
 from stcal.drawing.parts import Disc, Line, Text, board_parts, extent, target_parts
 from stcal.drawing.sheets import (
     EDGE,

@@ -27,8 +27,8 @@ from stcal.sfm.data.model import detections_csv
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.pattern import make_pattern, sides_of
 from stcal.sfm.pipeline import RunOptions, run
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.transaction import MarkerFile
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph

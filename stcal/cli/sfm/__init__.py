@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.sfm import camera, colmap, designs, measure, planning, run
+from stcal.cli.sfm import colmap, designs, measure, planning, run
 
 app = typer.Typer(
     name="stcal-sfm",
@@ -11,5 +11,5 @@ app = typer.Typer(
     cls=Commands,
     **PLAIN,
 )
-for part in (run, designs, colmap, planning, camera, measure):
+for part in (run, designs, colmap, planning, measure):
     app.add_typer(part.app)

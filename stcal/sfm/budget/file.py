@@ -18,8 +18,7 @@ from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Source, Statement
 from stcal.sfm.report.judgement import invalidated
-from stcal.sfm.runs.saved import SavedRun
-from stcal.sfm.runs.verify import Verified
+from stcal.sfm.runs.saved import SavedRun, Verified
 
 MICRO = 1e3
 MILLIDEGREES = 1e3 * float(np.degrees(1.0))

@@ -11,9 +11,8 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
-from stcal.sfm.checks.culprits import MOVED, MOVED_REMEDY
 from stcal.sfm.checks.images import summed
-from stcal.sfm.checks.verdict import FAILED, Check, Measured
+from stcal.sfm.checks.verdict import FAILED, MOVED, MOVED_REMEDY, Check, Measured
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8

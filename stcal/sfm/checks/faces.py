@@ -19,8 +19,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.checks.culprits import Guilt
-from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Guilt, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import MetricModel
 
 MIN_HALF = 2

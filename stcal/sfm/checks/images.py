@@ -15,14 +15,16 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
-from stcal.sfm.checks.culprits import Guilt, culprits, culprits_by_score
 from stcal.sfm.checks.verdict import (
     MOST_SIGMAS,
     SHOWN,
     SUSPICIOUS,
     Check,
+    Guilt,
     Measured,
     Trial,
+    culprits,
+    culprits_by_score,
     impossible,
     judge,
     without_image,

@@ -51,9 +51,8 @@ from stcal.sfm.report.page import report_html
 from stcal.sfm.runs.output import report_of, residuals_px
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.saved import AnyRun, SavedRun, folder_of
+from stcal.sfm.runs.saved import AnyRun, SavedRun, folder_of, verify
 from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
-from stcal.sfm.runs.verify import verify
 
 LONGEST_NAME = 200
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix

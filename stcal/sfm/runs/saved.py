@@ -1,4 +1,5 @@
-"""A finished run read back from its folder, for every command that continues from it."""
+"""A finished run read back from its folder, for every command that continues from it; and the comparison of its files
+with the hashes stored at its end."""
 
 import csv
 import io
@@ -28,6 +29,8 @@ from stcal.io.files import (
     TABLE_BYTES,
     TARGET,
     TARGET_MODEL,
+    digest_of,
+    own_digest,
     read_bytes,
     require_unchanged,
 )
@@ -43,11 +46,10 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, read_model
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.transaction import complete_interrupted
+from stcal.sfm.runs.transaction import RESULTS, MarkerFile, complete_interrupted, files_below
 
 AGAIN = "run it again"
 ReportPart = TypeVar("ReportPart", bound=Part)
@@ -328,3 +330,56 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
     return AdjustedRun(state, start, prior)
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """Differences of a run's folder from what the run of ``version`` wrote, as paths below the folder."""
+
+    version: str
+    missing: tuple[str, ...]  # files that are gone
+    changed: tuple[str, ...]
+    added: tuple[str, ...]  # files among the results that the run did not make
+
+    def notes(self, but: tuple[str, ...] = ()) -> list[str]:
+        """Returns one note on all files but some that differ, or none."""
+        kinds = {kind: [n for n in getattr(self, kind) if n not in but] for kind in ("missing", "changed", "added")}
+        clauses = [
+            f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names
+        ]
+        return [f"the run's folder is not as the run left it: {'; '.join(clauses)}"] if clauses else []
+
+
+def verify(run: AnyRun) -> Verified:
+    """Compares the files of a finished run with the hashes that were kept when it ended.
+
+    Raises InputError: not a run's folder, or one without hashes.
+    """
+    run = folder_of(run)
+    if not (run / RUN_MARKER).is_file():
+        raise InputError(
+            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
+    complete_interrupted(run)
+    content = read_json(run / RUN_MARKER, "run", "run it again")
+    try:
+        marker = checked(content, MarkerFile)
+    except InputError as error:
+        raise InputError(
+            "E-RUN-DAMAGED", f"run {run / RUN_MARKER}: damaged, or of another version ({error}); run it again"
+        ) from error
+    if marker.sha256 is None:
+        raise InputError(
+            "E-RUN-UNFINISHED",
+            f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of another version (stcal {marker.version}); "
+            "run it again",
+        )
+    present = {name for name in files_below(run) if name == RUN_MARKER or name.split("/")[0] in RESULTS}
+    changed = [
+        name
+        for name, known in marker.sha256.items()
+        if name in present and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
+    ]
+    added = (name.encode("utf-8", "backslashreplace").decode() for name in present - marker.sha256.keys())
+    missing = marker.sha256.keys() - present
+    return Verified(marker.version, tuple(sorted(missing)), tuple(sorted(changed)), tuple(sorted(added)))

@@ -27,13 +27,19 @@ from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
-from stcal.sfm.checks.culprits import MOVED, MOVED_REMEDY, moved_apart
-from stcal.sfm.checks.verdict import Check
+from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, Check, moved_apart
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group, detections_csv
 from stcal.sfm.data.patterns import pitch_hint
-from stcal.sfm.detect.board_alone import is_board_alone, label_boards
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
-from stcal.sfm.detect.labels import Detection, LabelledImage, label_images, label_once, leaves_a_board_out
+from stcal.sfm.detect.labels import (
+    Detection,
+    LabelledImage,
+    is_board_alone,
+    label_boards,
+    label_images,
+    label_once,
+    leaves_a_board_out,
+)
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group

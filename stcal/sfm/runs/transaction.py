@@ -1,20 +1,68 @@
 """The folder of a run: results are written into a hidden folder inside, which is renamed when they are complete, and
-take the places of the earlier ones. Whoever opens the folder next finishes that if the process was killed."""
+take the places of the earlier ones. Whoever opens the folder next finishes that if the process was killed. A marker
+holds the input of the run, and the hashes of its files."""
 
 import os
 import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import filelock
+from pydantic import Field
 
+import stcal
 from stcal.errors import InputError, StcalError
-from stcal.io.files import CACHE, INTERNAL, REPORT_PDF, RUN_ENTRIES, RUN_MARKER, digest_of, json_text, real_place, save
-from stcal.io.json import read_result
-from stcal.sfm.runs.marker import MarkerFile
+from stcal.io.files import (
+    CACHE,
+    INTERNAL,
+    REPORT_PDF,
+    RUN_ENTRIES,
+    RUN_MARKER,
+    digest_of,
+    json_text,
+    own_digest,
+    real_place,
+    save,
+)
+from stcal.io.json import ResultFile, read_result
+from stcal.sfm.runs.options import RunOptions
+
+ByFile = Annotated[str, "file"]
+
+
+class MarkerFile(ResultFile):
+    """Marker of a run's folder: the input of the run, and the hashes of its files."""
+
+    program: Literal["stcal-sfm"] = Field(description="that made the folder")
+    version: str = Field(description="of stcal")
+    images: str = Field(description="the folder of photographs")
+    options: dict[str, Any] | None = Field(description="of the run; null for `detect`")
+    sha256: dict[ByFile, str] | None = Field(
+        default=None,
+        description="path below the folder → SHA-256 (hex) of every file of the results, and of this one without its "
+        "own entry; absent until the run has ended well",
+    )
+
+    @classmethod
+    def of(cls, images: str | Path, options: RunOptions | None) -> "MarkerFile":
+        """Returns the marker of a run, or of a detection alone, that begins."""
+        return cls(
+            program="stcal-sfm",
+            version=stcal.__version__,
+            images=str(Path(images).absolute()),
+            options=None if options is None else asdict(options),
+        )
+
+    def sealed(self, digests: dict[str, str]) -> "MarkerFile":
+        """Returns the marker of results with these hashes, which include its own."""
+        others = {name: value for name, value in digests.items() if name != RUN_MARKER}
+        content = self.model_copy(update={"sha256": others}).content()
+        return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
+
 
 STAGE, READY, HOLDER = f"{INTERNAL}/unfinished", f"{INTERNAL}/ready", f"{INTERNAL}/holder.txt"
 """Results that are being written, results that are complete, and who writes."""

@@ -18,9 +18,8 @@ from stcal.sfm.budget.lengths import against_stated
 from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
-from stcal.sfm.runs.marker import MarkerFile
-from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.verify import verify
+from stcal.sfm.runs.saved import load_run, verify
+from stcal.sfm.runs.transaction import MarkerFile
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
 

@@ -10,8 +10,7 @@ from stcal.report.text import significant
 from stcal.sfm.budget.combine import budget_of_run
 from stcal.sfm.budget.file import BudgetFile
 from stcal.sfm.budget.page import REQUIRED, as_exact, budget_report
-from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.verify import verify
+from stcal.sfm.runs.saved import load_run, verify
 from tests.outcome import INPUT, assert_error
 
 STATED = "[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n"

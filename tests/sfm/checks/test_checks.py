@@ -18,10 +18,9 @@ from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.rims import lost_radius_mm
 from stcal.sfm.checks import faces
 from stcal.sfm.checks.board import board_checks
-from stcal.sfm.checks.culprits import culprits
 from stcal.sfm.checks.images import moved_check
 from stcal.sfm.checks.suite import Evidence, run_checks
-from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
+from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, culprits, judge
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.sections import checks_section, count_verdicts
 from stcal.sfm.runs.options import RunOptions

@@ -28,8 +28,7 @@ from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import pipeline_options
 from stcal.sfm.runs.crosscheck import Tolerances
 from stcal.sfm.runs.folder import write_report
-from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.verify import verify
+from stcal.sfm.runs.saved import load_run, verify
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
 from tests.shared import own_copy, unseal
 

@@ -9,7 +9,7 @@ import pytest
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
-from stcal.sfm.detect.board_alone import _is_symmetry, _numbered
+from stcal.sfm.detect.labels import _is_symmetry, _numbered
 from stcal.sfm.detect.sightings import PlaneView
 from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet

@@ -17,10 +17,9 @@ from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.measurement.target import read_target
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
-from stcal.sfm.runs.transaction import run_folder
+from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
 

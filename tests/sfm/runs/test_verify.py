@@ -8,10 +8,9 @@ import pytest
 
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop import crosscheck as interop
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.transaction import added_results, run_folder
-from stcal.sfm.runs.verify import verify
+from stcal.sfm.runs.saved import verify
+from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy
 
