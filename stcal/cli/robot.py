@@ -252,7 +252,7 @@ def identify(
         )
         require_identified_written(out, result)
     if offsets:
-        from stcal.robot.export import offsets_csv, require_offsets_written
+        from stcal.robot.identification.report import offsets_csv, require_offsets_written
 
         write(offsets, offsets_csv(result, nominal))
         require_offsets_written(offsets, result, nominal)

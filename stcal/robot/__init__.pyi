@@ -1,5 +1,5 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
-from .export import offsets_csv as offsets_csv
+from .identification.report import offsets_csv as offsets_csv
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
 from .identification.solve import identify as identify

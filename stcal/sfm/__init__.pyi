@@ -10,9 +10,9 @@ from .interop.export import export_run as export_run
 from .interop.export_database import export_database as export_database
 from .interop.export_model import export_model as export_model
 from .interop.native import calibrate_models as calibrate_models
-from .make.design import DesignOptions as DesignOptions
-from .make.design import design_tag_body as design_tag_body
-from .make.design import design_target as design_target
+from .make import DesignOptions as DesignOptions
+from .make import design_tag_body as design_tag_body
+from .make import design_target as design_target
 from .measurement.images import MeasureOptions as MeasureOptions
 from .measurement.images import measure as measure
 from .measurement.report import poses_csv as poses_csv

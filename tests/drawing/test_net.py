@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.make.pattern import make_pattern, sides_of
+from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import tag_body
 from tests.drawing.raster import camera_of, page_image
 from tests.outcome import fails_with

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.export import HEAD, offsets_csv, zeros
+from stcal.robot.identification.report import HEAD, offsets_csv, zeros
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.forward import forward

@@ -64,7 +64,7 @@ def test_detect_images(stcal_sfm, small_dataset, tmp_path):
 
 def test_design_target(stcal_sfm, monkeypatch, tmp_path):
     """Cases of hidden circles, which take seconds: `make/test_design.py`."""
-    monkeypatch.setattr("stcal.sfm.make.design.unnamed_cases", lambda *_: ([], 1))
+    monkeypatch.setattr("stcal.sfm.make.unnamed_cases", lambda *_: ([], 1))
     words = "--size", "130,120,110", "--faces", "front,right", "--circles", "9", "--images", "2", "--width", "1296"
     _, said, _ = stcal_sfm("design", tmp_path / "one", *words)
     options = sfm.DesignOptions((130.0, 120.0, 110.0), 9, width=1296, faces=("front", "right"))

@@ -19,7 +19,7 @@ from stcal.io.files import TARGET_MODEL
 from stcal.io.json import Part
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.interop.export.content import BOARD_RGB, colours
+from stcal.sfm.interop.export_content import BOARD_RGB, colours
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
 from stcal.sfm.mapping.models import (

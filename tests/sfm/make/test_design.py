@@ -10,16 +10,17 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.design import load_board, load_target, target_toml
 from stcal.lookalikes import MIN_COMMON
+from stcal.sfm import make
 from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
-from stcal.sfm.make import design
-from stcal.sfm.make.design import DesignOptions, make_target
-from stcal.sfm.make.pattern import (
+from stcal.sfm.make import (
     HIDDEN,
     LARGE,
     LEAST_CIRCLES,
     NAMES,
+    DesignOptions,
     faces_of,
     make_pattern,
+    make_target,
     sides_of,
     size_of,
     unnamed_cases,
@@ -103,7 +104,7 @@ def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     """Nine circles leave six, which is all that a face needs: of such patterns one in a few fails a case."""
     options = DesignOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
     with monkeypatch.context() as once:
-        once.setattr(design, "ATTEMPTS", 1)
+        once.setattr(make, "ATTEMPTS", 1)
         with fails_with("E-MAKE-UNNAMED … 1 … 420 … 1"):
             make_target(options)
     assert make_target(options).cases == 5 * 84

@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.io.poses.programs import metres, xyzw
-from stcal.sfm.interop.export.content import BOARD_RGB, Circle, Content, Photograph, ellipsoid, exaggeration
+from stcal.sfm.interop.export_content import BOARD_RGB, Circle, Content, Photograph, ellipsoid, exaggeration
 
 EDGES = 48
 """Number of edges of a disc. Its triangles leave out 0.3 % of its area."""

@@ -1,19 +1,38 @@
-"""Export of a target as tables and for robot programs."""
+"""Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
 import csv
 import io
+import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from textwrap import indent
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, ros2_launch, static_of_joint
+from stcal.io.files import save
+from stcal.io.poses.programs import (
+    Static,
+    fixed_joint,
+    messages,
+    read_messages,
+    read_ros1_launch,
+    read_ros2_launch,
+    ros1_launch,
+    ros2_launch,
+    static_of_joint,
+)
+from stcal.io.table import require_poses_written
 from stcal.io.toml import load_yaml, opencv_matrix
-from stcal.sfm.interop.export.content import Content
+from stcal.sfm.interop import gltf
+from stcal.sfm.interop.export_content import Content, content_of
+from stcal.sfm.runs.saved import AnyRun, saved_run
 
 COLUMNS = (
     *("kind", "face", "circle", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz", "nx", "ny", "nz", "radius_mm"),
@@ -184,3 +203,98 @@ def read_opencv(text: str) -> list[Static]:
         centres = np.reshape(face["centres"]["data"], (-1, 3)) if "centres" in face else ()
         frames += [Static(face["id"], "", Rigid(np.eye(3), pose.inverse() @ centre)) for centre in centres]
     return frames
+
+
+ROOT = "target"
+"""Default name of the target frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A form of export."""
+
+    suffix: str
+    write: Callable[[Content], str | bytes]
+    lost: str  # results among faces, circles, σ and cameras that the files do not hold
+    # returns :meth:`Content.statics` from a text, None for viewers
+    read: Callable[[str], Sequence[Static]] | None = None
+
+
+FRAMES_ONLY = "cameras, radii, σ of circles; σ of faces is in comments"
+FORMS = {
+    "urdf": Form(".urdf", urdf, "cameras, σ of circles; σ of faces is in comments", read_urdf),
+    "xacro": Form(".xacro", xacro, "cameras, σ of circles; σ of faces is in comments", read_urdf),
+    "tf2": Form(".yaml", tf2, FRAMES_ONLY, read_messages),
+    "ros2": Form(".py", launch_ros2, FRAMES_ONLY, read_ros2_launch),
+    "ros1": Form(".launch", launch_ros1, FRAMES_ONLY, read_ros1_launch),
+    "opencv": Form(".yml", opencv, "cameras", read_opencv),
+    "csv": Form(".csv", table, "cameras, correlations", read_table),
+    "gltf": Form(".gltf", gltf.gltf, "the lens's distortion but as numbers in extras"),
+    "glb": Form(".glb", gltf.glb, "the lens's distortion but as numbers in extras"),
+}
+"""Forms by the value of ``--form``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportedRun:
+    """An export that was written."""
+
+    path: Path
+    form: str
+    content: Content
+
+
+@require_arguments
+def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
+    """Writes faces and circles to a new file, with σ and cameras if the form holds them.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : str or Path
+        New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` and ``.launch`` (ROS 2
+        and 1), ``.yml`` (OpenCV), ``.csv``, ``.gltf`` or ``.glb``.
+    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv", "gltf", "glb"}, optional
+        Form in place of that of the suffix.
+    name : str
+        Name of the target frame, and prefix of the other frames' names.
+
+    Returns
+    -------
+    ExportedRun
+        ``path``, ``form``, and the ``content``.
+
+    Raises
+    ------
+    InputError
+        Not a finished run, the file exists, the form is unknown, or the name is bad.
+    """
+    path = Path(out)
+    form = form or form_of(path)
+    if form not in FORMS:
+        raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
+    if os.path.lexists(path):
+        raise InputError("E-OUTPUT-EXISTS", f"{path}: exists, and nothing is overwritten; give a new file")
+    if not path.parent.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
+    content = content_of(saved_run(run), name)
+    save(path, FORMS[form].write(content))
+    if (read := FORMS[form].read) is not None:
+        require_poses_written(
+            path,
+            lambda: Poses.of(static.pose for static in read(path.read_text(encoding="utf-8"))),
+            Poses.of(static.pose for static in content.statics()),
+        )
+    return ExportedRun(path, form, content)
+
+
+def form_of(path: Path) -> str:
+    """Returns the form for the suffix of a path."""
+    suffixes = {form.suffix: name for name, form in FORMS.items()}
+    if path.suffix.lower() not in suffixes:
+        raise InputError(
+            "E-OUTPUT-SUFFIX",
+            f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form",
+        )
+    return suffixes[path.suffix.lower()]
