@@ -88,11 +88,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
             never=("fitted",),
         ),
     ),
-    "name_choice": (
-        Typed(says=("OPENCV", "written")),
-        Typed(says=("written",)),
-        Typed(says=("written",)),
-    ),
+    "name_choice": (Typed(says=("OPENCV", "written")), Typed(says=("written",)), Typed(says=("written",))),
     "opencv_fisheye_model": (
         Typed(values=camera(420.5, 421.1, 639.2, 479.8, -0.021, 0.013, -0.009, 0.0021, names=FISHEYE)),
     ),

@@ -21,14 +21,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several
-from tests.handeye.photographed import (
-    CAMERA,
-    MARGIN_MM,
-    PER_MM,
-    image_from_sheet,
-    sheet_of_dots,
-    take,
-)
+from tests.handeye.photographed import CAMERA, MARGIN_MM, PER_MM, image_from_sheet, sheet_of_dots, take
 from tests.outcome import fails_with
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
@@ -131,8 +124,7 @@ def test_images_of_centres_are_exact():
 
 
 @pytest.mark.parametrize(
-    ("board", "count"),
-    [(dots(), 1), (dots(6, 6), 3), (dots(6, 6, (0, 0)), 0), (ChessboardDesign(5, 7, 1.0), 1)],
+    ("board", "count"), [(dots(), 1), (dots(6, 6), 3), (dots(6, 6, (0, 0)), 0), (ChessboardDesign(5, 7, 1.0), 1)]
 )
 def test_symmetries_bring_the_board_onto_itself(board, count):
     xyz = np.column_stack([board.xy_mm(), np.zeros(len(board.xy_mm()))])

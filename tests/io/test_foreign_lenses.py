@@ -169,8 +169,7 @@ def test_mrcals_splines_project_as_mrcal_does(tmp_path, order):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("model", "most_px"),
-    [("FOV", 1e-4), ("RAD_TAN_THIN_PRISM_FISHEYE", 0.1), ("DIVISION", 1e-4), ("EUCM", 1e-3)],
+    ("model", "most_px"), [("FOV", 1e-4), ("RAD_TAN_THIN_PRISM_FISHEYE", 0.1), ("DIVISION", 1e-4), ("EUCM", 1e-3)]
 )
 def test_a_fit_is_off_by_no_more_than_it_says(tmp_path, model, most_px):
     """The models differ in form; how near they come was measured."""

@@ -176,12 +176,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         if face == result.target.reference_face:
             continue
         truth = scene.target_from_face[face]
-        off = np.concatenate(
-            [
-                (pose @ truth.inverse()).log()[:3],
-                pose.translation - truth.translation,
-            ]
-        )
+        off = np.concatenate([(pose @ truth.inverse()).log()[:3], pose.translation - truth.translation])
         normalised = off @ np.linalg.solve(result.target.face_covariance[face], off)
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
 

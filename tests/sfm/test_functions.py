@@ -118,9 +118,7 @@ def test_report_again(stcal_sfm, small_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "call",
-    [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise],
-    ids=lambda call: call.__name__,
+    "call", [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise], ids=lambda call: call.__name__
 )
 def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
     with fails_with("E-FIELD-TYPE … 7"):

@@ -119,11 +119,7 @@ ELSEWHERE = {"sfm demo", "sfm detect", "robot from-photos"}
 FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.command for before in CALLS[:n]} | ELSEWHERE]
 
 
-@pytest.mark.parametrize(
-    "number",
-    sampled(range(len(CALLS)), kept=FIRST),
-    ids=[call.command for call in CALLS],
-)
+@pytest.mark.parametrize("number", sampled(range(len(CALLS)), kept=FIRST), ids=[call.command for call in CALLS])
 def test_calls_go_through(stock, tmp_path, number):
     assert went_through(stock, tmp_path / "case", number).failures == ()
 

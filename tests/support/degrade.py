@@ -254,10 +254,7 @@ def covered_labels(photograph: Photograph, image: np.ndarray, least: float = 8.0
 
 
 def behind(
-    photograph: Photograph,
-    planes: Iterable[Plane],
-    levels: Iterable[tuple[float, float]],
-    margin_mm: float = MARGIN_MM,
+    photograph: Photograph, planes: Iterable[Plane], levels: Iterable[tuple[float, float]], margin_mm: float = MARGIN_MM
 ) -> np.ndarray:
     """The photograph with planes drawn behind target and board; ``levels`` : grey values of each one's circles and of
     its plate. Later ones cover earlier ones; those that reach behind the camera are not drawn."""

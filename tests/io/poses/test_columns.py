@@ -53,10 +53,7 @@ def test_conventions(header, values, rotation, expected):
 @pytest.mark.parametrize(
     ("header", "words"),
     [
-        (
-            "rx_deg,ry_deg,rz_deg",
-            "E-ROTATION-AMBIGUOUS … rx, ry, rz … --rot",
-        ),
+        ("rx_deg,ry_deg,rz_deg", "E-ROTATION-AMBIGUOUS … rx, ry, rz … --rot"),
         ("rx,ry,rz", "E-ROTATION-AMBIGUOUS … --rotation … ur-rotvec, yaskawa"),
         ("w_rad,p_rad,r_rad", "E-ROTATION-AMBIGUOUS … wpr"),
         ("a,b,c", "E-ROTATION-AMBIGUOUS … abc"),

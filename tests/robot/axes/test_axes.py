@@ -447,10 +447,7 @@ def test_axes_that_are_parallel_but_for_the_smallest_number_are_compared_in_sile
 LENGTH_MM = 150.0
 UNEVEN = np.array([[120.0, 0, 0], [-120, 0, 0], [0, 160, -40], [0, -160, -40], [0, 0, 80]])
 """Middles of faces, say, about their mean."""
-PLACES = {
-    "ring": ring(LENGTH_MM),
-    "uneven": UNEVEN * LENGTH_MM / np.sqrt((UNEVEN**2).sum(axis=1).mean()),
-}
+PLACES = {"ring": ring(LENGTH_MM), "uneven": UNEVEN * LENGTH_MM / np.sqrt((UNEVEN**2).sum(axis=1).mean())}
 
 
 def posed(robot: Robot, q: np.ndarray, sigma: float = 0.0, seed: int = 0) -> Measurements:

@@ -162,9 +162,7 @@ def ten_of_two_sets(first, second) -> Verification:
     measured = [commanded + rng.normal(0, sigma, commanded.shape) for sigma in (first, second)]
     names = tuple(map(str, range(10))) * 2
     sets = ("before",) * 10 + ("after",) * 10
-    return verify(
-        MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)),
-    )
+    return verify(MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)))
 
 
 def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():

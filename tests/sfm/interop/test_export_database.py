@@ -276,12 +276,7 @@ def test_native_colmap_maps_the_export(small_run, tmp_path):
 PAIR = "UPDATE two_view_geometries SET {} WHERE pair_id = (SELECT max(pair_id) FROM two_view_geometries)"
 SECOND_CAMERA = "INSERT INTO cameras SELECT 2, model, width, height, params, prior_focal_length FROM cameras"
 REFUSALS = {
-    "EUCM": (
-        ["UPDATE cameras SET model = 16, params = zeroblob(48)"],
-        "4.0",
-        "E-SCHEMA-NO-PLACE … 1 … 16",
-        "4.2",
-    ),
+    "EUCM": (["UPDATE cameras SET model = 16, params = zeroblob(48)"], "4.0", "E-SCHEMA-NO-PLACE … 1 … 16", "4.2"),
     "division": (
         ["UPDATE cameras SET model = 12, params = zeroblob(32)"],
         "3.13",
@@ -303,24 +298,14 @@ REFUSALS = {
         "E-SCHEMA-NO-PLACE … 1",
         "4.0",
     ),
-    "pair camera": (
-        [PAIR.format("camera2 = x'00'")],
-        "4.0",
-        "E-SCHEMA-NO-PLACE … 1",
-        "4.2",
-    ),
+    "pair camera": ([PAIR.format("camera2 = x'00'")], "4.0", "E-SCHEMA-NO-PLACE … 1", "4.2"),
     "two sensors": (
         [SECOND_CAMERA, "INSERT INTO rig_sensors VALUES (1, 2, 0, NULL)"],
         "3.11",
         "E-SCHEMA-NO-PLACE … 1",
         "3.12",
     ),
-    "IMU": (
-        ["UPDATE rigs SET ref_sensor_type = 1"],
-        "3.11",
-        "E-SCHEMA-NO-PLACE … 1",
-        "3.12",
-    ),
+    "IMU": (["UPDATE rigs SET ref_sensor_type = 1"], "3.11", "E-SCHEMA-NO-PLACE … 1", "3.12"),
     "frame of two": (
         [
             SECOND_CAMERA,

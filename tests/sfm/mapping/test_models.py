@@ -257,10 +257,7 @@ def test_points_of_two_labels_merged(saved, model, plain):
     path = model.as_binary()
     found = calibrate_models(path, saved)
     assert found.target.circles.keys() == plain.target.circles.keys() - {"2:4", "2:6"}
-    assert found.notes == (
-        f"model {path}: points left out, since their keypoints name no one circle: 1",
-        NOT_THERE,
-    )
+    assert found.notes == (f"model {path}: points left out, since their keypoints name no one circle: 1", NOT_THERE)
 
 
 def test_a_split_track(saved, model, plain):

@@ -215,12 +215,7 @@ def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
 
 
 @pytest.mark.parametrize(
-    ("name", "key"),
-    [
-        (".stcal/run.json", "images"),
-        ("report.json", "groups"),
-        ("faces.json", "circles"),
-    ],
+    ("name", "key"), [(".stcal/run.json", "images"), ("report.json", "groups"), ("faces.json", "circles")]
 )
 def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
     edit(own_run / name, lambda content: content.pop(key))

@@ -51,11 +51,7 @@ SPOILT = {
     "a folder gone": (lambda run: shutil.rmtree(run / "colmap/models"), "missing", "colmap/models/12/images.bin"),
     "one letter": (lambda run: (run / "faces.json").write_text("faces.jsoN"), "changed", "faces.json"),
     "a link": (lambda run: link(run / "faces.json"), "changed", "faces.json"),
-    "a pipe": (
-        lambda run: ((run / "report.json").unlink(), os.mkfifo(run / "report.json")),
-        "changed",
-        "report.json",
-    ),
+    "a pipe": (lambda run: ((run / "report.json").unlink(), os.mkfifo(run / "report.json")), "changed", "report.json"),
     "the marker": (lambda run: edit_marker(run, lambda c: c.update(images="/elsewhere")), "changed", RUN_MARKER),
     "its hashes": (lambda run: edit_marker(run, lambda c: c["sha256"].popitem()), "changed", RUN_MARKER),
     "a file among the results": (lambda run: (run / "colmap/models/new.bin").touch(), "added", "colmap/models/new.bin"),
