@@ -70,13 +70,6 @@ def test_outliers_cannot_turn_points_on_a_line():
         register(a, b, folds=0)
 
 
-def test_spreads_and_supports():
-    a = np.array([[3.0, 0, 0], [-3, 0, 0], [0, 2, 0], [0, -2, 0]])
-    np.testing.assert_allclose(spreads(a + 7), np.sqrt([18, 8, 0]))
-    assert single_supports(MODELS["rigid"], a, 0.01).tolist() == []
-    assert single_supports(MODELS["rigid"], np.vstack([a[:2], [[1, 0, 0], [0, 5, 0]]]), 0.01).tolist() == [3]
-
-
 def test_one_point_off_a_plane_is_named_for_the_affine_model():
     flat = np.random.default_rng(3).uniform(-100, 100, (12, 3)) * [1, 1, 0]
     a = np.vstack([flat, [[0, 0, 90]]])

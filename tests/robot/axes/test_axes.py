@@ -25,7 +25,6 @@ SIGMA = 0.03
 WORLD = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0])
 TOOLS = {"A": Rigid(np.eye(3), [180, 20, 150]), "B": Rigid(np.eye(3), [-120, 130, 90])}
 TOOLS["C"] = Rigid(np.eye(3), [-60, -170, 210])
-RNG_SEED = 5
 
 
 def scara() -> Robot:

@@ -21,7 +21,7 @@ import pytest
 
 from stcal.errors import InputError, StcalError
 from stcal.sfm.interop import export_database as export
-from stcal.sfm.interop.export_database import copy_database, table_differences
+from stcal.sfm.interop.export_database import copy_database
 from stcal.sfm.interop.schema import SCHEMAS, schema_of_version
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with
@@ -243,36 +243,6 @@ def test_pycolmap_makes_the_same_model_of_the_export(small_run, tmp_path):
         assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
-def test_native_colmap_maps_the_export(small_run, tmp_path):
-    """Debian's 3.8 with thresholds for few points: every image of the group, every circle."""
-    colmap = native_colmap()
-    names, pair = first_group(small_run)
-    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", "3.8")
-    (tmp_path / "names.txt").write_text("\n".join(names) + "\n")
-    (tmp_path / "model").mkdir()
-    options = pipeline_options(names, pair)
-    given = {
-        "init_image_id1": pair[0],
-        "init_image_id2": pair[1],
-        "min_num_matches": options.min_num_matches,
-        "min_model_size": options.min_model_size,
-        "init_min_num_inliers": options.mapper.init_min_num_inliers,
-        "init_min_tri_angle": options.mapper.init_min_tri_angle,
-        "abs_pose_min_num_inliers": options.mapper.abs_pose_min_num_inliers,
-        "filter_min_tri_angle": options.mapper.filter_min_tri_angle,
-        **dict.fromkeys(["multiple_models", "extract_colors", "ba_refine_focal_length", "ba_refine_extra_params"], 0),
-    }
-    arguments = [str(part) for key, value in given.items() for part in (f"--Mapper.{key}", value)]
-    paths = ["--database_path", "out.db", "--image_path", ".", "--output_path", "model"]
-    command = [colmap, "mapper", *paths, "--image_list_path", "names.txt", *arguments]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert ended.returncode == 0, ended.stderr
-    model = pycolmap.Reconstruction(str(tmp_path / "model" / "0"))
-    assert {image.name for image in model.images.values() if image.has_pose} == set(names)
-    assert model.num_points3D() >= 80
-    assert 0 < model.compute_mean_reprojection_error() < 0.1
-
-
 PAIR = "UPDATE two_view_geometries SET {} WHERE pair_id = (SELECT max(pair_id) FROM two_view_geometries)"
 SECOND_CAMERA = "INSERT INTO cameras SELECT 2, model, width, height, params, prior_focal_length FROM cameras"
 REFUSALS = {
@@ -419,23 +389,17 @@ def test_a_database_that_is_locked(database, refused):
         other.stdin.close()
 
 
-def spoil(database, how):
-    data = bytearray(database.read_bytes())
-    match how:
-        case "text":
-            data = b"this is not a database"
-        case "empty":
-            data = b""
-        case "cut short":
-            data = data[: len(data) // 2]
-        case "overwritten":
-            data[4096 * 5 : 4096 * 20] = b"\xff" * (4096 * 15)
-    database.write_bytes(data)
+DAMAGE = {
+    "text": lambda data: b"this is not a database",
+    "empty": lambda data: b"",
+    "cut short": lambda data: data[: len(data) // 2],
+    "overwritten": lambda data: data[: 4096 * 5] + b"\xff" * (4096 * 15) + data[4096 * 20 :],
+}
 
 
-@pytest.mark.parametrize("how", ["text", "empty", "cut short", "overwritten"])
+@pytest.mark.parametrize("how", DAMAGE)
 def test_a_damaged_database(how, database, refused):
-    spoil(database, how)
+    database.write_bytes(DAMAGE[how](database.read_bytes()))
     assert re.search(r"database\.db: damaged \(.+\); make the run again", refused(database))
 
 
@@ -553,13 +517,3 @@ def test_the_command_says_what_it_wrote(stcal_sfm, small_run, tmp_path):
     assert out.splitlines()[0] == "schema 3.8, checked: 8 images, 28 pairs, camera model OPENCV"
     assert str(tmp_path / "out.db") in out.splitlines()[1]
     assert state_of(small_run) == before
-
-
-def test_differences_are_told_column_by_column():
-    older, newer = SCHEMAS["3.8"], SCHEMAS["3.11"]
-    assert table_differences(older.tables, older) == []
-    priors = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
-    assert table_differences(older.tables, newer) == [
-        *(f"table images has prior_{name} REAL in place of no column" for name in priors),
-        "table pose_priors is missing",
-    ]
