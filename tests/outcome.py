@@ -47,7 +47,6 @@ def fails_with(error: str) -> Iterator[pytest.ExceptionInfo[StcalError]]:
 
 
 def lines_of(stderr: str) -> list[str]:
-    """Standard error without progress."""
     return [line for line in stderr.splitlines() if not _PROGRESS.fullmatch(line)]
 
 

@@ -132,8 +132,6 @@ def test_public_names_are_documented():
     assert {name: missing for name, missing in found.items() if missing} == {}
 
 
-# --- what constructors refuse, like the readers of files ---
-
 FACE, TWO = reference_target().faces[:2]
 ROW = DHRow(100.0, 0.0, 0.0, 0.0)
 
@@ -261,9 +259,6 @@ def test_no_field_takes_a_value_of_another_type(made):
     assert taken == []
 
 
-# --- how results look in a notebook, and when transforms are equal ---
-
-
 def test_transforms_are_equal_by_value():
     turned = Rigid.exp([0.1, 0, 0, 1, 2, 3])
     assert Rigid() == Rigid()
@@ -284,9 +279,6 @@ def test_a_value_shows_itself_in_a_line(made):
     assert len(repr(made)) < 200 or "array([[" not in repr(made) or isinstance(made, Rigid)
 
 
-# --- errors in the words of Python ---
-
-
 def test_errors_speak_of_arguments(monkeypatch):
     monkeypatch.delenv(errors.COMMAND_LINE, raising=False)
     said = InputError("E-TEST", "--to-link a, --no-strict: give '--flatness 0.1', as `stcal robot --dh` has it; a--b")
@@ -305,9 +297,6 @@ def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
     with fails_with("E-OPTION-RANGE … flatness_mm 1e+09"):
         RunOptions(flatness_mm=1e9).settled(reference_target())
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())
-
-
-# --- the checker itself ---
 
 
 def bare(a, b) -> int:

@@ -36,7 +36,6 @@ APART = {"sfm demo", "robot init"}
 
 
 def functions_of(command: str) -> dict[str, object]:
-    """The functions that the table names for a command."""
     found = {}
     for name in re.findall(r"`((?:\w+\.)+\w+)`", TABLE[command]):
         path = name.removeprefix("stcal.").split(".")
@@ -67,7 +66,6 @@ def used(module: str) -> frozenset[int]:
 
 
 def calls_it(command: Callable, function: object) -> bool:
-    """Whether the module of a command uses a function or its class."""
     return id(function) in used(inspect.unwrap(command).__module__)
 
 
@@ -90,9 +88,6 @@ INSIDE = {"sfm.detect_circles", "handeye.handeye", "robot.load_universal"}
 def test_what_is_not_called_is_found():
     assert not calls_it(COMMANDS["sfm run"], stcal.sfm.plan)
     assert calls_it(COMMANDS["robot design"], robot.design)  # by its module
-
-
-# --- the answers of quick ones ---
 
 
 def call(*words) -> str:

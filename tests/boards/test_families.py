@@ -29,7 +29,6 @@ tag = [{ dictionary = "TagStandard41h12", id = 3, size_mm = 40, x_mm = 0, y_mm =
 
 
 def view_of_tag(tag: tuple[str, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A photograph of the tag with noise, and the places of its corners as printed, from top left, px."""
     rng = np.random.default_rng(seed)
     cells = 255 * np.array([list(row) for row in CELLS[tag].split()]).astype(np.uint8)
     sheet = np.kron(np.pad(cells, 1, constant_values=255), np.ones((PER_CELL, PER_CELL), np.uint8))

@@ -42,7 +42,6 @@ SETS = pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mar
 
 
 def seen_from(flange, setup, rng=None, sigma=(5e-4, 0.1)):
-    """Pairs of these flange poses."""
     if setup == "eye-in-hand":
         board = FLANGE_FROM_CAMERA.inverse() @ (flange.inverse() @ BASE_FROM_BOARD)
     else:
@@ -254,7 +253,6 @@ def test_a_board_of_another_size_is_no_contradiction():
 
 
 def turning(flange: Poses, seed: int) -> HandEyePoses:
-    """Of eye-in-hand with noise."""
     rng = np.random.default_rng(seed)
     board = FLANGE_FROM_CAMERA.inverse() @ flange.inverse() @ BASE_FROM_BOARD
     return HandEyePoses(disturbed(rng, flange, 2e-4, 0.1), disturbed(rng, board, 5e-4, 0.2))

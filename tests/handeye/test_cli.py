@@ -307,8 +307,6 @@ def test_splits_that_hold_out_nothing_but_outliers(command, tmp_path):
 
 
 def test_the_order_of_quaternions_is_an_option(command, tmp_path):
-    """x, y, z, w under the names of w, x, y, z."""
-
     def roll(rows):
         for row in rows:
             row[3:7], row[10:14] = [*row[4:7], row[3]], [*row[11:14], row[10]]

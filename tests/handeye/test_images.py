@@ -204,7 +204,6 @@ COMMON_FROM_GRID = Rigid(Rotation.from_euler("y", 30, degrees=True).as_matrix(),
 
 
 def photograph_of_both(pose: Rigid) -> np.ndarray:
-    """Of the ChArUco board and the AprilGrid, in one frame."""
     (_, sheet, first), (grid, origin) = charuco(), aprilgrid_mm(GRID, 2)
     drawn = [(grid, image_from_sheet(origin, pose @ COMMON_FROM_GRID)), (sheet, image_from_sheet(first, pose))]
     return photograph_of_several(drawn, PER_MM, (CAMERA.width, CAMERA.height))

@@ -171,9 +171,6 @@ def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
     assert found.identified.rank == 30
 
 
-# --- what is refused, before any photograph is measured ---
-
-
 @pytest.fixture
 def given(tmp_path, monkeypatch):
     """Inputs; measuring would fail the test."""

@@ -25,7 +25,6 @@ SLIDE = Joint("prismatic", -100.0, 2000.0)
 
 
 def turned(seed: int = 0, **more) -> Robot:
-    """With rows a little off right angles."""
     off = np.random.default_rng(seed).normal(size=(6, 4)) * [1, 0.01, 1, 0.01]
     rows = zip(mh80().rows, off, strict=True)
     rows = tuple(DHRow(r.a + a, r.alpha + alpha, r.d + d, r.theta + theta) for r, (a, alpha, d, theta) in rows)

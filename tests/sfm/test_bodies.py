@@ -146,7 +146,6 @@ def observed(target, count: int, seed: int, distance_mm: float = 300):
 
 
 def calibrated(target, images, size):
-    """The calibration of a body from its corners alone, without a camera."""
     start = Camera.of(start_camera(*size, "OPENCV"), "OPENCV")
     body = place_and_find_camera(images, target.faces, [start])
     camera = body.camera

@@ -20,7 +20,6 @@ from tests.shared import own_copy
 
 
 def written_json(stcal_sfm, out, *words) -> dict:
-    """What a command writes as JSON."""
     assert stcal_sfm(*words, "--json", out)[0] == 0
     return json.loads(out.read_text(encoding="utf-8"))
 

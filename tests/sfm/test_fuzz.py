@@ -142,7 +142,6 @@ def test_a_writer_without_a_check_is_found(stock, tmp_path, monkeypatch, kind, i
 
 @pytest.fixture
 def schedule(stock, tmp_path):
-    """A call with an input, and its folder."""
     call = call_of("register", "register/pairs.csv")
     read, written = lay_out(stock, tmp_path, call, earlier=True)
     return call, tmp_path, read, written, hashes(tmp_path)

@@ -59,7 +59,6 @@ def _traced(camera, box, centre, normal, radius, lens, rim_mm):
 
 
 def _moments(share, box):
-    """Light, and its centroid."""
     y, x = np.mgrid[box[1] : box[3], box[0] : box[2]]
     return np.array([share.sum(), (share * x).sum() / share.sum(), (share * y).sum() / share.sum()])
 
@@ -108,7 +107,6 @@ def _gradient_px(camera, seen, lens):
 
 @pytest.fixture(scope="module")
 def straight():
-    """A scene without distortion."""
     return make_scene(replace(OPTIONS, width=1296, height=864, distortion=()))
 
 

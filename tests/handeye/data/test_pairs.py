@@ -14,7 +14,6 @@ CELLS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def write(path, sides, unit="mm", edit=None, extra=None):
-    """A file with the poses of ``sides``, name → Poses; ``edit`` : (row, column) → text."""
     factor = {"mm": 1.0, "m": 1000.0}[unit]
     header = [f"{name}_{c}" + (f"_{unit}" if c in "xyz" else "") for name in sides for c in CELLS]
     rows = [

@@ -22,7 +22,6 @@ SETUPS = ("eye-in-hand", "eye-to-hand")
 
 
 def off(found, truth, name="mount_from_camera"):
-    """Angle (rad) and distance (mm) from the truth."""
     away = getattr(truth, name).inverse() @ getattr(found, name)
     return away.angle_rad(), float(np.linalg.norm(away.translation))
 
@@ -51,7 +50,6 @@ def test_noisy_poses_give_about_the_truth(method):
 
 @pytest.mark.parametrize("method", EXACT)
 def test_the_unit_of_the_poses_makes_no_difference(method):
-    """Poses in metres and σ in metres: the same answer in metres."""
     truth = simulated(np.random.default_rng(5), 10, camera=(1e-3, 0.4))
     sides = (truth.pairs.base_from_flange, truth.pairs.camera_from_board)
     in_metres = HandEyePoses(*(Poses(p.rotation, p.translation / 1000) for p in sides))

@@ -12,7 +12,6 @@ from tests.support.handeye import disturbed, simulated
 
 
 def apart(found: Rigid, true: Rigid) -> np.ndarray:
-    """rad and mm."""
     error = (found @ true.inverse()).log()
     return np.array([np.linalg.norm(error[:3]), np.linalg.norm(found.translation - true.translation)])
 

@@ -127,7 +127,6 @@ def test_the_share_of_the_transform_is_that_of_predictions():
 
 
 def test_poses_without_errors_are_not_tested():
-    """Nothing is divided by their residuals."""
     outcome = outcome_of(12, 3, method="park-martin", robot=(0, 0), camera=(0, 0))
     assert [each.title for each in judged(outcome).findings] == ["Motions of the flange", "Outliers"]
     assert judged(outcome).word == "good"

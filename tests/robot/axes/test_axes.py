@@ -222,7 +222,6 @@ SWEEP = 9
 
 
 def rows_of(joint: int) -> slice:
-    """Of the sweep of a joint, from 0."""
     return slice(3 * (1 + SWEEP * joint), 3 * (1 + SWEEP * (joint + 1)))
 
 
@@ -440,8 +439,6 @@ def test_axes_that_are_parallel_but_for_the_smallest_number_are_compared_in_sile
     assert np.isfinite(values).all()
     assert len(values) == len(mirrored) == 7
 
-
-# --- orientations ---
 
 LENGTH_MM = 150.0
 UNEVEN = np.array([[120.0, 0, 0], [-120, 0, 0], [0, 160, -40], [0, -160, -40], [0, 0, 80]])

@@ -57,7 +57,6 @@ def seven() -> Robot:
 
 
 def off(robot: Robot, poses: Poses, q: np.ndarray) -> tuple[float, float]:
-    """Largest error, mm and rad."""
     d = poses.difference(forward(robot, q))
     return np.linalg.norm(d[:, 3:], axis=1).max(), np.linalg.norm(d[:, :3], axis=1).max()
 

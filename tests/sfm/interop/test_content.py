@@ -15,8 +15,6 @@ from tests.shared import own_copy
 
 @pytest.fixture
 def spoilt(small_run, tmp_path):
-    """A copy of the small run's database after a statement."""
-
     def copy(statement: str) -> Path:
         database = own_copy(small_run / "colmap/database.db", tmp_path)
         with closing(sqlite3.connect(database)) as opened, opened:

@@ -56,7 +56,6 @@ def nothing_is_left(tmp_path, monkeypatch):
 
 @pytest.fixture(scope="session")
 def colmap() -> str:
-    """The native program, of any version that there is a schema for."""
     found = shutil.which("colmap")
     if found is None:
         pytest.skip("native colmap is not on PATH")
@@ -64,11 +63,7 @@ def colmap() -> str:
 
 
 def command(*arguments) -> list[str]:
-    """``stcal-sfm`` as a process of its own."""
     return [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
-
-
-# --- the real program ---
 
 
 @pytest.fixture(scope="module")
@@ -190,11 +185,7 @@ def test_a_run_with_other_options(colmap, small_set, stcal_sfm):
     assert check["mapping"]["faces"]["1"]["translation_um"] > 1e-4
 
 
-# --- thresholds ---
-
-
 def numbers(options, prefix: str = "") -> dict[str, float]:
-    """Numbers and choices of pycolmap's options by name."""
     values = {name: getattr(options, name) for name in dir(options) if not name.startswith("_")}
     return {prefix + name: value for name, value in values.items() if isinstance(value, bool | int | float)}
 
@@ -227,9 +218,6 @@ def test_older_names_and_unknown_options():
     assert given == dict(zip(names, ("6.0", "500", "0.5", "1"), strict=True))
     later = replace(found, mapper_options=frozenset({"default_random_seed"}))
     assert mapper_options(later, ["a"], (1, 2)) == {"default_random_seed": "1"}
-
-
-# --- programs that are not what they should be ---
 
 
 def program(folder, mapper: str, version: str = "3.8", asked: str = "") -> Path:
@@ -315,11 +303,7 @@ def test_a_mapper_that_fails(refused, tmp_path, case):
 
 
 def answers_of(colmap: str) -> str:
-    """The true program's answers about itself."""
     return f'case "$1 $2" in "help "*|"mapper -h") exec {colmap} "$@" ;; esac'
-
-
-# --- programs that hang ---
 
 
 def has_ended(pid: int) -> bool:
@@ -385,9 +369,6 @@ def test_an_interrupted_cross_check(own_run, tmp_path):
     assert_all_ended(pids, 2)
     assert list((tmp_path / "temporary").iterdir()) == []
     assert state_of(own_run) == before
-
-
-# --- programs that answer wrongly ---
 
 
 def test_what_the_mapper_is_given(own_run, refused, tmp_path):
@@ -476,11 +457,7 @@ def test_another_geometry_is_noticed(own_run, stcal_sfm, colmap, tmp_path):
     assert max(row["translation_um"] for row in check["result"]["faces"].values()) < 0.05  # from our own centres again
 
 
-# --- the run ---
-
-
 def never(tmp_path) -> Path:
-    """A program whose mapper must not be reached."""
     return program(tmp_path, "echo the mapper was started; exit 1")
 
 

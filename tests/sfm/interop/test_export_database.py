@@ -79,7 +79,6 @@ def state_of(folder) -> dict[str, str]:
 
 @pytest.fixture
 def database(small_run, tmp_path):
-    """A copy of the small run's database in a folder of its own."""
     (tmp_path / "run").mkdir()
     return own_copy(small_run / "colmap/database.db", tmp_path / "run")
 
@@ -116,7 +115,6 @@ def empty_database(schema, path) -> None:
 
 
 def native_colmap() -> str:
-    """Native COLMAP 3.8, as Debian has it."""
     colmap = shutil.which("colmap")
     if colmap is None:
         pytest.skip("native colmap is not on PATH")

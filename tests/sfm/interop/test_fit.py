@@ -14,7 +14,6 @@ from tests.shared import own_copy, unsealed_copy
 
 @pytest.fixture(scope="module")
 def own_run(small_run, tmp_path_factory):
-    """A copy of the small run; every test writes its model anew."""
     folder = tmp_path_factory.mktemp("fit") / "run"
     unsealed_copy(small_run, folder, ignore=shutil.ignore_patterns("cache", "overlays"))
     return folder
@@ -22,8 +21,6 @@ def own_run(small_run, tmp_path_factory):
 
 @pytest.fixture
 def changed(small_run, own_run):
-    """The copy with the small run's model after a change."""
-
     def change(spoil):
         model = pycolmap.Reconstruction(str(small_run / "colmap/target_model"))
         spoil(model)

@@ -34,7 +34,6 @@ def read(path, saved):
 
 @pytest.fixture(scope="module")
 def plain(saved):
-    """What the model of group 12 as the run wrote it says."""
     return calibrate_models(saved.folder / "colmap/models" / "12", saved)
 
 
@@ -47,11 +46,9 @@ class Model(pycolmap.Reconstruction):
         self.labels = {image.name: image.labels for image in saved.observations}
 
     def point(self, label: str) -> int:
-        """Id of a circle's point."""
         return next(i for i, _, found in self.seen() if found == label)
 
     def seen(self):
-        """(point id, (image id, keypoint), label) of every observation."""
         for image_id, image in self.images.items():
             for k, each in enumerate(image.points2D):
                 if each.has_point3D():
@@ -74,16 +71,12 @@ def model(saved, tmp_path):
 
 
 def assert_same_faces(found, known, missing=()) -> None:
-    """The same faces but for those missing, in the same places."""
     assert found.target.target_from_face.keys() == known.target.target_from_face.keys() - set(missing)
     for face, pose in found.target.target_from_face.items():
         assert np.allclose(pose.matrix(), known.target.target_from_face[face].matrix(), rtol=0, atol=SAME_MM), face
 
 
 NOT_THERE = "group 14: in none of the models"
-
-
-# --- pixel, database, mapping, model, pixel ---
 
 
 @pytest.fixture(scope="module")
@@ -162,9 +155,6 @@ def test_projections_are_colmap_s_own_less_half_a_pixel(saved, mapped):
     assert 0.001 < rms < 0.02  # good edges reach 0.005 px
 
 
-# --- labels ---
-
-
 def test_a_text_with_fewer_digits(saved, model, plain):
     """Quaternions of four digits are of length 1 to 1e-4 only; at f = 1393 px they move images by 0.2 px at most."""
     path = model.as_text() / "frames.txt"
@@ -182,9 +172,6 @@ def plain_rotation(saved) -> np.ndarray:
     return group.camera_from_model[0].rotation
 
 
-# --- edited models ---
-
-
 @pytest.mark.parametrize("face_id", ["1", "2"])
 def test_a_deleted_frame_circle_stands_where_the_design_has_it(saved, model, plain, face_id):
     """The circles are 20 µm off the design, each: so is a frame that rests on the design in one of its three."""
@@ -199,7 +186,6 @@ def test_a_deleted_frame_circle_stands_where_the_design_has_it(saved, model, pla
 
 
 def test_a_reference_face_of_too_few_circles_is_named(saved, model, stcal_sfm, tmp_path):
-    """And no file of half an answer is left."""
     face = saved.target_design.face("1")
     for circle in [face.y, *[c for c in face.ids if c not in (face.origin, face.x, face.y)][:5]]:
         model.delete_point3D(model.point(f"1:{circle}"))
@@ -211,7 +197,6 @@ def test_a_reference_face_of_too_few_circles_is_named(saved, model, stcal_sfm, t
 
 
 def test_points_of_two_labels_merged(saved, model, plain):
-    """Merged, they name neither circle."""
     model.merge_points3D(model.point("2:4"), model.point("2:6"))
     path = model.as_binary()
     found = calibrate_models(path, saved)
@@ -282,9 +267,6 @@ def test_a_world_of_another_size_place_and_attitude(saved, model, plain):
         assert np.allclose(pose.matrix(), known, rtol=0, atol=1e-8), face
     scale = found.scales["12"].mm_per_unit / plain.scales["12"].mm_per_unit
     assert scale == pytest.approx(1 / 0.037, rel=1e-12)
-
-
-# --- several groups, several models ---
 
 
 def test_all_groups_in_one_world(saved, tmp_path):
@@ -367,9 +349,6 @@ def test_models_are_found_two_folders_deep(saved, tmp_path):
     assert find_models(str(tmp_path / "all" / "a" / "0" / "deeper")) == [tmp_path / "all/a/0/deeper"]
 
 
-# --- a model of something else ---
-
-
 def test_intrinsics_refined_elsewhere_are_used_and_said(saved, model, plain):
     """0.1 px more focal length and 0.02 px more of the centre: a little off, and no reason to refuse it."""
     params = np.array(model.cameras[1].params)
@@ -421,7 +400,6 @@ def test_a_name_with_a_space_in_a_text(saved, model):
 
 
 def test_another_number_of_keypoints(saved, model):
-    """The run's other images have other circles."""
     image = next(i for i in model.images.values() if i.name == "12/IMG_1003.jpg")
     other = min(i.name for i in saved.observations if i.group == "14" and len(i) != len(image.points2D))
     image.name = other
@@ -442,9 +420,6 @@ def test_a_camera_model_that_stcal_has_not(saved, model):
     )
     with fails_with("E-CAMERA-MODEL … FOV"):
         read(model.as_binary(), saved)
-
-
-# --- damaged models ---
 
 
 def test_numbers_that_do_not_go_together(saved, model, stcal_sfm):
@@ -599,9 +574,6 @@ def test_a_model_of_an_older_version_has_no_rigs(saved, tmp_path, plain):
     assert_same_faces(calibrate_models(folder, saved), plain)
 
 
-# --- nothing there ---
-
-
 def test_an_empty_model(saved, model, stcal_sfm, tmp_path):
     for point in list(model.points3D):
         model.delete_point3D(point)
@@ -620,9 +592,6 @@ def test_no_model(saved, stcal_sfm, tmp_path):
     for place in ("missing", "file", "empty"):
         outcome = stcal_sfm("faces", tmp_path / place, "--run", saved.folder)
         assert_error(outcome, INPUT, "E-MODEL-UNREADABLE", f"{tmp_path / place}")
-
-
-# --- the command ---
 
 
 def test_the_command_says_what_the_models_say(saved, stcal_sfm, tmp_path):

@@ -198,7 +198,6 @@ def page(request) -> str:
 
 
 def rows_of(page: str, section: str) -> list[list[str]]:
-    """Cells of all table rows of a section, without markup."""
     part = page.split(f'<section id="{section}">')[1].split("</section>")[0]
     lines = re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
     return [

@@ -21,7 +21,6 @@ BOARD = reference_board()
 
 @pytest.fixture(scope="module")
 def hidden(small_dataset, small_scene, tmp_path_factory):
-    """The small set with the target painted over."""
     own = SmallSet(tmp_path_factory.mktemp("alone") / "set")
     own_copy(small_dataset, own.folder)
     for group in ("12", "14"):
@@ -71,9 +70,6 @@ def test_a_target_in_view_is_asked_for(small_set, small_scene, stcal_sfm):
     code, text, _ = stcal_sfm(*small.arguments("--target", path, "--board-only", "--no-strict"))
     assert code == 0
     assert "the board alone" in text
-
-
-# --- numbering ---
 
 
 def views(roll_deg: float) -> list[PlaneView]:

@@ -50,7 +50,6 @@ class Here(Executor):
 
 @pytest.fixture
 def expected(small_run):
-    """Results of this process alone."""
     return {name: (small_run / name).read_bytes() for name in RESULTS}
 
 

@@ -22,7 +22,6 @@ from tests.shared import own_copy
 
 @pytest.fixture
 def own(small_run, tmp_path):
-    """A copy of the small run to write to."""
     return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 

@@ -167,9 +167,6 @@ def test_an_expected_face_that_the_design_lacks():
         RunOptions(reference_face="9").settled(reference_target())
 
 
-# --- damaged, unfinished, of another version ---
-
-
 def edit(path, change) -> None:
     content = json.loads(path.read_text(encoding="utf-8"))
     change(content)
@@ -329,7 +326,6 @@ def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
 
 
 def nudge(path):
-    """Changes a digit of a number, which stays readable."""
     text = path.read_text(encoding="utf-8")
     place = max(match.start() for match in re.finditer(r"(?<=\d\.\d)\d", text))
     path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")

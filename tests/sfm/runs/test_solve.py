@@ -21,7 +21,6 @@ def group(scene, labels_only):
 
 
 def only(group, board: bool):
-    """Every image with its dots alone, or with its circles alone."""
     return [
         image.select([i for i, label in enumerate(image.labels) if str(label).startswith("board") == board])
         for image in group

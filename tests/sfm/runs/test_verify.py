@@ -20,7 +20,6 @@ MARKER = MarkerFile.of("images", RunOptions())
 
 @pytest.fixture
 def made(tmp_path):
-    """A run's folder of a few files."""
     with run_folder(tmp_path / "run", MARKER, {}) as folder:
         for name in ("faces.json", "report.json", "colmap/models/12/images.bin", "overlays/12/a.jpg"):
             (folder.stage / name).parent.mkdir(parents=True, exist_ok=True)
