@@ -15,7 +15,7 @@ from stcal.io.images import decode
 from stcal.robot.kinematics.model import mh80
 from stcal.sfm.detect.files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 MATRIX = np.array([[900.0, 0, 640.3], [0, 905.0, 355.8], [0, 0, 1]])
 SIZE = (1280, 720)
@@ -160,10 +160,8 @@ class Result:
 
 def test_checks_of_ones_own_have_their_own_names():
     assert [each.verdict for each in own_checks(Result(), [lambda _: check("mine")])] == ["failed"]  # 5 σ
-    with fails_with("E-CHECK-OWN … 'camera' is already used"):
-        own_checks(Result(), [lambda _: check("camera")])
-    with fails_with("E-CHECK-OWN … bool"):
-        own_checks(Result(), [lambda _: True])
+    refuses("E-CHECK-OWN … 'camera' is already used", own_checks, Result(), [lambda _: check("camera")])
+    refuses("E-CHECK-OWN … bool", own_checks, Result(), [lambda _: True])
 
 
 def test_the_repr_of_a_large_result_is_a_line():

@@ -31,7 +31,7 @@ from stcal.drawing.sheets import (
 )
 from stcal.io.design import board_toml, target_toml
 from tests.drawing.raster import shapes_of
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 SVG = "{http://www.w3.org/2000/svg}"
 DIGITS = 1e-6
@@ -245,10 +245,8 @@ def test_the_plan_beside_a_plate_has_the_numbers_of_its_circles():
 
 def test_far_too_many_sheets_are_refused(files):
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
-    with fails_with("E-DRAW-SHEETS … --paper … A4 … 500"):
-        draw(files / "board.toml", files / "board.pdf")
-    with fails_with("E-DRAW-SHEETS … 5000"):
-        draw(files / "board.toml", files / "board.pdf", "own")
+    refuses("E-DRAW-SHEETS … --paper … A4 … 500", draw, files / "board.toml", files / "board.pdf")
+    refuses("E-DRAW-SHEETS … 5000", draw, files / "board.toml", files / "board.pdf", "own")
 
 
 def test_circles_without_a_radius_are_refused(files):

@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.forms import SUFFIXES, WRITERS, written
 from stcal.io.cameras.read import read_camera
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 LENSES = {
     "PINHOLE": [],
@@ -108,11 +108,9 @@ def test_a_camera_of_a_chain_is_chosen(tmp_path):
     second = read_camera(path, "cam1")
     assert second.colmap_model == "OPENCV_FISHEYE"
     np.testing.assert_array_equal(second.distortion[[0, 1, 4, 5]], [-0.01, 0.02, -0.003, 0.0004])
-    with fails_with("E-CAMERA-SEVERAL … 2 cameras, 1 needed … cam0, cam1"):
-        read_camera(path)
+    refuses("E-CAMERA-SEVERAL … 2 cameras, 1 needed … cam0, cam1", read_camera, path)
     path.write_text(KALIBR.replace("pinhole", "catadioptric"))
-    with fails_with("E-CAMERA-MODEL … catadioptric … radtan"):
-        read_camera(path, "cam0")
+    refuses("E-CAMERA-MODEL … catadioptric … radtan", read_camera, path, "cam0")
 
 
 METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>

@@ -13,7 +13,7 @@ from stcal.io.cameras.difference import SizedLens, compare_cameras, fit_lens
 from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera, read_lens
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 WIDTH, HEIGHT = 1280, 961
 COLMAP = {
@@ -80,16 +80,13 @@ def test_a_database_of_something_else_is_refused(tmp_path):
     path = tmp_path / "other.db"
     with sqlite3.connect(path) as database:
         database.execute("CREATE TABLE cameras (camera_id, model, width, height, params)")
-    with fails_with("E-CAMERA-NONE"):
-        read_lens(path)
+    refuses("E-CAMERA-NONE", read_lens, path)
     with sqlite3.connect(path) as database:
         database.execute("INSERT INTO cameras VALUES (1, 4, 10, 10, 'words')")
-    with fails_with("E-CAMERA-UNREADABLE"):
-        read_lens(path)
+    refuses("E-CAMERA-UNREADABLE", read_lens, path)
     with sqlite3.connect(path) as database:
         database.execute("DROP TABLE cameras")
-    with fails_with("E-CAMERA-UNREADABLE … no such table: cameras"):
-        read_lens(path)
+    refuses("E-CAMERA-UNREADABLE … no such table: cameras", read_lens, path)
 
 
 @pytest.mark.parametrize("count", [12, 14])

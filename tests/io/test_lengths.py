@@ -11,7 +11,7 @@ from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
 from stcal.robot.urdf import load_urdf
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 TAGS = 'type = "tags"\n' + "".join(
     f'[[tag]]\ndictionary = "APRILTAG_36h11"\nid = {i}\nsize_mm = {{0}}\nx_mm = {{{i + 1}}}\ny_mm = 0.0\n'
@@ -57,10 +57,8 @@ def test_lengths_of_kalibr_are_metres(tmp_path, size):
 
 def test_layouts_in_metres_and_places_in_metres(tmp_path):
     load_layout(written(tmp_path, TAGS.format(60.0, 0.0, 120.0)))
-    with fails_with("E-LENGTH-UNIT … tag 0 … 0.06"):
-        load_layout(written(tmp_path, TAGS.format(0.06, 0.0, 0.12)))
-    with fails_with("E-TAG-OVERLAP … 0 … 1 … 0.12"):
-        load_layout(written(tmp_path, TAGS.format(60.0, 0.0, 0.12)))
+    refuses("E-LENGTH-UNIT … tag 0 … 0.06", load_layout, written(tmp_path, TAGS.format(0.06, 0.0, 0.12)))
+    refuses("E-TAG-OVERLAP … 0 … 1 … 0.12", load_layout, written(tmp_path, TAGS.format(60.0, 0.0, 0.12)))
 
 
 def test_a_tag_may_be_inside_another(tmp_path):

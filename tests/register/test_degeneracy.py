@@ -7,7 +7,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.models import MODELS
 from stcal.register.notes import WIDER_THAN, single_supports, spreads, symmetry
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 B_FROM_A = Rigid.exp([0.2, -0.7, 1.0, 500, 100, -900])
 SIGMA = 0.1
@@ -25,10 +25,8 @@ def along_a_line(n: int, off: float, seed=0) -> np.ndarray:
 @pytest.mark.parametrize("method", ["robust", "least-squares"])
 def test_a_line_is_refused(method):
     a = along_a_line(20, 0.02)
-    with fails_with("E-POINTS-COLLINEAR … 20"):
-        register(a, seen(a), method=method)
-    with fails_with("E-POINTS-COLLINEAR"):
-        register(a * [1, 0, 0], seen(a * [1, 0, 0]), method=method)
+    refuses("E-POINTS-COLLINEAR … 20", register, a, seen(a), method=method)
+    refuses("E-POINTS-COLLINEAR", register, a * [1, 0, 0], seen(a * [1, 0, 0]), method=method)
 
 
 def test_what_is_needed_off_a_line_is_what_is_refused():
@@ -46,11 +44,9 @@ def test_a_plane_is_solved_rigidly_and_refused_affinely():
     assert found.inliers.all()
     assert any("in a plane" in note for note in found.notes)
     for method in ("robust", "least-squares"):
-        with fails_with("E-POINTS-COPLANAR"):
-            register(a, seen(a), model="affine", method=method)
+        refuses("E-POINTS-COPLANAR", register, a, seen(a), model="affine", method=method)
     thin = a + np.random.default_rng(2).normal(0, 0.05, a.shape)
-    with fails_with("E-POINTS-COPLANAR … 25"):
-        register(thin, seen(thin), model="affine")
+    refuses("E-POINTS-COPLANAR … 25", register, thin, seen(thin), model="affine")
 
 
 def test_one_point_off_a_line_is_named():

@@ -7,7 +7,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, read_poses
 from stcal.handeye.data.pairs import inverse_covariance
 from stcal.io.table import COVARIANCE
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 
 CELLS = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -94,16 +94,13 @@ def test_matrices_are_checked_one_by_one(truth):
     assert same.camera_from_board.translation == pytest.approx(truth.pairs.camera_from_board.translation)
     mirrored = [m.copy() for m in board]
     mirrored[3][:3, 2] *= -1
-    with fails_with("E-ROTATION-IMPROPER … camera_from_board"):
-        HandEyePoses.from_matrices(flange, mirrored)
+    refuses("E-ROTATION-IMPROPER … camera_from_board", HandEyePoses.from_matrices, flange, mirrored)
     broken = [m.copy() for m in flange]
     broken[1][0, 3] = np.inf
     with fails_with("E-ARRAY-NOT-FINITE"):
         HandEyePoses.from_matrices(broken, board, names=tuple(f"{c}.png" for c in "abcdefgh"))
-    with fails_with("E-POSES-COUNT … 8 … 7"):
-        HandEyePoses.from_matrices(flange, board[:7])
-    with fails_with("E-POSES-COUNT … 7 … 8"):
-        HandEyePoses.from_matrices(flange[:7], board)
+    refuses("E-POSES-COUNT … 8 … 7", HandEyePoses.from_matrices, flange, board[:7])
+    refuses("E-POSES-COUNT … 7 … 8", HandEyePoses.from_matrices, flange[:7], board)
 
 
 def test_covariances_are_read_and_turned_over(tmp_path, truth):

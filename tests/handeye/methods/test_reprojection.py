@@ -12,7 +12,7 @@ from stcal.handeye.methods.reprojection import problem
 from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.support.handeye import error, normalised, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
@@ -127,10 +127,8 @@ def test_views_that_show_too_little_are_named():
     truth = simulated_views(np.random.default_rng(9), 5)
     view = truth.views.views[1]
     for count, message in ((3, "E-VIEW-CORNERS … 1.png … 3 … 4"), (5, "E-VIEW-CORNERS … 1.png")):
-        with fails_with(message):
-            with_view(truth, 1, View(view.xyz_board[:count], view.xy_px[:count]))
-    with fails_with("E-POSES-COUNT … 5 … 4"):
-        pairs_of_views(truth.pairs.base_from_flange, truth.views[:4])
+        refuses(message, with_view, truth, 1, View(view.xyz_board[:count], view.xy_px[:count]))
+    refuses("E-POSES-COUNT … 5 … 4", pairs_of_views, truth.pairs.base_from_flange, truth.views[:4])
 
 
 def test_a_camera_file_that_is_right_keeps_its_sigma():

@@ -21,7 +21,7 @@ from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import run_folder
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.shared import own_copy, unsealed_copy
 
 FRAME = ("id", "ids", "origin", "x", "y")
@@ -161,10 +161,8 @@ def test_which_faces_the_photographs_were_to_show(groups, given, expected):
 
 
 def test_an_expected_face_that_the_design_lacks():
-    with fails_with("E-TARGET-NO-FACE … 7"):
-        RunOptions(expect_faces=("7",)).settled(reference_target())
-    with fails_with("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5"):
-        RunOptions(reference_face="9").settled(reference_target())
+    refuses("E-TARGET-NO-FACE … 7", RunOptions(expect_faces=("7",)).settled, reference_target())
+    refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, reference_target())
 
 
 def edit(path, change) -> None:

@@ -12,7 +12,7 @@ from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.transaction import added_results, run_folder
 from stcal.sfm.runs.verify import verify
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.shared import own_copy
 
 MARKER = MarkerFile.of("images", RunOptions())
@@ -122,13 +122,10 @@ def test_a_run_without_hashes_gets_none(made):
     with added_results(made) as stage:
         (stage / "compare.json").write_text("x")
     assert (made / "compare.json").read_text() == "x"
-    with fails_with(f"E-RUN-UNFINISHED … {RUN_MARKER}"):
-        verify(made)
+    refuses(f"E-RUN-UNFINISHED … {RUN_MARKER}", verify, made)
     edit_marker(made, lambda content: content.update(sha256=3))
-    with fails_with(f"E-RUN-DAMAGED … {RUN_MARKER} … sha256: 3:"):
-        verify(made)
-    with fails_with("E-RUN-FOLDER"):
-        verify(made / "colmap/models")
+    refuses(f"E-RUN-DAMAGED … {RUN_MARKER} … sha256: 3:", verify, made)
+    refuses("E-RUN-FOLDER", verify, made / "colmap/models")
 
 
 def test_compare_adds_its_file(small_run, small_dataset, tmp_path, stcal_sfm):

@@ -15,7 +15,7 @@ from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
 from stcal.handeye.data.robot_poses import read_robot_poses
 from stcal.workflows.handeye.inputs import one_source, read_input
 from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 5).pairs
@@ -303,12 +303,9 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     between = ";" if ";" in head else ","
     path = written(tmp_path, f"{head}\n{between.join('123456')}\n", name)
     said = Said(rotation="ur-rotvec")
-    with fails_with("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm"):
-        read_input(path, statements=said)
-    with fails_with("E-POSES-NOT-FOUND … u"):
-        one_source(path, path, "image", said)
-    with fails_with("E-POSES-NOT-FOUND … u"):
-        read_robot_poses(path, statements=said)
+    refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", read_input, path, statements=said)
+    refuses("E-POSES-NOT-FOUND … u", one_source, path, path, "image", said)
+    refuses("E-POSES-NOT-FOUND … u", read_robot_poses, path, statements=said)
 
 
 def test_half_of_decimal_commas_is_no_list_of_numbers(tmp_path):
