@@ -160,13 +160,10 @@ def test_a_strip_hidden_is_said(tmp_path):
     assert "strip" in found.skipped[0].reason
 
 
-def test_a_camera_of_other_images_is_refused(tmp_path):
+def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
     with fails_with("E-CAMERA-CENTRE … 406 … 293 … a.png"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
-
-
-def test_no_readable_image_is_said(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)

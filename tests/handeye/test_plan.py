@@ -75,13 +75,10 @@ def test_only_what_the_robot_reaches_is_planned():
         plan_poses(truth.pairs, found, 1, OUTLINE, CAMERA, lambda flange: np.zeros(len(flange), bool))
 
 
-def test_a_method_without_sigma_cannot_plan():
+def test_what_cannot_be_planned_is_said():
     truth, _ = few(4)
     with fails_with("E-PLAN-NO-SIGMA … park-martin"):
         plan_poses(truth.pairs, handeye(truth.pairs, method="park-martin"))
-
-
-def test_a_board_that_never_fits_the_image_is_said_to_be_so():
     truth, found = few(5)
     with fails_with("E-PLAN-NO-VIEW"):
         plan_poses(truth.pairs, found, 1, 1000 * OUTLINE, CAMERA)

@@ -314,18 +314,3 @@ def test_mrcals_region_is_read(tmp_path):
     (tmp_path / "c.cameramodel").write_text(text.replace(str(REGION.tolist()), "[1, 2, 3]"))
     with fails_with("E-CAMERA-CONTENT … valid_intrinsics_region"):
         read_lens(tmp_path / "c.cameramodel")
-
-
-@pytest.mark.slow
-def test_mrcals_splined_example_is_fitted_and_compared_where_it_is_valid(shared_case):
-    """A turn alone, fitted elsewhere, leaves 1.16 px between mrcal's two models of one lens in their valid region."""
-    folder = shared_case("mrcal_splined")
-    splined, opencv = (read_lens(folder / f"{name}.cameramodel") for name in ("splined-0", "opencv8-0"))
-    assert isinstance(splined, ForeignLens)
-    found = fit_lens(splined, 6016, 4016)
-    assert found.rms_px < 1.16  # more parameters than a turn
-    assert np.degrees(found.camera_from_lens.angle_rad()) > 1
-    difference = compare_cameras(SizedLens(splined, 6016, 4016, found), opencv.sized(6016, 4016))
-    lengths = difference.lengths()
-    assert np.sqrt(np.nanmean(lengths**2)) == pytest.approx(1.16, abs=0.05)
-    assert 0.6 < np.isfinite(lengths).mean() < 0.9

@@ -25,16 +25,13 @@ def with_cells(cells):
     return [f"{row},{cell}" for row, cell in zip(ROWS, cells, strict=True)]
 
 
-def test_points_and_lines(written):
+def test_points_lines_and_units(written):
     pairs = read_pairs(written([ROWS[0], "# a remark", *ROWS[1:]]))
     assert list(pairs.lines) == [2, 4, 5, 6]
     np.testing.assert_array_equal(pairs.xyz_a[3], [0, 0, 3.5])
     np.testing.assert_array_equal(pairs.xyz_b[2], [10, 22, 30])
     assert pairs.weights is None
     assert pairs.covariances is None
-
-
-def test_units_by_suffix(written):
     pairs = read_pairs(written(ROWS, "ax_m,ay_mm,az_mm,bx_in,by_in,bz_in"))
     np.testing.assert_allclose(pairs.xyz_a[1], [1000, 0, 0])
     np.testing.assert_allclose(pairs.xyz_b[0], np.array([10, 20, 30]) * 25.4)

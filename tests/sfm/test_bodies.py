@@ -376,9 +376,6 @@ def test_a_body_may_have_tags_on_some_faces():
     assert net_text(tag_body("cube", "45", "APRILTAG_36h11", 0)).endswith("mm: one sheet of A4")
     refuses("E-OPTION-VALUE … no face 9 … 1, 2, 3", tag_body, "cube", "62", "APRILTAG_36h11", 3, "1,9")
     refuses("E-OPTION-VALUE … two or more", tag_body, "cube", "62", "APRILTAG_36h11", 3, "1")
-
-
-def test_widths_that_are_none_are_refused():
     refuses("E-OPTION-VALUE … 60,60 … width", tag_body, "cube", "60,60", "APRILTAG_36h11", 0)
     refuses("E-TAG-ID-RANGE … 50", tag_body, "cube", "60", "4X4_50", 47)
 

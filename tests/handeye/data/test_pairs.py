@@ -73,15 +73,12 @@ def test_missing_and_doubled_sides(tmp_path, truth):
         read_poses(write(tmp_path / "b.csv", every))
 
 
-def test_identical_poses_are_named(tmp_path, truth):
+def test_identical_poses_and_a_board_that_did_not_follow_are_named(tmp_path, truth):
     rows = [0, 1, 2, 3, 1, 5]
     sides = {"base_from_flange": truth.pairs.base_from_flange[rows]}
     sides["camera_from_board"] = truth.pairs.camera_from_board[rows]
     with fails_with("E-POSES-IDENTICAL … line 3 and line 6"):
         read_poses(write(tmp_path / "poses.csv", sides))
-
-
-def test_a_board_that_did_not_follow_is_named(truth):
     board = truth.pairs.camera_from_board[[0, 1, 2, 3, 3, 5, 6, 7]]
     with fails_with("E-POSES-IDENTICAL … pose 4 and pose 5"):
         HandEyePoses(truth.pairs.base_from_flange, board)

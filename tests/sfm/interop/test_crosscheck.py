@@ -271,13 +271,10 @@ def test_no_native_program(own_run, stcal_sfm, tmp_path, monkeypatch):
     assert_error(outcome, INPUT, "E-COLMAP-PROGRAM", "on the PATH", INSTALL, "--colmap")
 
 
-def test_no_program_there(refused, tmp_path):
+def test_programs_that_are_not_there_or_not_colmap(refused, tmp_path):
     (tmp_path / "text").write_text("no program")
     for place in (tmp_path / "none", tmp_path, tmp_path / "text"):
         refused(place, INPUT, f"native COLMAP: no program at {place} that can be executed", INSTALL)
-
-
-def test_a_program_that_is_not_colmap(refused, tmp_path):
     refused(shutil.which("true"), INPUT, "does not say a COLMAP version", INSTALL, "or give another --colmap")
     refused(shutil.which("false"), INPUT, "help` ended with code 1: no message", INSTALL)
     refused(sys.executable, INPUT, " help` ended with code 2: ", INSTALL)

@@ -340,10 +340,11 @@ def refused(tmp_path):
     return message
 
 
-def test_an_unknown_schema_lists_the_known_ones(database, refused):
+def test_an_unknown_schema_and_a_folder_that_is_not_there(database, refused):
     assert refused(database, schema="3.7") == (
         "schema 3.7: unknown; give one of 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.2"
     )
+    assert re.search(r"out\.db: no folder .*/none; make it", refused(database, out="none/out.db"))
 
 
 def test_nothing_is_overwritten(database, refused, tmp_path):
@@ -355,17 +356,10 @@ def test_nothing_is_overwritten(database, refused, tmp_path):
     assert "out.db: exists" in refused(database.parent / "none.db")  # told before anything is read
 
 
-def test_a_folder_that_is_not_there(database, refused):
-    assert re.search(r"out\.db: no folder .*/none; make it", refused(database, out="none/out.db"))
-
-
-def test_a_database_that_pycolmap_has_open(database, refused):
+def test_a_database_in_use_or_left_with_side_files(database, refused):
     with closing(pycolmap.Database.open(str(database))):
         assert "database.db: in use by another program (database.db-wal, database.db-shm" in refused(database)
     assert "Exported" in repr(copy_database(database, database.parent / "out.db", "3.8"))
-
-
-def test_side_files_of_a_program_that_did_not_end_well(database, refused):
     Path(f"{database}-journal").write_bytes(b"")
     assert "in use by another program (database.db-journal beside it); close it" in refused(database)
 

@@ -72,23 +72,11 @@ def blacken(small, scene, group: str, board: bool, count: int) -> None:
         small.image(i, group).write_bytes(encoded(".jpg", picture))
 
 
-def test_missing_folder(small_set, stcal_sfm):
-    small = small_set()
-    small.images.rmdir()
-    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-FOLDER", str(small.images), "does not exist")
-
-
 def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
     small = small_set()
     outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
     assert_error(outcome, INPUT, "E-VIDEO-UNREADABLE", str(small.camera), "a folder of images")
     assert not (small.out / ".stcal/cache" / "frames").exists()
-
-
-def test_empty_folder(small_set, stcal_sfm):
-    small = small_set()
-    (small.images / "12").mkdir()
-    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE", str(small.images), f"{small.images}")
 
 
 def test_no_image_is_left(small_set, stcal_sfm):
