@@ -24,7 +24,6 @@ def read(header: str, *values: float, rotation: str | None = None):
 
 FANUC = about("z", 30) @ about("y", 20) @ about("x", 10)
 """Rz(R) Ry(P) Rx(W), FANUC's and Yaskawa's manuals; Rz(A) Ry(B) Rx(C), KUKA's."""
-AXIS = np.array([0.3, -0.4, 1.2])
 
 
 @pytest.mark.parametrize(
