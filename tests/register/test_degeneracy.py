@@ -49,16 +49,13 @@ def test_a_plane_is_solved_rigidly_and_refused_affinely():
     refuses("E-POINTS-COPLANAR … 25", register, thin, seen(thin), model="affine")
 
 
-def test_one_point_off_a_line_is_named():
+def test_one_point_off_a_line_is_named_and_outliers_cannot_turn_it():
+    """Any one wrong point off the line fits exactly, and would set the turn about it."""
     a = np.vstack([along_a_line(12, 0.0), [[0, 80, 0]]])
     found = register(a, seen(a), folds=0, lines=range(2, 15))
     assert any("only line 14 keeps the points off a line" in note for note in found.notes)
     two = np.vstack([a, [[50, 60, 10]]])
     assert not any("keeps the points off" in note for note in register(two, seen(two), folds=0).notes)
-
-
-def test_outliers_cannot_turn_points_on_a_line():
-    """Any one wrong point off the line fits exactly, and would set the turn about it."""
     a = np.vstack([along_a_line(20, 0.02), np.random.default_rng(5).uniform(-100, 100, (4, 3))])
     b = seen(a)
     b[20:] += np.random.default_rng(6).uniform(-60, 60, (4, 3))

@@ -86,16 +86,13 @@ def test_light_falls_off():
     assert np.median(veiled[:, 61] - veiled[:, 58]) == pytest.approx(0.4 * 160, abs=2)
 
 
-def test_the_sensor_has_hot_pixels_and_dust():
+def test_pixels_of_sensor_and_file():
     hot = degrade.hot_pixels(EVEN, 0.01, 0) != EVEN
     assert hot.mean() == pytest.approx(0.01, rel=0.2)  # 600 of 60 000
     dust = degrade.dusty(EVEN, 10, 0) / 120
     assert 0.2 < dust.min() < 0.9
     assert dust.max() <= 1
     assert 0.5 < (dust > 0.99).mean() < 0.99
-
-
-def test_files_are_of_8_to_16_bits():
     assert degrade.stored(np.array([[-4.0, 99.6, 300.0]])).tolist() == [[0, 100, 255]]
     deep = degrade.stored(np.array([[0.0, 255.0]]), 12)
     assert (deep.dtype, deep.tolist()) == (np.uint16, [[0, 4095]])

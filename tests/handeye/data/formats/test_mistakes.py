@@ -130,12 +130,9 @@ def test_what_is_no_array_of_poses_is_named(tmp_path, name, content, part):
     assert part in refused(tmp_path / name)
 
 
-def test_a_small_archive_of_much_is_not_unpacked(tmp_path):
+def test_archives_of_much_and_programs_are_no_arrays(tmp_path):
     (tmp_path / "a.npz").write_bytes(archived(bytes(101_000_000)))
     assert "101 MB unpacked, at most 100 MB are read" in refused(tmp_path / "a.npz")
-
-
-def test_a_program_is_no_array(tmp_path):
     (tmp_path / "b.npy").write_bytes(pickle.dumps(GOOD))
     assert read_robot(tmp_path / "b.npy", Said()) is None  # the reader of tables says that it is no text
 
