@@ -8,6 +8,7 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.methods.closed_form import mean_pose, robust
+from tests.outcome import fails_with
 from tests.support.handeye import disturbed, simulated
 
 
@@ -40,6 +41,12 @@ def test_a_third_of_bad_poses_does_no_harm(seed):
     assert 1e-6 < apart(x, truth.mount_from_camera)[0] < 1e-3
     assert 1e-3 < apart(x, truth.mount_from_camera)[1] < 1.0
     assert apart(z, truth.stand_from_board)[1] < 1.0
+
+
+def test_two_poses_are_too_few():
+    truth = simulated(np.random.default_rng(0), 2)
+    with fails_with("E-HANDEYE-FEW-POSES … 2"):
+        robust(Loop.of(truth.pairs, "eye-in-hand"))
 
 
 def test_mean_pose_of_two_turns_is_half_way():
