@@ -18,7 +18,6 @@ PROGRAMS = {"stcal": (app, main), "stcal-sfm": (sfm, main_sfm)}
 
 
 def command_tree(application: typer.Typer, above: str = "") -> dict[str, Callable]:
-    """Functions by the words that call them: ``sfm run``."""
     found = {}
     for command in application.registered_commands:
         assert command.callback is not None
@@ -74,17 +73,14 @@ class Call:
 
     @property
     def inputs(self) -> list[str]:
-        """Places in the stock."""
         return [word[1:] for word in self.split() if word[0] == "@"]
 
     @property
     def outputs(self) -> list[str]:
-        """Names of files that may be there."""
         return [word[1:] for word in self.split() if word[0] == ">"]
 
     @property
     def folders(self) -> list[str]:
-        """Places in the stock of which copies are written to."""
         return [word[1:] for word in self.split() if word[0] == "~"]
 
     def arguments(self, read: Path, written: Path) -> list[str]:

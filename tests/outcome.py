@@ -46,8 +46,13 @@ def fails_with(error: str) -> Iterator[pytest.ExceptionInfo[StcalError]]:
         start = message.index(part, start) + len(part)
 
 
+def refuses(error: str, function: Callable, *arguments, **options) -> None:
+    """Expect :func:`fails_with` of a call."""
+    with fails_with(error):
+        function(*arguments, **options)
+
+
 def lines_of(stderr: str) -> list[str]:
-    """Standard error without progress."""
     return [line for line in stderr.splitlines() if not _PROGRESS.fullmatch(line)]
 
 

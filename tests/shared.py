@@ -49,7 +49,6 @@ class Once:
         return folder, value
 
     def changed(self) -> list[str]:
-        """Files that are not as they were made."""
         found = []
         for folder, made in self._stamps.items():
             now = stamps(folder)
@@ -64,7 +63,6 @@ def stamps(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def protect(folder: Path) -> None:
-    """Take away the write bits of all files below a folder but locks."""
     for path in folder.rglob("*"):
         if path.is_file() and not path.name.endswith(OF_READERS):
             path.chmod(0o444)
@@ -90,7 +88,6 @@ def unsealed_copy(run: Path, to: Path, ignore: Callable | None = None) -> Path:
 
 
 def unseal(run: Path) -> None:
-    """Remove the hashes of a run's files, so that edited ones are read."""
     marker = json.loads((run / ".stcal/run.json").read_text(encoding="utf-8"))
     (run / ".stcal/run.json").write_text(json.dumps(marker | {"sha256": None}), encoding="utf-8")
 

@@ -132,8 +132,6 @@ def test_public_names_are_documented():
     assert {name: missing for name, missing in found.items() if missing} == {}
 
 
-# --- what constructors refuse, like the readers of files ---
-
 FACE, TWO = reference_target().faces[:2]
 ROW = DHRow(100.0, 0.0, 0.0, 0.0)
 
@@ -150,41 +148,28 @@ ROW = DHRow(100.0, 0.0, 0.0, 0.0)
         (lambda: Robot("a", "modified", ((1, 2, 3, 4),), (Joint(),)), "E-ROBOT-ENTRIES … DHRow"),
         (lambda: Robot("a", "modified", (DHRow(0.4, 0, 0.1, 0),), (Joint(),)), "E-LENGTH-UNIT … 0.4 mm … metres"),
         (lambda: TargetDesign("t", "black", (FACE,)), "E-OPTION-VALUE … 'black' … bright or dark"),
-        (lambda: TargetDesign("t", "dark", (FACE, replace(FACE, id="9"))), "E-TARGET-LIKENESS … 1 … 9"),
-        (lambda: TargetDesign("t", "dark", (FACE, replace(TWO, id="1"))), "E-TARGET-ID … 1"),
-        (lambda: TargetDesign("t", "dark", (replace(FACE, id="board"),)), "E-TARGET-ID … board"),
         (
             lambda: TargetDesign("t", "dark", (replace(FACE, xy_mm=FACE.xy_mm / 1e3, radius_mm=FACE.radius_mm / 1e3),)),
             "E-LENGTH-UNIT … metres",
         ),
         (lambda: replace(FACE, ids=FACE.ids[:-1]), "E-ARRAY-SHAPE … face 1"),
-        (lambda: replace(FACE, ids=("1", *FACE.ids[:-1])), "E-TARGET-ID … face 1: circle id 1"),
-        (lambda: replace(FACE, x="z"), "E-TARGET-FRAME … z"),
-        (lambda: replace(FACE, x=FACE.y, y=FACE.x), "E-TARGET-FRAME … clockwise"),
-        (lambda: replace(FACE, radius_mm=5 * FACE.radius_mm), "E-TARGET-OVERLAP … face 1"),
         (lambda: replace(FACE, radius_mm=0 * FACE.radius_mm), "E-TARGET-RADIUS … 0 mm"),
         (lambda: replace(FACE, radius_mm=-FACE.radius_mm), "E-TARGET-RADIUS … -"),
         (lambda: replace(reference_board(), polarity="black"), "E-OPTION-VALUE … 'black'"),
-        (lambda: replace(reference_board(), radius_mm=15.0), "E-BOARD-RADIUS … 15 mm … 30 mm"),
         (lambda: replace(reference_board(), pitch_mm=0.03, radius_mm=0.01), "E-LENGTH-UNIT … 0.03 mm"),
         (lambda: replace(reference_board(), rows=0), "E-BOARD-SIZE … 0 rows"),
-        (lambda: replace(reference_board(), corner=(1, 1), corner_radius_mm=9.0), "E-BOARD-CORNER … row 1"),
         (lambda: replace(reference_board(), corner=(0, 0)), "E-BOARD-CORNER … None"),
         (lambda: replace(reference_board(), sigma_mm=-1.0), "E-SIGMA-VALUE … -1"),
         (lambda: RunOptions(solve="Joint"), "E-OPTION-VALUE … solve 'Joint' … joint"),
         (lambda: IdentifyOptions(model="stiff"), "E-OPTION-VALUE … model 'stiff'"),
         (lambda: DesignOptions(observe="poses"), "E-OPTION-VALUE … observe 'poses'"),
-        (lambda: RunOptions(flatness_mm=float("nan")), "E-FIELD-TYPE … flatness_mm nan … finite"),
         (lambda: RunOptions(workers=0), "E-OPTION-RANGE … workers 0 … 1"),
         (lambda: RunOptions(exclude="12/a.jpg"), "E-FIELD-TYPE … exclude '12/a.jpg' … tuple"),
-        (lambda: replace(FACE, xy_mm=1j * FACE.xy_mm), "E-ARRAY-TYPE … face 1 … complex"),
         (lambda: replace(FACE, xy_mm=[["0", "1"]] * len(FACE.ids)), "E-ARRAY-TYPE … face 1"),
-        (lambda: replace(FACE, xy_mm=[[0], [0, 1]]), "E-ARRAY-SHAPE … face 1"),
         (lambda: Rigid.exp([0] * 6) and Rigid(translation=[0, "1", 2]), "E-ARRAY-TYPE … translation"),
         (lambda: SeenTags([0.5], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]), "E-ARRAY-TYPE … rows … whole"),
         (lambda: Camera(2.5, 3, [1, 1], [1, 1], [0] * 8), "E-FIELD-TYPE … width 2.5 … whole"),
         (lambda: HandEyePoses(Poses.of([Rigid()]).matrix(), Poses.of([Rigid()])), "E-FIELD-TYPE … Poses"),
-        (lambda: Trial("a", 1.0, "mm", float("nan"), 1), "E-FIELD-TYPE … trial a … statistic nan"),
     ],
 )
 def test_constructors_are_as_strict_as_readers_of_files(make, error):
@@ -261,9 +246,6 @@ def test_no_field_takes_a_value_of_another_type(made):
     assert taken == []
 
 
-# --- how results look in a notebook, and when transforms are equal ---
-
-
 def test_transforms_are_equal_by_value():
     turned = Rigid.exp([0.1, 0, 0, 1, 2, 3])
     assert Rigid() == Rigid()
@@ -284,9 +266,6 @@ def test_a_value_shows_itself_in_a_line(made):
     assert len(repr(made)) < 200 or "array([[" not in repr(made) or isinstance(made, Rigid)
 
 
-# --- errors in the words of Python ---
-
-
 def test_errors_speak_of_arguments(monkeypatch):
     monkeypatch.delenv(errors.COMMAND_LINE, raising=False)
     said = InputError("E-TEST", "--to-link a, --no-strict: give '--flatness 0.1', as `stcal robot --dh` has it; a--b")
@@ -305,9 +284,6 @@ def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
     with fails_with("E-OPTION-RANGE … flatness_mm 1e+09"):
         RunOptions(flatness_mm=1e9).settled(reference_target())
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())
-
-
-# --- the checker itself ---
 
 
 def bare(a, b) -> int:

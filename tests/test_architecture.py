@@ -15,18 +15,12 @@ MOST_ENTRIES = 16
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 
 
-def test_no_folder_holds_more_than_one_can_see():
+def test_folders_can_be_seen_at_a_glance_and_names_stand_for_one_thing():
     counts = Counter(path.parent for path in FILES)
     assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
     entries = [p for p in (ROOT / "sfm").iterdir() if p.suffix == ".py" or (p / "__init__.py").is_file()]
     assert len(entries) <= MOST_ENTRIES
-
-
-def test_no_file_repeats_its_folder():
     assert [path for path in FILES if path.stem == path.parent.name] == []
-
-
-def test_no_public_name_is_a_module_too():
     for system in SYSTEMS:
         names = importlib.import_module(f"stcal.{system}").__all__
         assert {each.stem for each in (ROOT / system).iterdir()} & set(names) == set()

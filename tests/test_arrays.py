@@ -15,7 +15,7 @@ from stcal.io.images import decode
 from stcal.robot.kinematics.model import mh80
 from stcal.sfm.detect.files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 MATRIX = np.array([[900.0, 0, 640.3], [0, 905.0, 355.8], [0, 0, 1]])
 SIZE = (1280, 720)
@@ -100,14 +100,11 @@ def test_a_size_that_no_file_states_is_given(tmp_path):
     assert stcal.load_camera(tmp_path / "m.yaml", size=SIZE).same_as(Camera.from_opencv(MATRIX, EIGHT[:4], SIZE))
 
 
-def test_rotations_of_scipy_are_taken_and_given():
+def test_transforms_are_taken_and_given():
     turn = Rotation.from_euler("xyz", [0.3, -0.2, 0.9])
     one = Rigid(turn, [1, 2, 3])
     assert (one.as_scipy().inv() * turn).magnitude() < 1e-15
     assert Poses.from_matrices(np.array([one.matrix()] * 2))[1] == Rigid.from_matrix(one.matrix())
-
-
-def test_the_matrix_of_a_similarity_moves_points():
     a_from_b = Similarity(2.5, Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]))
     moved = a_from_b.matrix() @ np.column_stack([POINTS, np.ones(len(POINTS))]).T
     assert np.allclose(moved[:3].T, a_from_b @ POINTS, rtol=1e-14)
@@ -160,10 +157,8 @@ class Result:
 
 def test_checks_of_ones_own_have_their_own_names():
     assert [each.verdict for each in own_checks(Result(), [lambda _: check("mine")])] == ["failed"]  # 5 σ
-    with fails_with("E-CHECK-OWN … 'camera' is already used"):
-        own_checks(Result(), [lambda _: check("camera")])
-    with fails_with("E-CHECK-OWN … bool"):
-        own_checks(Result(), [lambda _: True])
+    refuses("E-CHECK-OWN … 'camera' is already used", own_checks, Result(), [lambda _: check("camera")])
+    refuses("E-CHECK-OWN … bool", own_checks, Result(), [lambda _: True])
 
 
 def test_the_repr_of_a_large_result_is_a_line():

@@ -12,7 +12,7 @@ from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.report.camera import shown
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2e-3, 0, 0, 0, 0])
 
@@ -94,13 +94,10 @@ def test_the_sigma_of_a_lens_that_is_fitted_is_missed(tmp_path):
 
 def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
     (folder / "i.yaml").write_text("intrinsics:\n  fx: 900\n  fy: 905\n  cx: 640\n  cy: 475\n")
-    with fails_with("E-CAMERA-SIZE … --size"):
-        call("show", folder / "i.yaml")
+    refuses("E-CAMERA-SIZE … --size", call, "show", folder / "i.yaml")
     assert "1280×960" in call("show", folder / "i.yaml", "--size", "1280x960")
-    with fails_with("E-OPTION-SIZE … --size … 12"):
-        call("show", folder / "i.yaml", "--size", "12")
-    with fails_with("E-OPTION-FORM … .json … --form"):
-        call("convert", folder / "a.txt", folder / "b.json")
+    refuses("E-OPTION-SIZE … --size … 12", call, "show", folder / "i.yaml", "--size", "12")
+    refuses("E-OPTION-FORM … .json … --form", call, "convert", folder / "a.txt", folder / "b.json")
 
 
 @pytest.mark.slow

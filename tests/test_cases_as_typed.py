@@ -50,7 +50,6 @@ def camera(fx: float, fy: float, cx: float, cy: float, *k: float, names: str = "
 
 
 FISHEYE = "k1 k2 k3 k4"
-CAM_TXT = camera(1502, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)
 MOVED = ("pose 2, pose 4, pose 5 and 3 more", "--undo-flips")
 HALF_A_TURN = ("all tags would fit if every tag stood half a turn the other way", "add 180 to each angle_deg")
 TYPED: dict[str, tuple[Typed, ...]] = {
@@ -88,11 +87,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
             never=("fitted",),
         ),
     ),
-    "name_choice": (
-        Typed(says=("OPENCV", "written")),
-        Typed(says=("written",)),
-        Typed(says=("written",)),
-    ),
+    "name_choice": (Typed(says=("OPENCV", "written")), Typed(says=("written",)), Typed(says=("written",))),
     "opencv_fisheye_model": (
         Typed(values=camera(420.5, 421.1, 639.2, 479.8, -0.021, 0.013, -0.009, 0.0021, names=FISHEYE)),
     ),

@@ -9,7 +9,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.labels import CircleLabel, DotLabel, circle_labels, dot_cells, parse_label, parse_labels
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 
 def test_parts_make_the_text_and_the_text_gives_the_parts():
@@ -44,7 +44,5 @@ def test_what_names_no_circle_is_refused(text):
 def test_cells_are_those_of_dots_and_circles_those_of_faces():
     assert np.array_equal(dot_cells(parse_labels(["board:0:1", "board:3:2"])), [[0, 1], [3, 2]])
     assert dot_cells([]).shape == (0, 2)
-    with fails_with("E-LABEL-FORM … 1:a … board"):
-        dot_cells(parse_labels(["1:a"]))
-    with fails_with("E-LABEL-FORM … board:0:0"):
-        circle_labels(["1:a", "board:0:0"])
+    refuses("E-LABEL-FORM … 1:a … board", dot_cells, parse_labels(["1:a"]))
+    refuses("E-LABEL-FORM … board:0:0", circle_labels, ["1:a", "board:0:0"])

@@ -129,12 +129,9 @@ def test_a_result_file_in_a_folder_of_images_is_written_again(tmp_path):
         keep_apart([("--out", tmp_path / "a.jpg")], [("images", tmp_path)])
 
 
-def test_two_outputs_are_kept_apart(tmp_path):
+def test_outputs_are_kept_apart_and_from_every_path_of_a_list(tmp_path):
     with fails_with("E-OUTPUT-TWICE … --out"):
         keep_apart([("--out", tmp_path / "a"), ("--json", tmp_path / "a")], [])
-
-
-def test_every_path_of_a_list_is_an_input(tmp_path):
     with fails_with("E-OUTPUT-IS-INPUT"):
         keep_apart([("--out", tmp_path / "a")], [("sources", tmp_path / "a"), ("sources", tmp_path / "b")])
 

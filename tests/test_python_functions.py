@@ -25,7 +25,7 @@ from stcal.io.files import json_text
 from stcal.robot.kinematics.model import mh80
 from tests.commands import COMMANDS
 from tests.locate.drawn_target import CAMERA, LAYOUT, photo, tilted
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "howto" / "python.md"
 ROW = re.compile(r"^\| `stcal([ -])([\w -]+)` \| (.+) \|$", re.MULTILINE)
@@ -36,7 +36,6 @@ APART = {"sfm demo", "robot init"}
 
 
 def functions_of(command: str) -> dict[str, object]:
-    """The functions that the table names for a command."""
     found = {}
     for name in re.findall(r"`((?:\w+\.)+\w+)`", TABLE[command]):
         path = name.removeprefix("stcal.").split(".")
@@ -67,7 +66,6 @@ def used(module: str) -> frozenset[int]:
 
 
 def calls_it(command: Callable, function: object) -> bool:
-    """Whether the module of a command uses a function or its class."""
     return id(function) in used(inspect.unwrap(command).__module__)
 
 
@@ -92,9 +90,6 @@ def test_what_is_not_called_is_found():
     assert calls_it(COMMANDS["robot design"], robot.design)  # by its module
 
 
-# --- the answers of quick ones ---
-
-
 def call(*words) -> str:
     result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
     assert result.exit_code == 0
@@ -115,10 +110,8 @@ def test_exposure_times_and_capture(tmp_path):
     taken = locate.capture(source, locate.exposure_times(0.5, 2, 3), tmp_path / "own")
     answer = json.loads((tmp_path / "scenes/scene-1/capture.json").read_text(encoding="utf-8"))
     assert json.loads(json_text(taken)) == answer
-    with fails_with("E-OUTPUT-EXISTS … own"):
-        locate.capture(source, [1.0], tmp_path / "own")
-    with fails_with("E-FIELD-TYPE … count"):
-        locate.exposure_times(1, 100, 2.5)
+    refuses("E-OUTPUT-EXISTS … own", locate.capture, source, [1.0], tmp_path / "own")
+    refuses("E-FIELD-TYPE … count", locate.exposure_times, 1, 100, 2.5)
 
 
 def test_arguments_of_other_types_are_refused(tmp_path):
@@ -126,12 +119,9 @@ def test_arguments_of_other_types_are_refused(tmp_path):
     camera = stcal.Camera(640, 480, [450.0, 450.0], [319.5, 239.5], np.zeros(8))
     arm = mh80()
     data = robot.Measurements.from_arrays(np.zeros((3, 6)), np.zeros((3, 3)))
-    with fails_with("E-FIELD-TYPE … two"):
-        stcal.compare_cameras(camera, tmp_path / "b.txt")
-    with fails_with("E-FIELD-TYPE … Evaluation"):
-        robot.evaluated_csv(data)
-    with fails_with("E-OPTION-VALUE … refit"):
-        robot.evaluate({"arm": arm}, data, "all")
+    refuses("E-FIELD-TYPE … two", stcal.compare_cameras, camera, tmp_path / "b.txt")
+    refuses("E-FIELD-TYPE … Evaluation", robot.evaluated_csv, data)
+    refuses("E-OPTION-VALUE … refit", robot.evaluate, {"arm": arm}, data, "all")
 
 
 def test_load_universal(tmp_path):
@@ -160,10 +150,8 @@ def test_simulated_cameras(tmp_path):
     wide = replace(options, height=427, fisheye_deg=120.0)
     synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide))
     assert (tmp_path / "own/cameras.txt").read_text() == (tmp_path / "wide/cameras.txt").read_text()
-    with fails_with("E-OPTION-CONFLICT … two cameras"):
-        synthetic.make_scene(wide, camera=own)
-    with fails_with("E-OPTION-RANGE … fisheye_deg 20"):
-        replace(options, fisheye_deg=20.0)
+    refuses("E-OPTION-CONFLICT … two cameras", synthetic.make_scene, wide, camera=own)
+    refuses("E-OPTION-RANGE … fisheye_deg 20", replace, options, fisheye_deg=20.0)
 
 
 def test_goals_in_the_base(tmp_path):

@@ -17,7 +17,6 @@ def drawn(seed: int, rows: int = 40, parameters: int = 20):
 
 
 def fitted(errors: np.ndarray, explained: np.ndarray) -> np.ndarray:
-    """Residuals after the least-squares fit."""
     flat = explained.reshape(errors.size, -1)
     return errors - (flat @ np.linalg.lstsq(flat, errors.ravel(), rcond=None)[0]).reshape(errors.shape)
 

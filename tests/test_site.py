@@ -75,13 +75,7 @@ def test_docstrings_become_lists():
     assert re.sub(r"\n{3,}", "\n\n", lines).strip() == re.sub(r"\n{3,}", "\n\n", LISTS).strip()
 
 
-WIDE = (
-    "README.md",
-    "docs/howto/calibrate.md",
-    "docs/tutorials/tags.md",
-    "docs/sources.md",
-    "docs/accuracy.md",
-)
+WIDE = ("README.md", "docs/howto/calibrate.md", "docs/tutorials/tags.md", "docs/sources.md", "docs/accuracy.md")
 """Pages with long lines of output, long commands and wide tables."""
 
 

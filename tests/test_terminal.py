@@ -127,9 +127,6 @@ def test_a_file_for_standard_output_needs_one_that_is_open(monkeypatch):
             terminal.write(terminal.STANDARD_OUTPUT, {})
 
 
-# --- how the program is called ---
-
-
 def test_the_package_is_the_program():
     words = [sys.executable, "-P", "-m", "stcal"]
     assert subprocess.run([*words, "--version"], capture_output=True, text=True, check=True).stdout.strip() == (
@@ -164,9 +161,6 @@ def test_help_shows_every_option_once_and_first_what_most_calls_need():
 def _is_option(command, name: str) -> bool:
     kind = inspect.signature(command, eval_str=True).parameters[name].annotation
     return any(isinstance(each, OptionInfo) for each in get_args(kind)[1:])
-
-
-# --- a file to standard output ---
 
 
 @pytest.fixture
@@ -222,9 +216,6 @@ def test_json_on_a_terminal_is_printable_and_the_same(monkeypatch, encoding, sho
     assert shown in text
 
 
-# --- completion ---
-
-
 def test_a_shell_asks_what_may_stand_next():
     """Nothing more than words is printed, and no run begins."""
     code = "from stcal.cli.entry import main_sfm; main_sfm()"
@@ -235,9 +226,6 @@ def test_a_shell_asks_what_may_stand_next():
     asked = {"_STCAL_SFM_COMPLETE": "source_bash"}
     ended = subprocess.run(words, capture_output=True, text=True, env=os.environ | asked, check=False)
     assert "complete -o default -F _stcal_sfm_completion stcal-sfm" in ended.stdout
-
-
-# --- how much is said, and in which colours ---
 
 
 def test_a_stage_that_takes_long_says_what_is_left():

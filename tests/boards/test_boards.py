@@ -17,7 +17,6 @@ CORNER_PX = 0.12
 
 
 def turn(degrees: float) -> np.ndarray:
-    """A view turned in the image, about its middle."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     about = np.array([[1, 0, 600], [0, 1, 450], [0, 0, 1.0]])
     return about @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.linalg.inv(about) @ IMAGE_FROM_MM

@@ -18,7 +18,6 @@ CAMERA = Camera(1200, 900, [1440.0, 1440.0], [599.5, 449.5], np.zeros(8))
 
 
 def sheet_of(board: CharucoDesign) -> np.ndarray:
-    """The printed board with white around."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     plain = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_mm, board.marker_mm, dictionary)
     plain.setLegacyPattern(board.legacy)

@@ -8,7 +8,7 @@ from stcal.boards import dictionaries
 from stcal.boards.dictionaries import dictionary_of, known_dictionary, of_opencv
 from stcal.boards.file import load_flat_board
 from stcal.boards.tags import find_tags
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 CELLS = {
     (
@@ -29,7 +29,6 @@ tag = [{ dictionary = "TagStandard41h12", id = 3, size_mm = 40, x_mm = 0, y_mm =
 
 
 def view_of_tag(tag: tuple[str, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A photograph of the tag with noise, and the places of its corners as printed, from top left, px."""
     rng = np.random.default_rng(seed)
     cells = 255 * np.array([list(row) for row in CELLS[tag].split()]).astype(np.uint8)
     sheet = np.kron(np.pad(cells, 1, constant_values=255), np.ones((PER_CELL, PER_CELL), np.uint8))
@@ -102,12 +101,10 @@ def test_families_are_known_by_name(monkeypatch, tmp_path):
     (tmp_path / "b.toml").write_text(LAYOUT)
     assert load_flat_board(tmp_path / "b.toml").tags == (("tagStandard41h12", 3),)
     (tmp_path / "b.toml").write_text(LAYOUT.replace("id = 3", "id = 2115"))
-    with fails_with("E-TAG-ID-RANGE … 2115 … tagStandard41h12 has 0 … 2114"):
-        load_flat_board(tmp_path / "b.toml")
+    refuses("E-TAG-ID-RANGE … 2115 … tagStandard41h12 has 0 … 2114", load_flat_board, tmp_path / "b.toml")
     with pytest.raises(ValueError, match="only a layout of tags"):
         of_opencv("tagStandard41h12")
-    with fails_with("E-TAG-DICTIONARY … tagStandard41h12 … not drawn here"):
-        dictionary_of("tagStandard41h12")
+    refuses("E-TAG-DICTIONARY … tagStandard41h12 … not drawn here", dictionary_of, "tagStandard41h12")
     known_dictionary.cache_clear()
 
 

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.boards.design import (
-    AprilGridDesign,
-    AsymmetricCirclesDesign,
-    BoardSet,
-    CharucoDesign,
-    ChessboardDesign,
-)
+from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, BoardSet, CharucoDesign, ChessboardDesign
 from stcal.boards.file import load_flat_board
 from stcal.boards.several import load_boards
 from stcal.errors import InputError
@@ -83,10 +77,7 @@ def test_opencvs_asymmetric_grid():
         (KALIBR["aprilgrid"].replace("tagRows: 5", "tagRows: 500"), "tags up to 2999, tag36h11 has 0 … 586"),
         (KALIBR["checkerboard"].replace("colSpacingMeters: 0.05", "colSpacingMeters: 0.04"), "squares needed"),
         (KALIBR["circlegrid"].replace("True", "False"), "asymmetricGrid false"),
-        (
-            KALIBR["aprilgrid"].replace("aprilgrid", "octagons"),
-            "'octagons'; one of aprilgrid, checkerboard",
-        ),
+        (KALIBR["aprilgrid"].replace("aprilgrid", "octagons"), "'octagons'; one of aprilgrid, checkerboard"),
         (KALIBR["checkerboard"].replace("targetRows: 6", "targetRows: 2"), "targetRows: 2: input should be greater"),
         ('type = "chessboard"\nrows = 2\ncolumns = 6\nsquare_mm = 20.0\n', "rows: 2: input should be greater"),
         (CHARUCO.replace("10.0", "19.9999999"), "marker_mm 20, under 0.99 of square_mm 20 needed"),

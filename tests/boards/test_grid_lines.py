@@ -54,16 +54,13 @@ def told(displaced_px: float, seed: int, by_phase: bool = False) -> float:
     return float(displacement_variance([waves], [otherwise]).of(np.ones(1))[0])
 
 
-def test_a_blur_that_passes_nothing_tells_nothing():
-    """The share of a turned edge underflows to 0: nothing is known of areas beyond the prior, and no σ is lost."""
+def test_lines_that_tell_nothing_leave_the_prior():
+    """The share of a turned edge underflows to 0: nothing is known of areas beyond the prior, and no σ is lost.
+    Lines whose spacing is a whole number of pixels say nothing: σ allows for images that were warped in points."""
     one = np.ones(2)
     found = displacement_variance([Displacement(0 * one, 1e-8 * one, 4 * one, 0 * one)])
     assert found.of_area == pytest.approx(PRIOR_PX**2)
     assert found.of(np.zeros(1)) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_lines_of_one_phase_leave_the_prior():
-    """Lines whose spacing is a whole number of pixels say nothing: σ allows for images that were warped in points."""
     one = np.ones(2)
     found = displacement_variance([Displacement(0 * one, one, one, one)])
     assert np.sqrt(found.of(np.ones(1))) == pytest.approx(np.hypot(PRIOR_PX, POINTS_PX), rel=0.01)

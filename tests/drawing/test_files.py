@@ -30,7 +30,7 @@ from stcal.drawing.sheets import (
 )
 from stcal.io.design import board_toml, target_toml
 from tests.drawing.raster import shapes_of
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 SVG = "{http://www.w3.org/2000/svg}"
 DIGITS = 1e-6
@@ -167,20 +167,14 @@ def test_parts_on_one_sheet_stand_in_rows():
         assert all((one[1] < other[0]).any() or (other[1] < one[0]).any() for other in boxes[:i])
 
 
-def test_the_side_and_the_step_of_an_aprilgrids_tags_are_said():
+def test_the_lengths_to_check_are_said():
+    """Between the outermost inner corners: of 9 × 6 squares of 12 mm 7 × 4. 8 × 5 inner corners of 12 mm make 9 × 6
+    squares: 108 mm × 72 mm, and a square around."""
     (part,) = board_parts(AprilGridDesign(3, 4, 20.0, 0.3, 2), 10.0)
     assert {words for *_, words in part.spans} == {"20, step 26"}
-
-
-def test_the_lengths_to_check_of_a_charuco_board_are_said():
-    """Between the outermost inner corners: of 9 × 6 squares of 12 mm 7 × 4."""
     (part,) = board_parts(CharucoDesign(6, 9, 12.0, 9.0, "DICT_4X4_50"), 10.0)
     lengths = {words: high - low for _, low, high, words in part.spans}
     assert lengths == {"7 × 12 = 84": 84.0, "4 × 12 = 48": 48.0}
-
-
-def test_the_outer_dimensions_of_a_part_are_said():
-    """8 × 5 inner corners of 12 mm make 9 × 6 squares: 108 mm × 72 mm, and a square around."""
     (part,) = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)
     assert {"132", "96"} <= {shape.words for shape in framed(part) if isinstance(shape, Text)}
 
@@ -242,15 +236,10 @@ def test_the_plan_beside_a_plate_has_the_numbers_of_its_circles():
             assert not any((box[0] < high).all() and (box[1] > low).all() for box in words)
 
 
-def test_far_too_many_sheets_are_refused(files):
+def test_too_many_sheets_and_circles_without_a_radius_are_refused(files):
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
-    with fails_with("E-DRAW-SHEETS … --paper … A4 … 500"):
-        draw(files / "board.toml", files / "board.pdf")
-    with fails_with("E-DRAW-SHEETS … 5000"):
-        draw(files / "board.toml", files / "board.pdf", "own")
-
-
-def test_circles_without_a_radius_are_refused(files):
+    refuses("E-DRAW-SHEETS … --paper … A4 … 500", draw, files / "board.toml", files / "board.pdf")
+    refuses("E-DRAW-SHEETS … 5000", draw, files / "board.toml", files / "board.pdf", "own")
     (files / "grid.yaml").write_text(
         "target_type: circlegrid\ntargetCols: 4\ntargetRows: 5\nspacingMeters: 0.02\nasymmetricGrid: true\n"
     )

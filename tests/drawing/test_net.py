@@ -17,7 +17,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make import make_pattern, sides_of
 from stcal.synthetic.designs import tag_body
 from tests.drawing.raster import camera_of, page_image
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 SIZE = (120.0, 100.0, 80.0)
 
@@ -158,14 +158,11 @@ def test_plates_that_touch_do_not_overlap():
 
 def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):
     (tmp_path / "reference.toml").write_text(target_toml(reference_target()))
-    with fails_with("E-DRAW-NET … --net … 1 … outline_mm"):
-        draw(tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
+    refuses("E-DRAW-NET … --net … 1 … outline_mm", draw, tmp_path / "reference.toml", tmp_path / "net.pdf", net=True)
     nowhere = tuple(replace(face, rough_target_from_face=None) for face in target.faces)
-    with fails_with("E-DRAW-NET … --net … front … rough_pose"):
-        net_part(TargetDesign("box", "dark", nowhere))
+    refuses("E-DRAW-NET … --net … front … rough_pose", net_part, TargetDesign("box", "dark", nowhere))
     (tmp_path / "board.toml").write_text('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n')
-    with fails_with("E-DRAW-DESIGN"):
-        draw(tmp_path / "board.toml", tmp_path / "net.pdf", net=True)
+    refuses("E-DRAW-DESIGN", draw, tmp_path / "board.toml", tmp_path / "net.pdf", net=True)
 
 
 def test_plates_apart_are_refused():

@@ -132,7 +132,6 @@ def _option(call: Call, rng: np.random.Generator) -> tuple[tuple[str, ...], str]
 
 
 def _restore(folder: Path) -> None:
-    """So that what is left can be removed."""
     for root, folders, files in os.walk(folder):
         for each in (*folders, *files):
             path = Path(root, each)

@@ -51,7 +51,6 @@ class Outcome:
 
     @property
     def said(self) -> str:
-        """All that was printed but progress."""
         return "\n".join([self.out, *lines_of(self.err)])
 
 
@@ -60,7 +59,6 @@ class TooLong(BaseException):
 
 
 def lines_of(err: str) -> list[str]:
-    """Standard error without progress."""
     return [line for line in err.split("\n") if line and not _PROGRESS.fullmatch(line)]
 
 

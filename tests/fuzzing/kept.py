@@ -72,7 +72,6 @@ def _laid_out(stock: Path, folder: Path, call: Call) -> tuple[Path, Path]:
 
 
 def _all_said(call: Call, folder: Path, outcome: Outcome) -> str:
-    """What a call has printed, and written as JSON."""
     texts = (
         path.read_text(encoding="utf-8") for name in call.outputs if (path := folder / OUT / name).suffix == ".json"
     )
@@ -102,7 +101,6 @@ def _clean(stock: Path, folder: Path, call: Call) -> dict[str, str]:
 
 
 def _answers(call: Call, folder: Path) -> dict[str, str]:
-    """Digests of what a call has written, by name."""
     names = [word[1:] for word in call.split() if word[0] in ">+~"]
     entries = [folder / OUT / name for name in names]
     files = [path for entry in entries for path in (entry.rglob("*") if entry.is_dir() else [entry]) if path.is_file()]

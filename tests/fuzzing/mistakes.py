@@ -55,7 +55,6 @@ def call_of(command: str, place: str) -> Call:
 
 
 def rewritten(place: str, change: Callable[[str], str]) -> Edit:
-    """Another text of a file."""
     return lambda read: (read / place).write_text(change((read / place).read_text()))
 
 
@@ -71,7 +70,6 @@ def columns(place: str, change: Callable[[dict[str, list[str]]], dict[str, list[
 
 
 def times(place: str, names: str, factor: float) -> Edit:
-    """Numbers of the columns that match."""
     return columns(
         place,
         lambda table: {
@@ -81,30 +79,24 @@ def times(place: str, names: str, factor: float) -> Edit:
 
 
 def named(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
-    """Columns under other names, their numbers as they are."""
     return columns(place, lambda table: {re.sub(old, new, n): c for n, c in table.items()})
 
 
 def exchanged(place: str, a: str, b: str) -> Edit:
-    """The numbers of two columns."""
     return columns(place, lambda table: table | {a: table[b], b: table[a]})
 
 
 def without(place: str, names: str) -> Edit:
-    """The columns that match are not there."""
     return columns(place, lambda table: {n: c for n, c in table.items() if not re.fullmatch(names, n)})
 
 
 def moved(place: str, names: str, by: int = 1) -> Edit:
-    """The columns that match against the others by so many rows."""
     return columns(
         place, lambda table: {n: c[-by:] + c[:-by] if re.fullmatch(names, n) else c for n, c in table.items()}
     )
 
 
 def shuffled(place: str, names: str) -> Edit:
-    """The rows of the columns that match against the others."""
-
     def change(table):
         order = np.random.default_rng(5).permutation(len(next(iter(table.values()))))
         return {n: [c[i] for i in order] if re.fullmatch(names, n) else c for n, c in table.items()}
@@ -145,13 +137,10 @@ def rolled_quaternion(place: str, prefix: str = "") -> Edit:
 
 
 def transposed(found: Poses) -> Poses:
-    """Rotations the other way round, places as they are."""
     return Poses(np.swapaxes(found.rotation, 1, 2), found.translation)
 
 
 def text(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
-    """Replace in a text file what matches."""
-
     def edit(before: str) -> str:
         after = re.sub(old, new, before)
         assert before != after, f"{place} has no {old}"
@@ -161,7 +150,6 @@ def text(place: str, old: str, new: str | Callable[[re.Match], str]) -> Edit:
 
 
 def number_times(place: str, key: str, factor: float) -> Edit:
-    """Numbers behind a TOML key."""
     return text(place, rf"\b({key}) = ([-\d.e]+)", lambda m: f"{m[1]} = {float(m[2]) * factor!r}")
 
 
@@ -179,8 +167,6 @@ def json_times(place: str, keys: tuple[str, ...], factor: float) -> Edit:
 
 
 def json_keys(place: str, keys: tuple[str, ...], change: Callable) -> Edit:
-    """The values of these keys, changed."""
-
     def edit(text: str) -> str:
         content = json.loads(text)
         return json.dumps(content | {key: change(content[key]) for key in keys})
@@ -189,7 +175,6 @@ def json_keys(place: str, keys: tuple[str, ...], change: Callable) -> Edit:
 
 
 def json_inverse(place: str, key: str) -> Edit:
-    """A transform the other way round."""
     return json_keys(place, (key,), lambda value: Rigid.from_matrix(np.array(value)).inverse().matrix().tolist())
 
 

@@ -38,8 +38,6 @@ def _bytes(said: str, change: Callable[[bytes, np.random.Generator], bytes]) -> 
 
 
 def _inserted(said: str, piece: Callable[[np.random.Generator], bytes]) -> Mutation:
-    """Puts a piece at a random place."""
-
     def change(data: bytes, rng: np.random.Generator) -> bytes:
         at = int(rng.integers(len(data) + 1))
         return data[:at] + piece(rng) + data[at:]
@@ -48,8 +46,6 @@ def _inserted(said: str, piece: Callable[[np.random.Generator], bytes]) -> Mutat
 
 
 def _replaced(said: str, instead: Callable[[bytes], bytes]) -> Mutation:
-    """Puts something in the place of a random piece."""
-
     def change(data: bytes, rng: np.random.Generator) -> bytes:
         a, b = sorted(rng.integers(len(data) + 1, size=2).tolist())
         return data[:a] + instead(data[a:b]) + data[b:]
@@ -158,7 +154,6 @@ def csv_cells(path: Path, rng: np.random.Generator) -> str:
 
 
 def csv_form(path: Path, rng: np.random.Generator) -> str:
-    """The whole file as other programs write it."""
     text = path.read_text()
     forms = {
         "semicolons": text.replace(",", ";"),

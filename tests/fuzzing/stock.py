@@ -90,7 +90,6 @@ def make_stock(folder: Path, dataset: Path | None = None, finished: Path | None 
 
 
 def write_rows(path: Path, header, rows) -> None:
-    """A CSV file of cells."""
     with open(path, "w", newline="", encoding="utf-8") as stream:
         csv.writer(stream, lineterminator="\n").writerows([header, *rows])
 

@@ -110,7 +110,6 @@ def _more(holder, key, rng) -> str:
 
 
 def _scaled(holder, key, rng) -> str:
-    """All numbers below."""
     factor = _pick(rng, [1e-3, 1e3, -1, 0, 1e300, 25.4])
     holder[key] = _times(holder[key], factor)
     return f"times {factor:g}"

@@ -176,12 +176,9 @@ def test_refinement_agrees_with_opencv_on_noisy_points():
     assert np.abs(ours.translation - pose.translation).max() > 1e-3  # the noise did move it
 
 
-def test_refinement_refuses_points_behind_the_camera():
+def test_refinement_refuses_points_behind_the_camera_and_poses_that_do_not_settle(monkeypatch):
     with fails_with("E-POINTS-BEHIND"):
         refine_planar_pose(Rigid(translation=[0, 0, -500]), GRID, GRID / 1000)
-
-
-def test_a_pose_that_does_not_settle_is_an_error(monkeypatch):
     monkeypatch.setattr("stcal.geometry.plane.MAX_STEPS", 1)
     with fails_with("E-NO-MINIMUM … planar pose … 1"):
         refine_planar_pose(Rigid(translation=[0, 0, 600]), GRID, GRID / 500)

@@ -8,15 +8,7 @@ import pytest
 
 from stcal.geometry import least_squares
 from stcal.geometry.least_squares import Normal, PoseStack
-from stcal.geometry.plane import (
-    covariance_of_both,
-    deciding_delta,
-    distinct,
-    mirrored,
-    step_between,
-    two_minima,
-    weigh,
-)
+from stcal.geometry.plane import covariance_of_both, deciding_delta, distinct, mirrored, step_between, two_minima, weigh
 from stcal.geometry.rigid import Rigid
 from tests.geometry import test_pose_descent
 from tests.outcome import fails_with

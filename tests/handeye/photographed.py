@@ -66,7 +66,6 @@ class Photographs:
     board: Path
 
     def arguments(self) -> list[str]:
-        """Of the command."""
         options = [("--poses", self.poses), ("--camera", self.camera), ("--board", self.board)]
         return [str(self.images), *(str(word) for pair in options for word in pair)]
 

@@ -69,7 +69,6 @@ def test_poses_of_the_flange_that_were_not_read_anew_are_refused():
 
 
 def drawn(count: int) -> HandEyePoses:
-    """Poses that follow one another at random."""
     return simulated(np.random.default_rng(5), count, robot=(3e-4, 0.1), camera=(4e-4, 0.15)).pairs
 
 

@@ -19,7 +19,6 @@ ROBOT = (5e-4, 0.2)
 
 
 def filed(truth, camera):
-    """The same corners with another camera file: pairs and views."""
     views = Views(camera, truth.views.views)
     return pairs_of_views(truth.pairs.base_from_flange, views, truth.pairs.names), views
 

@@ -12,7 +12,7 @@ from stcal.handeye.report.file import HandEyeFile
 from stcal.io.files import json_text
 from stcal.io.table import POSE, pose_cells
 from tests.handeye.test_plan_cli import NOISE, poses_file
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.support.handeye import simulated
 
 
@@ -31,10 +31,8 @@ def written(command, tmp_path):
 
 
 def test_what_is_no_input_is_refused(poses):
-    with fails_with("E-FIELD-TYPE … given … HandEyeInput"):
-        workflows.calibrate_handeye(poses)
-    with fails_with("E-OPTION-VALUE … setup"):
-        workflows.read_handeye(poses, setup="in hand")
+    refuses("E-FIELD-TYPE … given … HandEyeInput", workflows.calibrate_handeye, poses)
+    refuses("E-OPTION-VALUE … setup", workflows.read_handeye, poses, setup="in hand")
 
 
 def test_two_files_of_poses(written, poses, tmp_path):

@@ -21,14 +21,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several
-from tests.handeye.photographed import (
-    CAMERA,
-    MARGIN_MM,
-    PER_MM,
-    image_from_sheet,
-    sheet_of_dots,
-    take,
-)
+from tests.handeye.photographed import CAMERA, MARGIN_MM, PER_MM, image_from_sheet, sheet_of_dots, take
 from tests.outcome import fails_with
 from tests.support.circle_images import circle_conic, ellipse_of_conic
 
@@ -131,8 +124,7 @@ def test_images_of_centres_are_exact():
 
 
 @pytest.mark.parametrize(
-    ("board", "count"),
-    [(dots(), 1), (dots(6, 6), 3), (dots(6, 6, (0, 0)), 0), (ChessboardDesign(5, 7, 1.0), 1)],
+    ("board", "count"), [(dots(), 1), (dots(6, 6), 3), (dots(6, 6, (0, 0)), 0), (ChessboardDesign(5, 7, 1.0), 1)]
 )
 def test_symmetries_bring_the_board_onto_itself(board, count):
     xyz = np.column_stack([board.xy_mm(), np.zeros(len(board.xy_mm()))])
@@ -168,13 +160,10 @@ def test_a_strip_hidden_is_said(tmp_path):
     assert "strip" in found.skipped[0].reason
 
 
-def test_a_camera_of_other_images_is_refused(tmp_path):
+def test_images_of_another_camera_and_unreadable_ones_are_said(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.full((300, 400), 200, np.uint8))
     with fails_with("E-CAMERA-CENTRE … 406 … 293 … a.png"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
-
-
-def test_no_readable_image_is_said(tmp_path):
     (tmp_path / "a.png").write_bytes(b"")
     with fails_with("E-IMAGES-NONE-USABLE … 1 … a.png … empty"):
         detect_boards(find_images(tmp_path)[0], MODEL, dots(), workers=1)
@@ -212,7 +201,6 @@ COMMON_FROM_GRID = Rigid(Rotation.from_euler("y", 30, degrees=True).as_matrix(),
 
 
 def photograph_of_both(pose: Rigid) -> np.ndarray:
-    """Of the ChArUco board and the AprilGrid, in one frame."""
     (_, sheet, first), (grid, origin) = charuco(), aprilgrid_mm(GRID, 2)
     drawn = [(grid, image_from_sheet(origin, pose @ COMMON_FROM_GRID)), (sheet, image_from_sheet(first, pose))]
     return photograph_of_several(drawn, PER_MM, (CAMERA.width, CAMERA.height))

@@ -8,7 +8,7 @@ import pytest
 from stcal import handeye
 from stcal.geometry.rigid import Poses
 from tests.handeye.test_cli import NOISE, poses_file
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.handeye import FLANGE_FROM_CAMERA, simulated
 
 
@@ -73,9 +73,7 @@ def test_options_that_name_unknowns_leave_no_choice(pairs):
 
 
 def test_what_is_no_pairs_of_poses_is_refused(pairs):
-    with fails_with("E-POSES-COUNT … camera_from_board"):
-        handeye.handeye(pairs.base_from_flange, setup="eye-in-hand")
-    with fails_with("E-OPTION-CONFLICT … unit 'm'"):
-        handeye.handeye(pairs, unit="m")
+    refuses("E-POSES-COUNT … camera_from_board", handeye.handeye, pairs.base_from_flange, setup="eye-in-hand")
+    refuses("E-OPTION-CONFLICT … unit 'm'", handeye.handeye, pairs, unit="m")
     with fails_with("E-OPTION-VALUE … unit 'feet'"):
         handeye.handeye(pairs.base_from_flange, pairs.camera_from_board, setup="eye-in-hand", unit="feet")

@@ -52,18 +52,6 @@ def test_sigma_comes_out_as_planned(setup):
     assert np.sum(errors) < 51.2  # χ² of 24, one in a thousand
 
 
-def test_planned_poses_are_better_than_such_as_were_taken():
-    """Three more that turn as little as those before lower σ far less."""
-    truth, found = few(1)
-    planned = plan_poses(truth.pairs, found, 3, OUTLINE, CAMERA)
-    more = simulated(np.random.default_rng(99), 9, "eye-in-hand", ROBOT, SEEN, tilt=0.15)
-    alike = handeye(more.pairs, "eye-in-hand", "pose", options=HandEyeOptions(Noise(*ROBOT, *SEEN)))
-    eye = truth.pairs.camera_from_board
-    points = judged_at(eye.rotation @ OUTLINE.mean(0) + eye.translation)
-    by_chance = worst_sigma(np.linalg.inv(alike.covariance), alike.mount_from_camera, points)
-    assert planned.sigma_mm[-1] < by_chance / 1.5
-
-
 @pytest.mark.parametrize("setup", SETUPS)
 def test_the_board_stays_in_the_image(setup):
     truth, found = few(2, setup)
@@ -87,13 +75,10 @@ def test_only_what_the_robot_reaches_is_planned():
         plan_poses(truth.pairs, found, 1, OUTLINE, CAMERA, lambda flange: np.zeros(len(flange), bool))
 
 
-def test_a_method_without_sigma_cannot_plan():
+def test_what_cannot_be_planned_is_said():
     truth, _ = few(4)
     with fails_with("E-PLAN-NO-SIGMA … park-martin"):
         plan_poses(truth.pairs, handeye(truth.pairs, method="park-martin"))
-
-
-def test_a_board_that_never_fits_the_image_is_said_to_be_so():
     truth, found = few(5)
     with fails_with("E-PLAN-NO-VIEW"):
         plan_poses(truth.pairs, found, 1, 1000 * OUTLINE, CAMERA)

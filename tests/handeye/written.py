@@ -158,7 +158,6 @@ def of_ur(folder: Path, pairs: HandEyePoses) -> Arguments:
 
 
 def file_storage(folder: Path, pairs: HandEyePoses) -> Arguments:
-    """A matrix for each pose, by OpenCV's own writer."""
     for name, poses in (("robot", pairs.base_from_flange), ("camera", pairs.camera_from_board)):
         storage = cv2.FileStorage(str(folder / f"{name}.yml"), cv2.FILE_STORAGE_WRITE)
         for i, matrix in enumerate(matrices(poses)):

@@ -86,35 +86,6 @@ def test_colmap_reads_what_is_written(tmp_path, form, suffix):
         assert list(found.params) == camera_of(model).colmap_params()
 
 
-KALIBR = """cam0:
-  camera_model: pinhole
-  intrinsics: [461.629, 460.152, 362.680, 246.049]
-  distortion_model: radtan
-  distortion_coeffs: [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
-  resolution: [752, 480]
-cam1:
-  camera_model: pinhole
-  intrinsics: [457.587, 456.134, 379.999, 255.238]
-  distortion_model: equidistant
-  distortion_coeffs: [-0.01, 0.02, -0.003, 0.0004]
-  resolution: [752, 480]
-"""
-
-
-def test_a_camera_of_a_chain_is_chosen(tmp_path):
-    path = tmp_path / "camchain.yaml"
-    path.write_text(KALIBR)
-    assert read_camera(path, "cam0").colmap_model == "OPENCV"
-    second = read_camera(path, "cam1")
-    assert second.colmap_model == "OPENCV_FISHEYE"
-    np.testing.assert_array_equal(second.distortion[[0, 1, 4, 5]], [-0.01, 0.02, -0.003, 0.0004])
-    with fails_with("E-CAMERA-SEVERAL … 2 cameras, 1 needed … cam0, cam1"):
-        read_camera(path)
-    path.write_text(KALIBR.replace("pinhole", "catadioptric"))
-    with fails_with("E-CAMERA-MODEL … catadioptric … radtan"):
-        read_camera(path, "cam0")
-
-
 METASHAPE = """<?xml version="1.0" encoding="UTF-8"?>
 <calibration>
   <projection>{kind}</projection><width>5184</width><height>3456</height>

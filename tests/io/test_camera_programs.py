@@ -115,10 +115,7 @@ REFUSED = {
         OST.format(model="camera_model: fisheye\ndistortion_model: plumb_bob", values=K4),
         "E-CAMERA-MODEL … says",
     ),
-    "two sizes": (
-        OST.format(model="resolution: [720, 1280]", values=D4),
-        "E-CAMERA-SIZE … 720×1280 px … 1280×720 px",
-    ),
+    "two sizes": (OST.format(model="resolution: [720, 1280]", values=D4), "E-CAMERA-SIZE … 720×1280 px … 1280×720 px"),
     "two matrices": (OST.format(model=f"K: {EYE}", values=D4), "E-CAMERA-REPEATED … K"),
     "size of a shape": (f"K: {FLAT}\nimage_size: [720, 1280]\n", "E-CAMERA-SIZE … 720×1280 px … width first"),
     "a fisheye without a model": (f"K: {FLAT}\nD: {K4}\n", "E-CAMERA-MODEL … D … -0.0248 … equidistant"),

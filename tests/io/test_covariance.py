@@ -38,10 +38,7 @@ NONE = {
     "negative variance": (with_entry(3, 3, -3.0), "E-COVARIANCE-VALUE … -0.0003 … 0"),
     "correlation of 9": (with_entry(3, 4, 9.0), "E-COVARIANCE-VALUE … 9 … 1 … 1"),
     "correlation over 1": (with_entry(0, 5, -1.01), "E-COVARIANCE-VALUE … -1.01"),
-    "not symmetric": (
-        with_entry(0, 1, 0.5) + with_entry(0, 1, 0.06, both=False),
-        "E-COVARIANCE-VALUE … 10.7",
-    ),
+    "not symmetric": (with_entry(0, 1, 0.5) + with_entry(0, 1, 0.06, both=False), "E-COVARIANCE-VALUE … 10.7"),
     "one side only": (with_entry(4, 2, 0.5, both=False), "E-COVARIANCE-VALUE … 100"),
     "not together": (without_a_reason_in_pairs(), "E-COVARIANCE-VALUE … -0.2 … 0"),
     "covariance without variance": (without_variance(), "E-COVARIANCE-VALUE … 5 … 03"),

@@ -11,7 +11,7 @@ from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
 from stcal.robot.urdf import load_urdf
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 TAGS = 'type = "tags"\n' + "".join(
     f'[[tag]]\ndictionary = "APRILTAG_36h11"\nid = {i}\nsize_mm = {{0}}\nx_mm = {{{i + 1}}}\ny_mm = 0.0\n'
@@ -55,15 +55,10 @@ def test_lengths_of_kalibr_are_metres(tmp_path, size):
     assert "metres" in str(caught.value)
 
 
-def test_layouts_in_metres_and_places_in_metres(tmp_path):
+def test_layouts_and_places_in_metres_and_a_tag_inside_another(tmp_path):
     load_layout(written(tmp_path, TAGS.format(60.0, 0.0, 120.0)))
-    with fails_with("E-LENGTH-UNIT … tag 0 … 0.06"):
-        load_layout(written(tmp_path, TAGS.format(0.06, 0.0, 0.12)))
-    with fails_with("E-TAG-OVERLAP … 0 … 1 … 0.12"):
-        load_layout(written(tmp_path, TAGS.format(60.0, 0.0, 0.12)))
-
-
-def test_a_tag_may_be_inside_another(tmp_path):
+    refuses("E-LENGTH-UNIT … tag 0 … 0.06", load_layout, written(tmp_path, TAGS.format(0.06, 0.0, 0.12)))
+    refuses("E-TAG-OVERLAP … 0 … 1 … 0.12", load_layout, written(tmp_path, TAGS.format(60.0, 0.0, 0.12)))
     text = TAGS.format(60.0, 0.0, 0.0).replace("id = 1\nsize_mm = 60.0", "id = 1\nsize_mm = 6.0")
     assert len(load_layout(written(tmp_path, text)).tags) == 2
 
@@ -80,15 +75,12 @@ def test_targets_in_metres(tmp_path):
     assert load_target(written(tmp_path, target_toml(small))).faces[0].radius_mm[0] == 0.006
 
 
-def test_robots_in_metres(tmp_path):
+def test_robots_in_metres_and_one_without_links(tmp_path):
     load_robot(written(tmp_path, ROBOT.format(0, -612.0)))
     for wrong in (-0.612, -612000.0):
         with fails_with(f"E-LENGTH-UNIT … joint 2 … {wrong:g}"):
             load_robot(written(tmp_path, ROBOT.format(0, wrong)))
     load_robot(written(tmp_path, ROBOT.format(0, 0)))  # axes that meet: zeros are meant
-
-
-def test_a_robot_without_links_comes_back(tmp_path):
     rows = (DHRow(0.02, np.pi / 2, 0.0, 0.0), DHRow(0.0, 0.0, 0.01, 0.0))
     robot = Robot("gimbal", "standard", rows, (Joint(), Joint()), tools={"": Rigid()}, unusual_size=True)
     assert load_robot(written(tmp_path, robot_toml(robot))).rows[0].a == 0.02

@@ -27,7 +27,6 @@ def sheet(layout: TargetLayout = LAYOUT) -> np.ndarray:
 
 
 def photo(camera_from_obj: Rigid, printed: np.ndarray | None = None, camera: Camera = CAMERA) -> np.ndarray:
-    """A photograph of the sheet."""
     matrix = np.array([[camera.focal[0], 0, camera.centre[0]], [0, camera.focal[1], camera.centre[1]], [0, 0, 1]])
     origin = camera_from_obj @ np.array([*-SHEET_MM / 2, 0.0])
     image_from_mm = matrix @ np.column_stack([camera_from_obj.rotation[:, :2], origin])

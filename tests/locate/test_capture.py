@@ -12,7 +12,7 @@ from stcal.errors import InputError
 from stcal.io import device as module
 from stcal.io.device import OpenCVSource, SimulatedSource
 from stcal.locate.exposures import capture, find_scenes, scene_folder
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 
 class Driver:
@@ -78,16 +78,13 @@ def test_a_camera_that_refuses_says_so_and_nothing_is_written(driver, tmp_path):
     ):
         before = getattr(driver, name)
         setattr(driver, name, value)
-        with fails_with(said):
-            capture(OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", None, 0.0)
+        refuses(said, capture, OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", None, 0.0)
         setattr(driver, name, before)
         assert not (tmp_path / "a").exists()
     driver.takes_gain = False
-    with fails_with("E-DEVICE-SETTING"):
-        OpenCVSource("0", 3.0)
+    refuses("E-DEVICE-SETTING", OpenCVSource, "0", 3.0)
     driver.opened = False
-    with fails_with("E-DEVICE-OPEN … camera 0"):
-        OpenCVSource("0")
+    refuses("E-DEVICE-OPEN … camera 0", OpenCVSource, "0")
 
 
 def test_a_simulated_camera_is_as_bright_as_its_exposure(tmp_path):

@@ -20,8 +20,6 @@ from tests.support.tags import random_pose
 
 @pytest.fixture
 def locate(monkeypatch, capsys):
-    """Run a command of ``stcal locate``; exit code, standard output and error."""
-
     def call(*arguments):
         monkeypatch.setattr("sys.argv", ["stcal", "locate", *map(str, arguments)])
         return ended(main, capsys)
@@ -46,7 +44,6 @@ def files(tmp_path_factory):
 
 @pytest.fixture
 def run(locate, files):
-    """``stcal locate run`` of the target and its camera."""
     target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
     return lambda scenes, *options: locate("run", files / "scenes" / scenes, *target, *options)
 

@@ -121,7 +121,6 @@ def test_a_wrong_tag_is_left_out():
 
 
 def test_two_tags_that_contradict_are_rejected():
-    """Neither is the outlier, but no pose fits both."""
     _, verdict = judge(locate(with_wrong_tag([0, 3], 3), LAYOUT, CAMERA))
     assert verdict.decision == "reject"
     assert verdict.reasons[0].startswith("chi2 per dof")

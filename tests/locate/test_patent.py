@@ -8,7 +8,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.locate.exposures import exposure_times
 from stcal.locate.patent import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, CornerNoise, example_layout, simulated_exposures
 
 LAYOUT = example_layout(1e-6)
@@ -21,10 +21,8 @@ def tag_at(x: float, y: float, side: float = 10.0) -> np.ndarray:
 
 def test_exposure_times_are_a_geometric_series():
     assert np.allclose(exposure_times(1.0, 16.0, 5), [1, 2, 4, 8, 16])
-    with fails_with("E-EXPOSURES-VALUE"):
-        exposure_times(0.0, 1.0, 3)
-    with fails_with("E-EXPOSURES-VALUE"):
-        exposure_times(1.0, 2.0, 1)
+    refuses("E-EXPOSURES-VALUE", exposure_times, 0.0, 1.0, 3)
+    refuses("E-EXPOSURES-VALUE", exposure_times, 1.0, 2.0, 1)
 
 
 def test_area_is_that_of_the_convex_hull():

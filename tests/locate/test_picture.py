@@ -18,7 +18,6 @@ MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", C
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Three exposures, all of which show all tags: dark, well exposed, and saturated."""
     folder = tmp_path_factory.mktemp("scene")
     for k, image in enumerate(expose(photo(tilted(30)), [1 / 6, 1, 4])):
         cv2.imwrite(str(folder / f"{k}.png"), image)

@@ -26,8 +26,6 @@ def plain():
 
 @pytest.fixture
 def located(tmp_path):
-    """Write the images of one scene, and locate it."""
-
     def of(images, layout=LAYOUT, options=None):
         for k, image in enumerate(images):
             cv2.imwrite(str(tmp_path / f"{k}.png"), image)

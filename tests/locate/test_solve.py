@@ -17,7 +17,7 @@ from stcal.locate.calibration import (
     plane_points,
 )
 from stcal.locate.layout import LayoutPlan, obj_from_plane
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
 
 BOARD = ChessboardDesign(6, 9, 20.0)
@@ -143,11 +143,9 @@ def test_the_derivative_of_the_frame():
 
 def test_what_cannot_be_calibrated_is_named():
     boards, tags, names = views(3, 0)
-    with fails_with("E-LAYOUT-FEW-IMAGES … 1 … 3 … 2"):
-        calibrate(PLAN, [boards[0], None, None], tags, names, CAMERA)
+    refuses("E-LAYOUT-FEW-IMAGES … 1 … 3 … 2", calibrate, PLAN, [boards[0], None, None], tags, names, CAMERA)
     without = [Tags(t.tags[1:], t.corners_px[1:], t.covariance_px2[1:]) for t in tags]
-    with fails_with("E-LAYOUT-UNLINKED … 0 … 3"):
-        calibrate(PLAN, boards, without, names, CAMERA)
+    refuses("E-LAYOUT-UNLINKED … 0 … 3", calibrate, PLAN, boards, without, names, CAMERA)
     result = calibrate(PLAN, [*boards, None], [*tags, tags[0]], [*names, "bare.png"], CAMERA)
     assert result.left_out == ("bare.png: the board is not seen",)
 

@@ -39,8 +39,6 @@ def written(folder, rows: list[str]):
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """Call the command: exit code, what it printed, and its error line."""
-
     def call(*arguments):
         monkeypatch.setattr("sys.argv", ["stcal", "register", *map(str, arguments)])
         return ended(main, capsys)

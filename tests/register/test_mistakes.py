@@ -7,7 +7,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.mistakes import mirrored_ratio
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.point_pairs import scene
 
 
@@ -125,14 +125,11 @@ def test_options_that_cannot_be(options, message):
 
 def test_points_that_cannot_be():
     s = scene(13, 30)
-    with fails_with("E-ARRAY-SHAPE … (30, 3) … (29, 3)"):
-        register(s.xyz_a, s.xyz_b[1:])
+    refuses("E-ARRAY-SHAPE … (30, 3) … (29, 3)", register, s.xyz_a, s.xyz_b[1:])
     bad = s.xyz_b.copy()
     bad[5, 1] = np.nan
-    with fails_with("E-ARRAY-NOT-FINITE … 6"):
-        register(s.xyz_a, bad)
-    with fails_with("E-POINTS-FEW … 0 … 3"):
-        register(np.zeros((0, 3)), np.zeros((0, 3)))
+    refuses("E-ARRAY-NOT-FINITE … 6", register, s.xyz_a, bad)
+    refuses("E-POINTS-FEW … 0 … 3", register, np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def test_points_in_metres_are_doubted():

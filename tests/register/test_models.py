@@ -146,19 +146,6 @@ def test_jacobian_of_one_point_by_hand():
     np.testing.assert_allclose(slope, expected, atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("name", "points", "message"),
-    [
-        ("affine", np.random.default_rng(0).uniform(-1, 1, (6, 3)) * [1, 1, 0], "E-POINTS-COPLANAR"),
-        ("affine", np.eye(3), "E-POINTS-FEW … 3 … 3 … 4"),
-        ("rigid", np.arange(4.0)[:, None] * [1, 2, 3], "E-POINTS-COLLINEAR"),
-    ],
-)
-def test_degenerate(name, points, message):
-    with fails_with(message):
-        fit(MODELS[name], points, points)
-
-
 def test_affine_transforms_compose_and_invert():
     one = Affine([[2, 1, 0], [0, 1, 0], [0, 0, 3.0]], [1, 2, 3])
     two = Affine([[1, 0, 0], [5, 1, 0], [0, 1, 1.0]], [0, 0, 7])

@@ -21,7 +21,6 @@ def points(seed: int, n: int = 40, sigma: float = 0.05) -> tuple[np.ndarray, np.
 
 
 def moved_from(row: int, b: np.ndarray, by: Rigid) -> np.ndarray:
-    """Points of frame b with those from a row on moved about the middle of all."""
     middle = b.mean(0)
     return np.concatenate([b[:row], by @ (b[row:] - middle) + middle])
 
@@ -54,7 +53,6 @@ def test_a_drift_is_told_from_a_jump():
 
 
 def sound(seed: int) -> bool:
-    """Whether a sound set seems to move."""
     a, b = points(seed, 20 + seed % 40)
     problem = Problem(MODELS[("rigid", "similarity", "affine")[seed % 3]], a, b, PointNoise())
     return moved_meanwhile(problem, problem.fit()) is not None

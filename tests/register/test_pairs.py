@@ -25,16 +25,13 @@ def with_cells(cells):
     return [f"{row},{cell}" for row, cell in zip(ROWS, cells, strict=True)]
 
 
-def test_points_and_lines(written):
+def test_points_lines_and_units(written):
     pairs = read_pairs(written([ROWS[0], "# a remark", *ROWS[1:]]))
     assert list(pairs.lines) == [2, 4, 5, 6]
     np.testing.assert_array_equal(pairs.xyz_a[3], [0, 0, 3.5])
     np.testing.assert_array_equal(pairs.xyz_b[2], [10, 22, 30])
     assert pairs.weights is None
     assert pairs.covariances is None
-
-
-def test_units_by_suffix(written):
     pairs = read_pairs(written(ROWS, "ax_m,ay_mm,az_mm,bx_in,by_in,bz_in"))
     np.testing.assert_allclose(pairs.xyz_a[1], [1000, 0, 0])
     np.testing.assert_allclose(pairs.xyz_b[0], np.array([10, 20, 30]) * 25.4)
@@ -62,11 +59,7 @@ def test_noise_of_three_kinds(written):
         (with_cells([1, -2, -1, 4]), HEAD + ",sigma_mm", "E-SIGMA-VALUE … 3 … sigma … -2 … (and 1 more)"),
         (with_cells(["1,1"] * 4), HEAD + ",sigma_mm,weight", "E-TABLE-COLUMNS-CONFLICT … weight and sigma"),
         (with_cells(["1,2"] * 4), HEAD + ",cov_x_x,cov_x_y", "E-TABLE-COLUMN-MISSING … cov_x_z … 6"),
-        (
-            with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]),
-            f"{HEAD},{COV}",
-            "E-TABLE-COVARIANCE … 5 … 2",
-        ),
+        (with_cells(["1,0,0,1,0,1"] * 3 + ["1,2,0,1,0,1"]), f"{HEAD},{COV}", "E-TABLE-COVARIANCE … 5 … 2"),
     ],
 )
 def test_bad_files(written, rows, head, message):

@@ -42,12 +42,3 @@ def test_ours_beats_theirs_which_beats_their_least_squares_and_only_the_kinemati
         assert far[name] > near[name]
     assert far[script.RIGID] > 1.3 * near[script.RIGID]
     assert far[script.TOGETHER] == min(far.values())
-
-
-@pytest.mark.slow
-def test_their_samples_find_no_clean_draw_among_thirty_per_cent(script):
-    rng = np.random.default_rng(2)
-    cell = script.Cell.of(rng)
-    measured = cell.measured(script.POINTS, script.SMALL, (0.3, 0.0), rng)
-    with pytest.raises(script.DegenerateError, match="no sample of 34 points"):
-        script.by_paper(measured, limits=(0.23,))

@@ -18,7 +18,6 @@ RIGID = MODELS["rigid"]
 
 
 def cost_ratio(s, found) -> float:
-    """Square sum of the clean points over their optimum."""
     a, b = s.xyz_a[s.clean], s.xyz_b[s.clean]
     return ((b - found.b_from_a @ a) ** 2).sum() / ((b - align_rigid(b, a) @ a) ** 2).sum()
 

@@ -18,7 +18,6 @@ def bend(xyz: np.ndarray) -> np.ndarray:
 
 
 def bent(seed: int, n: int, sigma: float = SIGMA, half: float = 100.0):
-    """Points, and what is measured of them in a bent frame."""
     rng = np.random.default_rng(seed)
     a = rng.uniform(-half, half, (n, 3))
     return a, B_FROM_A @ (a + bend(a)) + rng.normal(0, sigma, a.shape)

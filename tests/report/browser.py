@@ -38,7 +38,6 @@ def metrics(width: int, height: int) -> dict:
 
 
 def show(chrome: Chrome, page: Path, width: int = 1280, height: int = 900) -> None:
-    """Open a page of this size."""
     chrome.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics(width, height))
     chrome.get(page.resolve().as_uri())
 

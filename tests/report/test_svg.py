@@ -45,14 +45,11 @@ def test_ticks_are_round(low, high, texts):
     assert all(low - 1e-9 <= value <= high + 1e-9 for value in values)
 
 
-def test_data_lie_between_the_ends_of_their_axes():
+def test_axes_hold_their_data():
     axes = Axes(Drawing(2, 2), (10, 20, 110, 70), (0, 4), (5, -5))  # downwards
     np.testing.assert_allclose(axes.at([0, 4, 1], [5, -5, 0]), [[10, 70], [110, 20], [35, 45]])
     axes = Axes(Drawing(2, 2), (10, 20, 110, 70), (1, 100), (0, 1), log="x")
     np.testing.assert_allclose(axes.at([1, 10, 100, -1], 0), [[10, 70], [60, 70], [110, 70], [10, 70]])
-
-
-def test_equal_axes_hold_all_points_on_one_scale():
     xy = np.array([[0.0, 0.0], [300.0, 10.0]])
     axes = Axes.equal(Drawing(3, 3), (10, 20, 110, 70), xy, 0.0, down=True)
     np.testing.assert_allclose(axes.at(*xy.T), [[10, 45 - 5 / 3], [110, 45 + 5 / 3]])

@@ -171,9 +171,6 @@ def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
     assert found.identified.rank == 30
 
 
-# --- what is refused, before any photograph is measured ---
-
-
 @pytest.fixture
 def given(tmp_path, monkeypatch):
     """Inputs; measuring would fail the test."""
@@ -241,15 +238,12 @@ def test_what_is_refused(given, tmp_path, rows, options, error):
         given(["image", *JOINTS], rows, **options)
 
 
-def test_targets_of_a_tool_that_is_not_photographed(given):
+def test_a_tool_that_is_not_photographed_and_poses_beside_joint_values_are_refused(given):
     nominal = replace(mh80(), tools={"": Rigid(), "gripper": Rigid()})
     q = np.zeros((1, 6)).T
     targets = Table("targets.csv", {"target": ["gripper"]} | dict(zip(JOINTS, q, strict=True)), [2])
     with fails_with("E-ROBOT-NO-TOOL … targets.csv … 2 … 'gripper' … MH80 … ''"):
         given(["image", *JOINTS], rows_of(), nominal, targets=targets)
-
-
-def test_poses_beside_the_joint_values(given):
     head = ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
     with fails_with("E-TABLES-BOTH … x_mm"):
         given(["image", *JOINTS, *head], [[*row, *pose_cells(Rigid())] for row in rows_of()])

@@ -25,7 +25,6 @@ SLIDE = Joint("prismatic", -100.0, 2000.0)
 
 
 def turned(seed: int = 0, **more) -> Robot:
-    """With rows a little off right angles."""
     off = np.random.default_rng(seed).normal(size=(6, 4)) * [1, 0.01, 1, 0.01]
     rows = zip(mh80().rows, off, strict=True)
     rows = tuple(DHRow(r.a + a, r.alpha + alpha, r.d + d, r.theta + theta) for r, (a, alpha, d, theta) in rows)
@@ -221,12 +220,9 @@ def test_command_line(stcal_robot, tmp_path):
         assert (code, told in error) == (2, True)
 
 
-def test_a_name_that_xml_cannot_hold_is_refused():
+def test_robots_that_a_urdf_cannot_hold_are_refused():
     with fails_with("E-ROBOT-NAME … '\\x1b[31mred' has control characters"):
         robot_urdf(replace(EXAMPLE, name="\x1b[31mred"))
-
-
-def test_an_elastic_robot_has_no_urdf():
     none = Elasticity(np.zeros((6, 2)), np.zeros((6, 3)), np.zeros((6, 4)), np.array([0, 0, -1.0]))
     with fails_with("E-ROBOT-ELASTICITY"):
         robot_urdf(replace(EXAMPLE, elasticity=none))

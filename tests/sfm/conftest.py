@@ -23,13 +23,11 @@ def stock(small_dataset, small_run, once) -> Path:
 
 @pytest.fixture(scope="session")
 def saved(small_run) -> SavedRun:
-    """``small_run``, read once."""
     return load_run(small_run)
 
 
 @pytest.fixture
 def own_run(small_run, tmp_path) -> Path:
-    """A copy of ``small_run`` to write to."""
     return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
@@ -55,7 +53,6 @@ class SmallSet:
         return self.images / group / f"IMG_{1000 + i}.jpg"
 
     def arguments(self, *more) -> list:
-        """Of ``stcal-sfm run``."""
         return ["run", self.images, "--camera", self.camera, "--out", self.out, "--workers", 1, *more]
 
 

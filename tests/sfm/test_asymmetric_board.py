@@ -38,10 +38,7 @@ def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        (
-            'type = "boards"\n[[board]]\nfile = "other.toml"\n',
-            "E-BOARD-SINGLE … several boards",
-        ),
+        ('type = "boards"\n[[board]]\nfile = "other.toml"\n', "E-BOARD-SINGLE … several boards"),
         (
             "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n",
             "E-BOARD-RADIUS … radius_mm",

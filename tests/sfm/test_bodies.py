@@ -42,7 +42,7 @@ from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.levels import sampled
-from tests.outcome import COMPUTATION, assert_error, fails_with
+from tests.outcome import COMPUTATION, assert_error, fails_with, refuses
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
 SIGMA_PX = 0.1
@@ -146,7 +146,6 @@ def observed(target, count: int, seed: int, distance_mm: float = 300):
 
 
 def calibrated(target, images, size):
-    """The calibration of a body from its corners alone, without a camera."""
     start = Camera.of(start_camera(*size, "OPENCV"), "OPENCV")
     body = place_and_find_camera(images, target.faces, [start])
     camera = body.camera
@@ -176,12 +175,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         if face == result.target.reference_face:
             continue
         truth = scene.target_from_face[face]
-        off = np.concatenate(
-            [
-                (pose @ truth.inverse()).log()[:3],
-                pose.translation - truth.translation,
-            ]
-        )
+        off = np.concatenate([(pose @ truth.inverse()).log()[:3], pose.translation - truth.translation])
         normalised = off @ np.linalg.solve(result.target.face_covariance[face], off)
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
 
@@ -380,17 +374,10 @@ def test_a_body_may_have_tags_on_some_faces():
     assert [face.id for face in five.faces] == ["1", "2", "3", "4", "5"]
     assert net_text(five) == "net to fold, 186 × 186 mm: one sheet of A3"
     assert net_text(tag_body("cube", "45", "APRILTAG_36h11", 0)).endswith("mm: one sheet of A4")
-    with fails_with("E-OPTION-VALUE … no face 9 … 1, 2, 3"):
-        tag_body("cube", "62", "APRILTAG_36h11", 3, "1,9")
-    with fails_with("E-OPTION-VALUE … two or more"):
-        tag_body("cube", "62", "APRILTAG_36h11", 3, "1")
-
-
-def test_widths_that_are_none_are_refused():
-    with fails_with("E-OPTION-VALUE … 60,60 … width"):
-        tag_body("cube", "60,60", "APRILTAG_36h11", 0)
-    with fails_with("E-TAG-ID-RANGE … 50"):
-        tag_body("cube", "60", "4X4_50", 47)
+    refuses("E-OPTION-VALUE … no face 9 … 1, 2, 3", tag_body, "cube", "62", "APRILTAG_36h11", 3, "1,9")
+    refuses("E-OPTION-VALUE … two or more", tag_body, "cube", "62", "APRILTAG_36h11", 3, "1")
+    refuses("E-OPTION-VALUE … 60,60 … width", tag_body, "cube", "60,60", "APRILTAG_36h11", 0)
+    refuses("E-TAG-ID-RANGE … 50", tag_body, "cube", "60", "4X4_50", 47)
 
 
 @pytest.mark.slow

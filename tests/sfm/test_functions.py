@@ -15,12 +15,11 @@ import stcal
 from stcal import sfm
 from stcal.io.files import json_text
 from stcal.sfm.planning.file import plan_text
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.shared import own_copy
 
 
 def written_json(stcal_sfm, out, *words) -> dict:
-    """What a command writes as JSON."""
     assert stcal_sfm(*words, "--json", out)[0] == 0
     return json.loads(out.read_text(encoding="utf-8"))
 
@@ -72,10 +71,8 @@ def test_design_target(stcal_sfm, monkeypatch, tmp_path):
     assert plan_text(found.forecast, found.source) in said
     for name, path in zip(("target.toml", "board.toml"), found.files, strict=True):
         assert path.read_bytes() == (tmp_path / "one" / name).read_bytes()
-    with fails_with("E-OUTPUT-EXISTS … target.toml"):
-        sfm.design_target(options, 2, tmp_path / "two")
-    with fails_with("E-OPTION-VALUE … under"):
-        sfm.DesignOptions((130.0, 120.0, 110.0), faces=("front", "under"))
+    refuses("E-OUTPUT-EXISTS … target.toml", sfm.design_target, options, 2, tmp_path / "two")
+    refuses("E-OPTION-VALUE … under", sfm.DesignOptions, (130.0, 120.0, 110.0), faces=("front", "under"))
 
 
 def test_design_tag_body_and_plan(stcal_sfm, tmp_path):
@@ -104,10 +101,8 @@ def test_crosscheck_names_what_is_missing(stcal_sfm, small_run, tmp_path):
     program = tmp_path / "no-colmap"
     own = own_copy(small_run, tmp_path / "run")  # its lock is taken
     assert stcal_sfm("crosscheck", own, "--colmap", program).error == "E-COLMAP-PROGRAM"
-    with fails_with("E-COLMAP-PROGRAM … no-colmap"):
-        sfm.crosscheck(small_run, program, sfm.Tolerances(sigma=1.0))
-    with fails_with("E-FIELD-TYPE … tolerances … Tolerances"):
-        sfm.crosscheck(small_run, program, 0.5)
+    refuses("E-COLMAP-PROGRAM … no-colmap", sfm.crosscheck, small_run, program, sfm.Tolerances(sigma=1.0))
+    refuses("E-FIELD-TYPE … tolerances … Tolerances", sfm.crosscheck, small_run, program, 0.5)
 
 
 def test_report_again(stcal_sfm, small_run, tmp_path):
@@ -118,14 +113,9 @@ def test_report_again(stcal_sfm, small_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "call",
-    [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise],
-    ids=lambda call: call.__name__,
+    "call", [sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise], ids=lambda call: call.__name__
 )
 def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
-    with fails_with("E-FIELD-TYPE … 7"):
-        call(7)
-    with fails_with("E-RUN-FOLDER … out"):
-        call(replace(small_result, out=None))
-    with fails_with(f"E-RUN-FOLDER … {tmp_path}"):
-        call(tmp_path)
+    refuses("E-FIELD-TYPE … 7", call, 7)
+    refuses("E-RUN-FOLDER … out", call, replace(small_result, out=None))
+    refuses(f"E-RUN-FOLDER … {tmp_path}", call, tmp_path)

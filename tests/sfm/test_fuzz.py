@@ -119,11 +119,7 @@ ELSEWHERE = {"sfm demo", "sfm detect", "robot from-photos"}
 FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.command for before in CALLS[:n]} | ELSEWHERE]
 
 
-@pytest.mark.parametrize(
-    "number",
-    sampled(range(len(CALLS)), kept=FIRST),
-    ids=[call.command for call in CALLS],
-)
+@pytest.mark.parametrize("number", sampled(range(len(CALLS)), kept=FIRST), ids=[call.command for call in CALLS])
 def test_calls_go_through(stock, tmp_path, number):
     assert went_through(stock, tmp_path / "case", number).failures == ()
 
@@ -146,7 +142,6 @@ def test_a_writer_without_a_check_is_found(stock, tmp_path, monkeypatch, kind, i
 
 @pytest.fixture
 def schedule(stock, tmp_path):
-    """A call with an input, and its folder."""
     call = call_of("register", "register/pairs.csv")
     read, written = lay_out(stock, tmp_path, call, earlier=True)
     return call, tmp_path, read, written, hashes(tmp_path)

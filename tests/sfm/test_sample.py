@@ -33,7 +33,6 @@ def bounds(count: int) -> tuple[float, float]:
 
 
 def printed(*arguments) -> str:
-    """By ``stcal-sfm``, as it is called."""
     call = [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
     done = subprocess.run(call, capture_output=True, text=True, encoding="utf-8")
     assert done.returncode == 0, done.stderr
@@ -138,7 +137,6 @@ class Page(HTMLParser):
 
 
 def test_the_report_says_what_the_files_say(calibrated):
-    """The page stands alone, and its table has the faces' positions."""
     out, text = calibrated.out, calibrated.text
     html = (out / "report.html").read_text(encoding="utf-8")
     page = Page()

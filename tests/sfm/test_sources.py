@@ -28,13 +28,10 @@ def leaf(words: list[str]):
     return command, words
 
 
-def test_each_function_is_there():
+def test_each_function_and_script_is_there():
     for name in FUNCTIONS:
         module, _, function = name.rpartition(".")
         assert hasattr(import_module(module), function), name
-
-
-def test_each_script_is_there():
     assert [name for name in SCRIPTS if not (ROOT / name).is_file()] == []
 
 

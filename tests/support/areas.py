@@ -81,5 +81,4 @@ def squares_nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def homography(camera_matrix: np.ndarray, rotation: np.ndarray, translation: Sequence[float]) -> np.ndarray:
-    """Pixels from mm in the plane."""
     return camera_matrix @ np.column_stack([rotation[:, :2], translation])

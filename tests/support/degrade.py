@@ -30,9 +30,6 @@ def stored(image: np.ndarray, bits: int = 8) -> np.ndarray:
     return levels.astype(np.uint8 if bits == 8 else np.uint16)
 
 
-# ---------------------------------------------------------------- lens and movement
-
-
 def defocused(image: np.ndarray, radius_px: float) -> np.ndarray:
     """Out of focus: every point becomes an even disc of ``radius_px``."""
     reach = int(np.ceil(radius_px)) + 1
@@ -72,15 +69,10 @@ def rolled(xy_px: np.ndarray, shift_px: float, height: int) -> np.ndarray:
 
 
 def shrunk(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resampled to fewer pixels, each the mean of what it covers."""
     return cv2.resize(np.asarray(image, np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
 
-# ---------------------------------------------------------------- sensor and file
-
-
 def noisy(image: np.ndarray, sigma: float, seed: int) -> np.ndarray:
-    """Independent Gaussian noise of ``sigma`` grey values in every pixel."""
     noise = np.random.default_rng(seed).standard_normal(image.shape, dtype=np.float32)
     return np.asarray(image, np.float32) + np.float32(sigma) * noise
 
@@ -99,12 +91,10 @@ def toned(image: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def jpeg(image: np.ndarray, quality: int) -> bytes:
-    """A JPEG file of that quality (1…100)."""
     return encode(stored(image), ".jpg", quality)
 
 
 def hot_pixels(image: np.ndarray, share: float, seed: int) -> np.ndarray:
-    """That share of the pixels reads white."""
     hot = np.random.default_rng(seed).random(image.shape) < share
     return np.where(hot, np.float32(WHITE), np.asarray(image, np.float32))
 
@@ -118,9 +108,6 @@ def dusty(image: np.ndarray, count: int, seed: int) -> np.ndarray:
         spot = _spot(image.shape, (x, y), rng.uniform(3, 10))
         result *= 1 - np.float32(rng.uniform(0.1, 0.4)) * spot
     return result
-
-
-# ---------------------------------------------------------------- light
 
 
 def vignetted(image: np.ndarray, loss: float) -> np.ndarray:
@@ -178,9 +165,6 @@ def unevenly_lit(photograph: Photograph, ratio: float) -> np.ndarray:
         factor = ratio ** (-(0.5 * (1 - towards) + 0.5 * across))
         image[window] *= 1 + share[window] * (factor.astype(np.float32) - 1)
     return image
-
-
-# ---------------------------------------------------------------- circles and board
 
 
 def without_circles(photograph: Photograph, labels: Iterable[str]) -> np.ndarray:
@@ -250,14 +234,8 @@ def covered_labels(photograph: Photograph, image: np.ndarray, least: float = 8.0
     return whole, part
 
 
-# ---------------------------------------------------------------- what stands behind
-
-
 def behind(
-    photograph: Photograph,
-    planes: Iterable[Plane],
-    levels: Iterable[tuple[float, float]],
-    margin_mm: float = MARGIN_MM,
+    photograph: Photograph, planes: Iterable[Plane], levels: Iterable[tuple[float, float]], margin_mm: float = MARGIN_MM
 ) -> np.ndarray:
     """The photograph with planes drawn behind target and board; ``levels`` : grey values of each one's circles and of
     its plate. Later ones cover earlier ones; those that reach behind the camera are not drawn."""

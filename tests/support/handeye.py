@@ -93,7 +93,6 @@ def board_corners(columns: int, rows: int, square_mm: float) -> np.ndarray:
 
 
 def disturbed(rng: np.random.Generator, poses: Poses, sigma_rad: float, sigma_mm: float) -> Poses:
-    """With Gaussian left perturbations."""
     turn = Rotation.from_rotvec(rng.normal(0, 1, (len(poses), 3)) * sigma_rad).as_matrix()
     return Poses(turn @ poses.rotation, poses.translation + rng.normal(0, 1, (len(poses), 3)) * sigma_mm)
 

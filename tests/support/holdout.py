@@ -34,7 +34,6 @@ class PoseTrial:
 
 
 def half_calibrated(images: CalibrationImages, plan: LayoutPlan, chosen: Sequence[int]) -> CalibratedLayout:
-    """The layout from the chosen images only."""
     return calibrate(
         plan,
         [images.views[i] for i in chosen],

@@ -78,7 +78,6 @@ class Photograph:
 
     @property
     def planes(self) -> tuple[Plane, ...]:
-        """Faces in view, and the board."""
         return (*self.faces, self.board)
 
     def ellipses(self) -> dict[str, tuple[np.ndarray, float]]:
@@ -131,21 +130,17 @@ class Photograph:
         return share
 
     def outline_px(self, plane: Plane, margin_mm: float = MARGIN_MM) -> np.ndarray:
-        """A plane's outline in the image, (k, 2) px."""
         return self.camera.project(plane.xyz_camera(plane.outline_mm(margin_mm)))
 
     def face_region(self, plane: Plane) -> np.ndarray:
-        """Share of the pixels on a face or the board."""
         return self.region(self.outline_px(plane))
 
     def foreground(self) -> np.ndarray:
-        """Share of the pixels on the target's body or on the board."""
         all_faces = np.vstack([self.outline_px(face) for face in (*self.faces, *self.hidden_faces)])
         hull = cv2.convexHull(all_faces.astype(np.float32))[:, 0]
         return np.maximum(self.region(hull), self.face_region(self.board))
 
     def levels(self, plane: Plane) -> tuple[float, float]:
-        """Median grey value of a plane's circles and of what surrounds them."""
         angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
         ring = np.column_stack([np.cos(angle), np.sin(angle)])
         around = plane.xy_mm[:, None] + 1.5 * plane.radius_mm[:, None, None] * ring

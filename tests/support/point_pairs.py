@@ -33,13 +33,11 @@ class PointPairScene:
 
 
 def directions(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 3) unit vectors, even over the sphere."""
     v = rng.normal(size=(n, 3))
     return v / np.linalg.norm(v, axis=1)[:, None]
 
 
 def cube(rng: np.random.Generator, n: int, half_mm: float = HALF_MM) -> np.ndarray:
-    """(n, 3) points, even over a cube around :data:`CENTRE_MM`."""
     return np.array(CENTRE_MM) + rng.uniform(-half_mm, half_mm, (n, 3))
 
 
@@ -114,7 +112,6 @@ def make_scene(
 
 
 def scene(seed, *args, **options) -> PointPairScene:
-    """:func:`make_scene` of its own generator."""
     return make_scene(np.random.default_rng(seed), *args, **options)
 
 

@@ -11,7 +11,7 @@ from stcal.io.design import load_board, load_target
 from stcal.synthetic.dataset import TruthFile, write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)
 
@@ -102,15 +102,11 @@ def test_png_holds_the_image_exactly(tmp_path):
 
 def test_refusals(tmp_path, scene):
     (tmp_path / "mine.txt").write_text("keep")
-    with fails_with("E-OUTPUT-EXISTS"):
-        write_dataset(tmp_path, scene)
-    with fails_with("E-OUTPUT-EXISTS"):
-        write_dataset(tmp_path / "mine.txt", scene)
+    refuses("E-OUTPUT-EXISTS", write_dataset, tmp_path, scene)
+    refuses("E-OUTPUT-EXISTS", write_dataset, tmp_path / "mine.txt", scene)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
-    with fails_with("E-OPTION-FORM … tif"):
-        write_dataset(tmp_path / "new", scene, image_format="tif")
-    with fails_with("E-OPTION-FORM"):
-        write_dataset(tmp_path / "new", scene, RenderOptions(bit_depth=16))
+    refuses("E-OPTION-FORM … tif", write_dataset, tmp_path / "new", scene, image_format="tif")
+    refuses("E-OPTION-FORM", write_dataset, tmp_path / "new", scene, RenderOptions(bit_depth=16))
 
 
 def test_a_data_set_that_fails_leaves_no_folder(tmp_path):

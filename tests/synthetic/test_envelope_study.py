@@ -14,7 +14,6 @@ HEADER = "image,label,x_px,y_px,sigma_px\n"
 
 
 def written(name: str, strength: int, folder) -> dict:
-    """The pictures of a case, written to a folder."""
     return study.write_case(KINDS[name], study.Case(DATA, name, KINDS[name].values[strength - 1]), folder)
 
 

@@ -13,7 +13,7 @@ from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.optics import ThinLens, blur_evenly
 from stcal.synthetic.render import RenderOptions, _add_circles, check_lens, render
 from stcal.synthetic.scene import ImageCircles, SceneOptions, image_circles, make_scene, seen_wide, wide_options
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 OPTIONS = SceneOptions(seed=1, width=972, height=648, images_per_group=2, groups=(("1", "2"), ("1", "5")))
 PLAIN = RenderOptions(noise=0, vignetting=0, gradient=0, spread=0, bit_depth=16)
@@ -59,7 +59,6 @@ def _traced(camera, box, centre, normal, radius, lens, rim_mm):
 
 
 def _moments(share, box):
-    """Light, and its centroid."""
     y, x = np.mgrid[box[1] : box[3], box[0] : box[2]]
     return np.array([share.sum(), (share * x).sum() / share.sum(), (share * y).sum() / share.sum()])
 
@@ -108,7 +107,6 @@ def _gradient_px(camera, seen, lens):
 
 @pytest.fixture(scope="module")
 def straight():
-    """A scene without distortion."""
     return make_scene(replace(OPTIONS, width=1296, height=864, distortion=()))
 
 
@@ -204,14 +202,10 @@ def test_truth_states_lens_and_rim(scene):
 
 
 def test_refusals(scene):
-    with fails_with("E-SIMULATE-OPTIONS … f_number … 0"):
-        ThinLens(0.0, 24.0, 900.0)
-    with fails_with("E-SIMULATE-OPTIONS … 20 mm … 24 mm"):
-        ThinLens(4.0, 24.0, 20.0)
-    with fails_with("E-FIELD-TYPE … rim_mm"):
-        RenderOptions(rim_mm=float("nan"))
-    with fails_with("E-SIMULATE-OPTIONS … 100 mm … at most 20"):
-        check_lens(scene, ThinLens(2.0, 24.0, 100.0))
+    refuses("E-SIMULATE-OPTIONS … f_number … 0", ThinLens, 0.0, 24.0, 900.0)
+    refuses("E-SIMULATE-OPTIONS … 20 mm … 24 mm", ThinLens, 4.0, 24.0, 20.0)
+    refuses("E-FIELD-TYPE … rim_mm", RenderOptions, rim_mm=float("nan"))
+    refuses("E-SIMULATE-OPTIONS … 100 mm … at most 20", check_lens, scene, ThinLens(2.0, 24.0, 100.0))
     wide = wide_options(replace(OPTIONS, distance_mm=500, groups=(("1", "2"),)))
     with fails_with("E-SIMULATE-OPTIONS … equidistant"):
         check_lens(seen_wide(make_scene(wide), 120, 1), ThinLens(4.0, 24.0, 500.0))

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.support.circle_images import area_and_centroid
 
 OPTIONS = SceneOptions(seed=1, width=648, height=432, images_per_group=2, groups=(("1", "2"), ("1", "5")))
@@ -136,12 +136,9 @@ def test_vignetting_gradient_blur_and_exposure(second):
 
 
 def test_options_are_checked():
-    with fails_with("E-SIMULATE-OPTIONS … 12"):
-        RenderOptions(bit_depth=12)
-    with fails_with("E-SIMULATE-OPTIONS … reflectance 1.2"):
-        RenderOptions(reflectance=1.2)
-    with fails_with("E-SIMULATE-OPTIONS … noise … -1"):
-        RenderOptions(noise=-1)
+    refuses("E-SIMULATE-OPTIONS … 12", RenderOptions, bit_depth=12)
+    refuses("E-SIMULATE-OPTIONS … reflectance 1.2", RenderOptions, reflectance=1.2)
+    refuses("E-SIMULATE-OPTIONS … noise … -1", RenderOptions, noise=-1)
 
 
 def test_rings_are_dots_with_a_hole_about_the_same_centre():

@@ -9,7 +9,7 @@ from stcal.design import TargetDesign, reference_target
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.synthetic.scene import SceneOptions, image_circles, make_scene, rim_points, second_design
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.circle_images import area_and_centroid, simulate_centres
 
 OPTIONS = SceneOptions(seed=3, width=1296, height=864, images_per_group=4)
@@ -158,20 +158,16 @@ def test_a_target_too_near_is_refused():
 
 
 def test_errors_say_what_to_do():
-    with fails_with("E-SCENE-FACES"):
-        make_scene(replace(OPTIONS, groups=(("1", "3"),)))
-    with fails_with("E-TARGET-NO-FACE … 9"):
-        make_scene(replace(OPTIONS, groups=(("1", "9"),)))
-    with fails_with("E-SCENE-GROUP … 12"):
-        make_scene(replace(OPTIONS, groups=(("1", "2"), ("1", "2"))))
+    refuses("E-SCENE-FACES", make_scene, replace(OPTIONS, groups=(("1", "3"),)))
+    refuses("E-TARGET-NO-FACE … 9", make_scene, replace(OPTIONS, groups=(("1", "9"),)))
+    refuses("E-SCENE-GROUP … 12", make_scene, replace(OPTIONS, groups=(("1", "2"), ("1", "2"))))
     target = reference_target()
     with fails_with("E-TARGET-ROUGH-POSE … 5"):
         make_scene(OPTIONS, target, nominal={f: p for f, p in reference_target().rough_poses().items() if f != "5"})
     pair = TargetDesign("pair", "bright", target.faces[:2])
     with fails_with("E-SCENE-FACES"):
         make_scene(OPTIONS, pair, nominal={"1": Rigid(), "2": Rigid(reference_target().rough_poses()["2"].rotation)})
-    with fails_with("E-SIMULATE-OPTIONS … images_per_group … 0"):
-        SceneOptions(images_per_group=0)
+    refuses("E-SIMULATE-OPTIONS … images_per_group … 0", SceneOptions, images_per_group=0)
 
 
 def test_a_plate_of_which_nothing_is_stated_says_what_is_assumed():

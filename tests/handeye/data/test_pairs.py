@@ -7,14 +7,13 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, read_poses
 from stcal.handeye.data.pairs import inverse_covariance
 from stcal.io.table import COVARIANCE
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 
 CELLS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def write(path, sides, unit="mm", edit=None, extra=None):
-    """A file with the poses of ``sides``, name → Poses; ``edit`` : (row, column) → text."""
     factor = {"mm": 1.0, "m": 1000.0}[unit]
     header = [f"{name}_{c}" + (f"_{unit}" if c in "xyz" else "") for name in sides for c in CELLS]
     rows = [
@@ -74,15 +73,12 @@ def test_missing_and_doubled_sides(tmp_path, truth):
         read_poses(write(tmp_path / "b.csv", every))
 
 
-def test_identical_poses_are_named(tmp_path, truth):
+def test_identical_poses_and_a_board_that_did_not_follow_are_named(tmp_path, truth):
     rows = [0, 1, 2, 3, 1, 5]
     sides = {"base_from_flange": truth.pairs.base_from_flange[rows]}
     sides["camera_from_board"] = truth.pairs.camera_from_board[rows]
     with fails_with("E-POSES-IDENTICAL … line 3 and line 6"):
         read_poses(write(tmp_path / "poses.csv", sides))
-
-
-def test_a_board_that_did_not_follow_is_named(truth):
     board = truth.pairs.camera_from_board[[0, 1, 2, 3, 3, 5, 6, 7]]
     with fails_with("E-POSES-IDENTICAL … pose 4 and pose 5"):
         HandEyePoses(truth.pairs.base_from_flange, board)
@@ -95,16 +91,13 @@ def test_matrices_are_checked_one_by_one(truth):
     assert same.camera_from_board.translation == pytest.approx(truth.pairs.camera_from_board.translation)
     mirrored = [m.copy() for m in board]
     mirrored[3][:3, 2] *= -1
-    with fails_with("E-ROTATION-IMPROPER … camera_from_board"):
-        HandEyePoses.from_matrices(flange, mirrored)
+    refuses("E-ROTATION-IMPROPER … camera_from_board", HandEyePoses.from_matrices, flange, mirrored)
     broken = [m.copy() for m in flange]
     broken[1][0, 3] = np.inf
     with fails_with("E-ARRAY-NOT-FINITE"):
         HandEyePoses.from_matrices(broken, board, names=tuple(f"{c}.png" for c in "abcdefgh"))
-    with fails_with("E-POSES-COUNT … 8 … 7"):
-        HandEyePoses.from_matrices(flange, board[:7])
-    with fails_with("E-POSES-COUNT … 7 … 8"):
-        HandEyePoses.from_matrices(flange[:7], board)
+    refuses("E-POSES-COUNT … 8 … 7", HandEyePoses.from_matrices, flange, board[:7])
+    refuses("E-POSES-COUNT … 7 … 8", HandEyePoses.from_matrices, flange[:7], board)
 
 
 def test_covariances_are_read_and_turned_over(tmp_path, truth):

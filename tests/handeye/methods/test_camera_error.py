@@ -15,7 +15,6 @@ TRIALS = 12
 
 
 def by_a_wrong_camera(seed: int, times: float, method: str, options: HandEyeOptions) -> float:
-    """Squared error of X in σ²: corners of 0.1 px by a camera file that is off by so many σ, twelve poses."""
     rng = np.random.default_rng(seed)
     truth = simulated_views(rng, 12, "eye-in-hand", (1e-4, 0.03), 0.1, 0.03)
     error = times * rng.multivariate_normal(np.zeros(len(PRIOR.covariance)), PRIOR.covariance)

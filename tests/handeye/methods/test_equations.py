@@ -13,7 +13,6 @@ KEPT, CORNERS = 7, 5
 
 
 def drawn(rng, with_cross=True) -> Equations:
-    """Equations of random derivatives."""
     jacobian = rng.normal(size=(40, KEPT))
     by_corner = rng.normal(size=(40, 3))
     corner, residual = np.arange(40) % CORNERS, rng.normal(size=40)

@@ -12,7 +12,7 @@ from stcal.handeye.data.pairs import Loop, Motions, poses_with_log
 from stcal.handeye.methods.closed_form import AX_XB, equations, smallest_largest
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish, three_others
 from stcal.handeye.solve import handeye
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 
 FROM_POSES = tuple(m for m in METHODS if m != "reprojection")
@@ -22,7 +22,6 @@ SETUPS = ("eye-in-hand", "eye-to-hand")
 
 
 def off(found, truth, name="mount_from_camera"):
-    """Angle (rad) and distance (mm) from the truth."""
     away = getattr(truth, name).inverse() @ getattr(found, name)
     return away.angle_rad(), float(np.linalg.norm(away.translation))
 
@@ -51,7 +50,6 @@ def test_noisy_poses_give_about_the_truth(method):
 
 @pytest.mark.parametrize("method", EXACT)
 def test_the_unit_of_the_poses_makes_no_difference(method):
-    """Poses in metres and σ in metres: the same answer in metres."""
     truth = simulated(np.random.default_rng(5), 10, camera=(1e-3, 0.4))
     sides = (truth.pairs.base_from_flange, truth.pairs.camera_from_board)
     in_metres = HandEyePoses(*(Poses(p.rotation, p.translation / 1000) for p in sides))
@@ -184,20 +182,13 @@ def test_wrong_arguments(arguments, message):
 
 
 def test_wrong_options():
-    with fails_with("E-EVOLUTION-OPTIONS … 3"):
-        EvolutionOptions(population=3)
-    with fails_with("E-EVOLUTION-OPTIONS … -1"):
-        Bounds(-1.0)
-    with fails_with("E-EVOLUTION-OPTIONS … 1e+308"):
-        Bounds(1e308)
-    with fails_with("E-SIGMA-INCOMPLETE … σ_rot … σ_trans … robot"):
-        Noise(robot_rad=1e-3)
-    with fails_with("E-SIGMA-VALUE … 10 … 100"):
-        Noise(camera_rad=1e-3, camera_mm=-1.0)
-    with fails_with("E-SIGMA-VALUE … corner_px … 0 … more … than 0"):
-        Noise(corner_px=0.0)
-    with fails_with("E-SIGMA-VALUE"):
-        Noise(0.0, 0.1, 0.0, 0.1)
+    refuses("E-EVOLUTION-OPTIONS … 3", EvolutionOptions, population=3)
+    refuses("E-EVOLUTION-OPTIONS … -1", Bounds, -1.0)
+    refuses("E-EVOLUTION-OPTIONS … 1e+308", Bounds, 1e308)
+    refuses("E-SIGMA-INCOMPLETE … σ_rot … σ_trans … robot", Noise, robot_rad=1e-3)
+    refuses("E-SIGMA-VALUE … 10 … 100", Noise, camera_rad=1e-3, camera_mm=-1.0)
+    refuses("E-SIGMA-VALUE … corner_px … 0 … more … than 0", Noise, corner_px=0.0)
+    refuses("E-SIGMA-VALUE", Noise, 0.0, 0.1, 0.0, 0.1)
 
 
 def test_the_order_of_the_poses_makes_no_difference():

@@ -20,7 +20,6 @@ TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)
 
 
 def bound(truth, noise):
-    """Cramér–Rao: the inverse information of X with Z unknown, at the truth."""
     loop = Loop.of(truth.pairs, truth.setup)
     slope = loop.jacobian(truth.mount_from_camera)[:, :, :12]
     spread = components(loop, noise, truth.mount_from_camera).known

@@ -39,7 +39,6 @@ def outcome(request, truth) -> Outcome:
 
 
 def with_images(outcome: Outcome, folder) -> Outcome:
-    """Noise stands for photographs, the largest that fill a page most."""
     camera = outcome.views.camera
     noise = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), np.uint8)
     names = tuple(f"{i}.png" for i in range(len(outcome.pairs.names)))

@@ -70,7 +70,7 @@ def test_small_turns_are_named_with_the_axes_to_turn_about():
     assert found.word == "do not use"
 
 
-def test_a_fit_that_predicts_worse_than_it_promises():
+def test_errors_on_poses_held_out_decide():
     """Errors of poses held out, four times as large: less than one of 100 000 by chance."""
     outcome = outcome_of(16, 5)
     assert word_of(outcome, "Poses held out") == "good"
@@ -78,9 +78,6 @@ def test_a_fit_that_predicts_worse_than_it_promises():
     for factor, word in ((1.9, "use with care"), (4.0, "do not use")):
         worse = replace(held, translation_mm=factor * held.translation_mm)
         assert word_of(replace(outcome, held_out=worse), "Poses held out") == word
-
-
-def test_nothing_held_out_asks_for_care():
     outcome = replace(outcome_of(16, 5), held_out=None)
     assert judged(outcome).sentence() == "use with care: errors on poses held out are not known"
 
@@ -127,7 +124,6 @@ def test_the_share_of_the_transform_is_that_of_predictions():
 
 
 def test_poses_without_errors_are_not_tested():
-    """Nothing is divided by their residuals."""
     outcome = outcome_of(12, 3, method="park-martin", robot=(0, 0), camera=(0, 0))
     assert [each.title for each in judged(outcome).findings] == ["Motions of the flange", "Outliers"]
     assert judged(outcome).word == "good"

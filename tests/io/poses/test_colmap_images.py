@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.io.poses.programs import image_lines
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 A, B, C = (f"{i} 1 0 0 0 0 0 {i} 1 {name}\n" for i, name in ((1, "a.jpg"), (2, "b c.jpg"), (3, "0003")))
 
@@ -28,7 +28,5 @@ def test_every_image_is_read(text, followed, end):
 
 
 def test_a_line_of_another_form_is_named():
-    with fails_with("E-MODEL-UNREADABLE … line 2 … 2 cells"):
-        image_lines(f"{A}1.0 2.0\n{B}\n", "images.txt")
-    with fails_with("E-MODEL-UNREADABLE … line 3"):
-        image_lines(f"{A}\nno image\n", "images.txt")
+    refuses("E-MODEL-UNREADABLE … line 2 … 2 cells", image_lines, f"{A}1.0 2.0\n{B}\n", "images.txt")
+    refuses("E-MODEL-UNREADABLE … line 3", image_lines, f"{A}\nno image\n", "images.txt")

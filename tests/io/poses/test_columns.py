@@ -24,7 +24,6 @@ def read(header: str, *values: float, rotation: str | None = None):
 
 FANUC = about("z", 30) @ about("y", 20) @ about("x", 10)
 """Rz(R) Ry(P) Rx(W), FANUC's and Yaskawa's manuals; Rz(A) Ry(B) Rx(C), KUKA's."""
-AXIS = np.array([0.3, -0.4, 1.2])
 
 
 @pytest.mark.parametrize(
@@ -53,10 +52,7 @@ def test_conventions(header, values, rotation, expected):
 @pytest.mark.parametrize(
     ("header", "words"),
     [
-        (
-            "rx_deg,ry_deg,rz_deg",
-            "E-ROTATION-AMBIGUOUS … rx, ry, rz … --rot",
-        ),
+        ("rx_deg,ry_deg,rz_deg", "E-ROTATION-AMBIGUOUS … rx, ry, rz … --rot"),
         ("rx,ry,rz", "E-ROTATION-AMBIGUOUS … --rotation … ur-rotvec, yaskawa"),
         ("w_rad,p_rad,r_rad", "E-ROTATION-AMBIGUOUS … wpr"),
         ("a,b,c", "E-ROTATION-AMBIGUOUS … abc"),

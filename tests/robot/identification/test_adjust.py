@@ -11,7 +11,7 @@ from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, measured, placed
-from tests.outcome import fails_with
+from tests.outcome import refuses
 from tests.support.arms import TOOL, WORLD, seen_arm
 
 LENGTHS, ANGLES = [0, 2], [1, 3, 4]
@@ -82,7 +82,5 @@ def test_names_of_what_is_adjusted():
     assert adjusted("tool, base") == "base,tool"
     assert adjusted("base,zeros") == "zeros"
     assert adjusted("zeros,geometry") == "all"
-    with fails_with("E-OPTION-VALUE"):
-        adjusted("lengths")
-    with fails_with("E-OPTION-RANGE … 2"):
-        IdentifyOptions(model="auto", folds=0)
+    refuses("E-OPTION-VALUE", adjusted, "lengths")
+    refuses("E-OPTION-RANGE … 2", IdentifyOptions, model="auto", folds=0)

@@ -19,7 +19,6 @@ def kept(case, seeds) -> list[tuple[float, bool, int]]:
 
 
 def of(text: str):
-    """The case of the study with this line."""
     return next(case for case in study.CASES if case.title() == text)
 
 

@@ -118,7 +118,6 @@ JUMP = Rigid.exp([0, 0, 2e-3, 0.6, -0.8, 0])
 
 
 def moved_from(row: int, data: Measurements, by: Rigid) -> Measurements:
-    """The measurements with those from a row on moved, about the middle of all."""
     middle = Rigid(np.eye(3), data.points().mean(0))
     moved = middle @ by @ middle.inverse() @ data.poses()
     later = np.arange(len(data)) >= row

@@ -71,7 +71,6 @@ def test_rows_base_and_tools_make_the_poses_of_the_minimal_parameters(tmp_path):
 
 @pytest.fixture(scope="module")
 def exact_state():
-    """Identified without noise, with two targets."""
     return identify(mh80(), simulated(4, 40, 0, 0, targets=("a", "b"))[1], QUICK).state
 
 

@@ -123,8 +123,7 @@ def test_several_rows_that_are_far_off_are_named():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("mistaken", "named"),
-    [(WITH_ZERO, "theta of joint 4 … +90°"), (EXCHANGED, "rows 2 and 3 were exchanged")],
+    ("mistaken", "named"), [(WITH_ZERO, "theta of joint 4 … +90°"), (EXCHANGED, "rows 2 and 3 were exchanged")]
 )
 def test_a_mistake_is_named_beside_wrong_rows(mistaken, named):
     data = with_wrong_rows(seen(8, 40), [3, 20])

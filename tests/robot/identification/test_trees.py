@@ -33,7 +33,6 @@ from tests.support.arms import MARKERS, RIGHT, elastic, two_arms
 
 
 def apart(one: Robot, other: Robot, q: np.ndarray, name: str) -> np.ndarray:
-    """Between the poses of a marker in the frame of the instrument."""
     return (one.world_from_base @ forward(one, q, name)).difference(other.world_from_base @ forward(other, q, name))
 
 

@@ -93,7 +93,6 @@ def test_columns_that_nothing_reads_are_named_and_the_known_ones_are_not(data):
 
 
 def test_covariances_and_common_errors_are_known(data):
-    """As ``stcal-sfm measure`` writes them."""
     path = data.write("data.csv", POSE[3:])
     head, *rows = path.read_text().splitlines()
     covariance = np.diag([1e-8] * 3 + [1e-4] * 3)[np.triu_indices(6)]
@@ -146,7 +145,6 @@ def test_notes_of_sweeps(data, stcal_robot):
 
 
 def test_a_trackers_file_beside_joint_values(data, stcal_robot):
-    """Semicolons, another name for the key, metres."""
     names = [f"p{i}" for i in range(40)]
     rows = [[name, *map(repr, place.tolist())] for name, place in zip(names, data.seen.positions / 1000, strict=True)]
     text = "\n".join(["Name;X [m];Y [m];Z [m]", *map(";".join, rows)])

@@ -36,7 +36,6 @@ def arm(seed: int, joints: int, convention: str) -> Robot:
 
 
 def matrix(turn_z=0.0, z=0.0, x=0.0, turn_x=0.0, turn_y=0.0) -> dict[str, np.ndarray]:
-    """Rz, Tz, Tx, Rx, Ry as 4×4 matrices, written out."""
     (c, cx, cy), (s, sx, sy) = np.cos([turn_z, turn_x, turn_y]), np.sin([turn_z, turn_x, turn_y])
     return {
         "Rz": np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),

@@ -12,7 +12,7 @@ from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))
 POSES = Poses.of([Rigid.exp([0.1, 0.2, 0.3, 4, 5, 6]), Rigid.exp([-0.4, 0, 0.3, 40, 50, 60])])
@@ -58,13 +58,11 @@ def test_common_errors_of_poses(tmp_path):
     assert data.common == pytest.approx(common, rel=1e-5)
     assert data[1:].common == pytest.approx(common[1:], rel=1e-5)
     assert data.own_covariance() == pytest.approx(data.covariance - common @ np.swapaxes(common, 1, 2), rel=1e-5)
-    with fails_with("E-TABLE-COVARIANCE … line 2"):
-        read(tmp_path, common_text(4 * common))
+    refuses("E-TABLE-COVARIANCE … line 2", read, tmp_path, common_text(4 * common))
     with fails_with("E-TABLE-COLUMN-MISSING … common1_rx … common1_rx"):
         read(tmp_path, common_text(common, ["common1_r", *common_columns(3)[1:]]))
     without = ",".join(["q1_mm,q2_deg", *POSE, *common_columns(1)]) + "\n1,2,0,0,0,1,0,0,0,0,0,0,0,0,0\n"
-    with fails_with("E-TABLE-COVARIANCE"):
-        read(tmp_path, without)
+    refuses("E-TABLE-COVARIANCE", read, tmp_path, without)
 
 
 def test_distances_from_rows(tmp_path):

@@ -97,7 +97,6 @@ def test_joint_values_beside_poses_choose_the_branch(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["poses", "joint values"])
 def test_a_tool_that_the_nominal_file_lacks_is_the_identified_ones(case, by):
-    """Poses are commanded of one tool: as if both files had it."""
     path = case.write(list(POSE), case.pose_rows()) if by == "poses" else case.write(JOINTS, case.joint_rows())
     targets = read_targets(path, case.real)
     bare = replace(case.nominal, tools={"": Rigid()})

@@ -18,7 +18,7 @@ from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.robot.use.design import DesignOptions, choose, design
 from stcal.robot.use.report import design_report
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])
 ARM = replace(mh80(), tools={"": TOOL})
@@ -165,21 +165,15 @@ def test_what_no_pose_shows_is_left_out_and_told():
 
 
 def test_mistakes_are_named():
-    with fails_with("E-DESIGN-FEW … 8 … 3 … 27 … 9"):
-        design(ARM, DesignOptions(count=8, candidates=100))
-    with fails_with("E-DESIGN-OPTIONS"):
-        DesignOptions(count=50, candidates=50)
-    with fails_with("E-DESIGN-OPTIONS"):
-        DesignOptions(box=(0, 0, 0, 1, 1, -1))
-    with fails_with("E-SIGMA-VALUE"):
-        DesignOptions(sigma_mm=0)
-    with fails_with("E-SIGMA-VALUE"):
-        DesignOptions(sigma_mm=1e308)
+    refuses("E-DESIGN-FEW … 8 … 3 … 27 … 9", design, ARM, DesignOptions(count=8, candidates=100))
+    refuses("E-DESIGN-OPTIONS", DesignOptions, count=50, candidates=50)
+    refuses("E-DESIGN-OPTIONS", DesignOptions, box=(0, 0, 0, 1, 1, -1))
+    refuses("E-SIGMA-VALUE", DesignOptions, sigma_mm=0)
+    refuses("E-SIGMA-VALUE", DesignOptions, sigma_mm=1e308)
     with fails_with("E-DESIGN-BOX … 0 … 5000"):
         design(ARM, DesignOptions(count=10, candidates=50, box=(5000, 0, 0, 6000, 1, 1)))
     sliding = replace(ARM, joints=(*ARM.joints[:2], Joint("prismatic"), *ARM.joints[3:]))
-    with fails_with("E-ROBOT-LIMITS … 3"):
-        design(sliding)
+    refuses("E-ROBOT-LIMITS … 3", design, sliding)
 
 
 def test_command_line(tmp_path, stcal_robot):

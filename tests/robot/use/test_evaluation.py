@@ -17,7 +17,7 @@ from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.report import evaluated_csv, evaluation_file, evaluation_report, names_of
 from stcal.robot.use.verification import read_measured, verify
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.robot.identification.test_solve import rokae
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
@@ -182,17 +182,12 @@ def test_distances_have_their_own_errors(refit):
 def test_another_arm_is_refused_in_one_line():
     data = seen(arm(), 9)
     other = Robot("other", "standard", mh80().rows[:3], (Joint(),) * 3)
-    with fails_with("E-ROBOT-MISMATCH … 6 … 3"):
-        evaluate({"a": arm(), "b": other}, data)
+    refuses("E-ROBOT-MISMATCH … 6 … 3", evaluate, {"a": arm(), "b": other}, data)
     rows = tuple(replace(row, alpha=-row.alpha) for row in mh80().rows)
-    with fails_with("E-IDENTIFY-MISFIT"):
-        evaluate({"a": arm(), "b": replace(mh80(), rows=rows)}, data)
-    with fails_with("E-IDENTIFY-MISFIT"):
-        evaluate({"a": mh80()}, data, "none")
-    with fails_with("E-ROBOT-NO-TOOL … 'ball'"):
-        evaluate({"a": arm()}, replace(data, targets=("ball",) * 40), "base")
-    with fails_with("E-IDENTIFY-FEW … 3 … position … 9 … 9 … base and tool"):
-        evaluate({"a": arm()}, data[:3])
+    refuses("E-IDENTIFY-MISFIT", evaluate, {"a": arm(), "b": replace(mh80(), rows=rows)}, data)
+    refuses("E-IDENTIFY-MISFIT", evaluate, {"a": mh80()}, data, "none")
+    refuses("E-ROBOT-NO-TOOL … 'ball'", evaluate, {"a": arm()}, replace(data, targets=("ball",) * 40), "base")
+    refuses("E-IDENTIFY-FEW … 3 … position … 9 … 9 … base and tool", evaluate, {"a": arm()}, data[:3])
 
 
 def test_files_are_called_by_their_names():

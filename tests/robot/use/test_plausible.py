@@ -18,7 +18,6 @@ TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])
 
 
 def arm(seed: int, size: float = 1.0) -> Robot:
-    """Of other lengths."""
     rng, nominal = np.random.default_rng(seed), mh80()
     rows = (
         replace(r, a=r.a * size * rng.uniform(0.7, 1.3), d=r.d * size * rng.uniform(0.7, 1.3)) for r in nominal.rows

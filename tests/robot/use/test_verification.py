@@ -9,7 +9,7 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.robot.use.report import verification_report
 from stcal.robot.use.verification import MeasuredPoses, Verification, read_measured, verification_file, verify
-from tests.outcome import fails_with
+from tests.outcome import refuses
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
 COMMANDED = np.array([[0, 0, 0], [30, 0, 0], [0, 40, 0], [0, 0, 50], [60, 80, 0]], float)
@@ -91,25 +91,20 @@ def test_poses_by_name_in_any_order(tmp_path):
     twice = verify(read_measured(written(tmp_path, [*lines_of("before"), lines_of("before")[0]])))
     assert len(twice.poses) == 6  # without names the same command twice is two poses
     assert twice.sets[0].error_mm[-1] == pytest.approx(0, abs=1e-9)
-    with fails_with("E-TABLE-ROW-REPEATED … 7 … before … 2"):
-        read_measured(written(tmp_path, [*before, before[0]], head))
+    refuses("E-TABLE-ROW-REPEATED … 7 … before … 2", read_measured, written(tmp_path, [*before, before[0]], head))
     moved = [row.replace("after,30", "after,31") for row in after]
-    with fails_with("E-VERIFY-COMMANDED … 1 … before … after"):
-        verify(read_measured(written(tmp_path, before + moved, head)))
+    refuses("E-VERIFY-COMMANDED … 1 … before … after", verify, read_measured(written(tmp_path, before + moved, head)))
 
 
 def test_too_few_and_other_units_are_named(tmp_path):
-    with fails_with("E-VERIFY-FEW … 2 … before"):
-        verify(read_measured(written(tmp_path, lines_of("before")[:2])))
+    refuses("E-VERIFY-FEW … 2 … before", verify, read_measured(written(tmp_path, lines_of("before")[:2])))
     inches = written(tmp_path, lines_of("before"), HEAD.replace(",x_mm,y_mm,z_mm", ",x_in,y_in,z_in"))
     [warning] = verify(read_measured(inches)).warnings()
     assert "times the commanded ones; check units" in warning
     assert verify(read_measured(written(tmp_path, lines_of("before")))).warnings() == []
     still = [f"before,1,2,3,{i},0,0" for i in range(4)]
-    with fails_with("E-VERIFY-ALIKE"):
-        verify(read_measured(written(tmp_path, still)))
-    with fails_with("E-TABLE-COLUMN-MISSING … commanded_x_mm"):
-        read_measured(written(tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm"))
+    refuses("E-VERIFY-ALIKE", verify, read_measured(written(tmp_path, still)))
+    refuses("E-TABLE-COLUMN-MISSING … commanded_x_mm", read_measured, written(tmp_path, ["1,2,3"], "x_mm,y_mm,z_mm"))
 
 
 def test_no_error_at_all_gives_no_reduction(tmp_path):
@@ -162,9 +157,7 @@ def ten_of_two_sets(first, second) -> Verification:
     measured = [commanded + rng.normal(0, sigma, commanded.shape) for sigma in (first, second)]
     names = tuple(map(str, range(10))) * 2
     sets = ("before",) * 10 + ("after",) * 10
-    return verify(
-        MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)),
-    )
+    return verify(MeasuredPoses("t", range(2, 22), sets, names, np.tile(commanded, (2, 1)), np.concatenate(measured)))
 
 
 def test_sets_in_the_wrong_order_and_positions_that_are_copies_are_named():

@@ -43,7 +43,6 @@ def state_of(case, refined=False, common=None, board=None, camera=None):
 
 
 def shift(case, changed, common) -> np.ndarray:
-    """What the circles do, less their motion as one."""
     before = state_of(case, common=common).shared.xyz_model
     free = free_motions(before, scale=False)
     moved = (changed.shared.xyz_model - before).ravel()

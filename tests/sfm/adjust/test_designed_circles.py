@@ -35,7 +35,6 @@ def scene():
 
 @pytest.fixture(scope="module")
 def whole(scene, labels_only):
-    """With all circles in view."""
     return calibrated(scene, labels_only, ()).target
 
 

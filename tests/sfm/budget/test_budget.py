@@ -18,7 +18,7 @@ from stcal.sfm.budget.lengths import against_stated
 from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
-from stcal.sfm.runs.saved import load_run, verify
+from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import MarkerFile
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
@@ -38,11 +38,6 @@ expansion_sigma_ppm_per_k = 1.0
 temperature_c = 22.0
 temperature_sigma_k = 1.0
 """
-
-
-@pytest.fixture(scope="module")
-def saved(small_run):
-    return load_run(small_run)
 
 
 @pytest.fixture(scope="module")

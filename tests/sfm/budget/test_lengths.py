@@ -11,15 +11,9 @@ from stcal.errors import StcalError
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.lengths import SHARED, against_run, against_stated
 from stcal.sfm.budget.sources import statement_of
-from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error
 
 PITCH = "[board]\npitch_sigma_ppm = 50.0\n"
-
-
-@pytest.fixture(scope="module")
-def saved(small_run):
-    return load_run(small_run)
 
 
 @pytest.fixture(scope="module")

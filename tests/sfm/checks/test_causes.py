@@ -39,8 +39,6 @@ def first(scene, lab, images, camera=None, board=None):
 
 
 def of_file(**change):
-    """A camera file that is wrong."""
-
     def plant(scene, images):
         camera = scene.camera
         made = {key: make(np.asarray(getattr(camera, key)), camera) for key, make in change.items()}

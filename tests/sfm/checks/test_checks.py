@@ -68,7 +68,6 @@ class Lab:
         return np.array([ellipse_of_conic(conic)[1] for conic in conics])
 
     def check(self, scene, images, camera=None, board=None, solve="chain"):
-        """All checks by key."""
         camera, board = camera or scene.camera, board or scene.board
         refined, calibration, options = self.calibrate(scene, images, camera, board, solve)
         models = tuple(each.model for each in refined)
@@ -78,7 +77,6 @@ class Lab:
         return {check.key: check for check in run_checks(evidence)}
 
     def calibrate(self, scene, images, camera=None, board=None, solve="chain"):
-        """Refined groups, their calibration, and its options."""
         camera, board = camera or scene.camera, board or scene.board
         refined = [refine(m, camera, scene.target, board) for m in self.labels_only.models(scene, images)]
         options = AdjustOptions(scene.target.faces[0].id, solve)

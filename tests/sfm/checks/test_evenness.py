@@ -36,7 +36,6 @@ class Group:
         return evenness_check([self.network], images, self.camera)
 
     def in_all(self):
-        """Labels that all images show."""
         return sorted(set.intersection(*(set(image.labels) for image in self.images)))
 
 

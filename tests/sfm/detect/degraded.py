@@ -30,11 +30,9 @@ class Outcome:
     counts: dict
 
     def labels(self, name: str, plane: str = "") -> set[str]:
-        """Of an image, on one plane or all."""
         return {label for label in self.images[name].observations.labels if plane in ("", label.plane)}
 
     def notes(self) -> str:
-        """Of all images, one a line."""
         return "\n".join(note for image in self.images.values() for note in image.notes)
 
     def assert_all_found(self, share: float = 1.0) -> None:
@@ -52,7 +50,6 @@ class Bench:
         self.data, self.folder = data, folder
 
     def groups(self, *names: str) -> RenderedSet:
-        """The set with some of its groups."""
         own = {name: self.data.truth["groups"][name] for name in names}
         photographs = tuple(p for p in self.data.photographs if p.group in names)
         return replace(self.data, truth=self.data.truth | {"groups": own}, photographs=photographs)

@@ -239,9 +239,6 @@ def test_patterns_of_which_the_same_is_said_make_one_note(scene, group):
     assert [note.partition("(")[2] for note in found.notes if "may be another" in note] == ["3 times)"]
 
 
-# --- the numbering of the board ---
-
-
 def numbered(image, numberings) -> ImageDetection:
     """With other numberings of its board, made of the true one and that after half a turn."""
     seen = Seen(image)

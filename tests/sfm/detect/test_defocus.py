@@ -28,7 +28,6 @@ def scene():
 
 
 def seen(scene, image, lens=None, noise=0.0):
-    """The labelled circles of the faces in one image."""
     options = RenderOptions(seed=3, noise=noise, lens=lens, clutter=False)
     picture = render(scene, GROUP, image, options)
     detection = detect_image(picture, scene.camera, scene.target, None, EllipseOptions())
@@ -37,7 +36,6 @@ def seen(scene, image, lens=None, noise=0.0):
 
 @pytest.fixture(scope="module")
 def pairs(scene):
-    """Each image through a lens, and its pinhole twin."""
     return [(seen(scene, i, LENS), seen(scene, i)) for i in range(2)]
 
 

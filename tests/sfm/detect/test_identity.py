@@ -29,7 +29,6 @@ def pose(tilt_deg=40.0, azimuth_deg=30.0, roll_deg=0.0, x=0.0, y=0.0, depth=1000
 
 
 def ellipses_of(camera_from_plane, xy_mm, radius_mm, contrast=100.0):
-    """Exact ellipses of circles in a plane."""
     centres, shapes = [], []
     for (x, y), r in zip(xy_mm, radius_mm, strict=True):
         conic = circle_conic(camera_from_plane @ np.array([x, y, 0.0]), camera_from_plane.rotation[:, 2], r)

@@ -64,7 +64,6 @@ def test_a_mirror_at_another_place_in_every_group_gives_no_wrong_label(bench):
 
 @pytest.fixture(scope="module")
 def two_groups(scene, labels_only):
-    """Exact observations of groups 12 and 23."""
     seen = labels_only.observations(scene, 0.003, np.random.default_rng(0))
     return [[o for o in seen if o.group == group] for group in scene.groups if "2" in group]
 

@@ -22,14 +22,12 @@ class Group:
         self.patterns = patterns_of(scene.target, scene.board)
 
     def move_px(self, image, label, by_px):
-        """The centre of a circle in one image."""
         seen = self.images[image]
         centre = seen.centre.copy()
         centre[list(seen.labels).index(label)] += np.array(by_px) / FOCAL_PX
         self.images[image] = replace(seen, centre=centre)
 
     def move_mm(self, image, label, by_mm):
-        """A circle in its plane."""
         seen, face = self.images[image], TARGET.face(label.split(":")[0])
         own = [i for i, x in enumerate(seen.labels) if x.plane == face.id]
         xy = face.xy_mm[[face.ids.index(seen.labels[i].circle) for i in own]]
@@ -39,7 +37,6 @@ class Group:
         self.move_px(image, label, shift[0] * FOCAL_PX)
 
     def keep_only(self, face, images):
-        """The face in these images alone."""
         for i, seen in enumerate(self.images):
             if i not in images:
                 rows = np.array([k for k, label in enumerate(seen.labels) if label.plane != face])

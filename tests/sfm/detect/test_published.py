@@ -16,7 +16,6 @@ BITS = 8
 
 
 def drawn(ellipses, grey=200):
-    """The ellipses in an image of the camera's size."""
     image = np.full((CAMERA.height, CAMERA.width), 20, np.uint8)
     for centre, shape in zip(ellipses.centre_px, ellipses.shape_px, strict=True):
         values, axes = np.linalg.eigh(shape)

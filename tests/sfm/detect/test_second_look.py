@@ -54,7 +54,6 @@ class FirstLook:
         self.shape_px[circle] = self.shape_px[circle] @ narrower
 
     def taken_out(self):
-        """Circles that the others of their plane contradict, and why."""
         centre = CAMERA.normalised_from_pixel(self.centre_px)
         by_ideal = CAMERA.focal[:, None] * CAMERA.distort_jacobian(centre)[1]
         shape = np.linalg.solve(by_ideal, self.shape_px)
@@ -165,7 +164,6 @@ def dim(cell):
 
 
 def invert(cell):
-    """A dark circle on bright ground."""
     cell[:] = 1 - cell
 
 
@@ -235,7 +233,6 @@ def test_circles_of_other_sizes_than_the_options_ask_for_are_not_measured():
 
 
 def centres(n):
-    """Of any circles."""
     return centres_of(np.ones((n, 2)), np.ones((n, 2)))
 
 

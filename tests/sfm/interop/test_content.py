@@ -15,8 +15,6 @@ from tests.shared import own_copy
 
 @pytest.fixture
 def spoilt(small_run, tmp_path):
-    """A copy of the small run's database after a statement."""
-
     def copy(statement: str) -> Path:
         database = own_copy(small_run / "colmap/database.db", tmp_path)
         with closing(sqlite3.connect(database)) as opened, opened:
@@ -99,10 +97,7 @@ NOT_OF_THE_RUN = {
     "params": ("UPDATE cameras SET params = zeroblob(64)", "E-RUN-DATABASE … database.db"),
     "size": ("UPDATE cameras SET width = 10", "E-RUN-DATABASE … database.db"),
     "no pairs": ("DELETE FROM two_view_geometries", "E-RUN-DATABASE … database.db … two_view_geometries"),
-    "a pair less": (
-        f"DELETE FROM matches {MATCHES}",
-        "E-RUN-DATABASE … database.db … matches … 27 … 28",
-    ),
+    "a pair less": (f"DELETE FROM matches {MATCHES}", "E-RUN-DATABASE … database.db … matches … 27 … 28"),
     "a match less": (
         f"UPDATE matches SET rows = rows - 1, data = substr(data, 9) {MATCHES}",
         "E-RUN-DATABASE … database.db … matches … 12/IMG_1000.jpg … 12/IMG_1001.jpg",

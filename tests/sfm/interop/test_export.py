@@ -25,7 +25,6 @@ FLOAT_MM = 1e-4
 
 @pytest.fixture(scope="module")
 def files(small_run, tmp_path_factory):
-    """Path by form."""
     folder = tmp_path_factory.mktemp("exported")
     return {name: export_run(small_run, folder / f"box{form.suffix}", name="box").path for name, form in FORMS.items()}
 

@@ -21,7 +21,7 @@ import pytest
 
 from stcal.errors import InputError, StcalError
 from stcal.sfm.interop import export_database as export
-from stcal.sfm.interop.export_database import copy_database, table_differences
+from stcal.sfm.interop.export_database import copy_database
 from stcal.sfm.interop.schema import SCHEMAS, schema_of_version
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with
@@ -79,7 +79,6 @@ def state_of(folder) -> dict[str, str]:
 
 @pytest.fixture
 def database(small_run, tmp_path):
-    """A copy of the small run's database in a folder of its own."""
     (tmp_path / "run").mkdir()
     return own_copy(small_run / "colmap/database.db", tmp_path / "run")
 
@@ -116,7 +115,6 @@ def empty_database(schema, path) -> None:
 
 
 def native_colmap() -> str:
-    """Native COLMAP 3.8, as Debian has it."""
     colmap = shutil.which("colmap")
     if colmap is None:
         pytest.skip("native colmap is not on PATH")
@@ -243,45 +241,10 @@ def test_pycolmap_makes_the_same_model_of_the_export(small_run, tmp_path):
         assert all(np.array_equal(ours[track], theirs[track]) for track in ours)
 
 
-def test_native_colmap_maps_the_export(small_run, tmp_path):
-    """Debian's 3.8 with thresholds for few points: every image of the group, every circle."""
-    colmap = native_colmap()
-    names, pair = first_group(small_run)
-    copy_database(small_run / "colmap/database.db", tmp_path / "out.db", "3.8")
-    (tmp_path / "names.txt").write_text("\n".join(names) + "\n")
-    (tmp_path / "model").mkdir()
-    options = pipeline_options(names, pair)
-    given = {
-        "init_image_id1": pair[0],
-        "init_image_id2": pair[1],
-        "min_num_matches": options.min_num_matches,
-        "min_model_size": options.min_model_size,
-        "init_min_num_inliers": options.mapper.init_min_num_inliers,
-        "init_min_tri_angle": options.mapper.init_min_tri_angle,
-        "abs_pose_min_num_inliers": options.mapper.abs_pose_min_num_inliers,
-        "filter_min_tri_angle": options.mapper.filter_min_tri_angle,
-        **dict.fromkeys(["multiple_models", "extract_colors", "ba_refine_focal_length", "ba_refine_extra_params"], 0),
-    }
-    arguments = [str(part) for key, value in given.items() for part in (f"--Mapper.{key}", value)]
-    paths = ["--database_path", "out.db", "--image_path", ".", "--output_path", "model"]
-    command = [colmap, "mapper", *paths, "--image_list_path", "names.txt", *arguments]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert ended.returncode == 0, ended.stderr
-    model = pycolmap.Reconstruction(str(tmp_path / "model" / "0"))
-    assert {image.name for image in model.images.values() if image.has_pose} == set(names)
-    assert model.num_points3D() >= 80
-    assert 0 < model.compute_mean_reprojection_error() < 0.1
-
-
 PAIR = "UPDATE two_view_geometries SET {} WHERE pair_id = (SELECT max(pair_id) FROM two_view_geometries)"
 SECOND_CAMERA = "INSERT INTO cameras SELECT 2, model, width, height, params, prior_focal_length FROM cameras"
 REFUSALS = {
-    "EUCM": (
-        ["UPDATE cameras SET model = 16, params = zeroblob(48)"],
-        "4.0",
-        "E-SCHEMA-NO-PLACE … 1 … 16",
-        "4.2",
-    ),
+    "EUCM": (["UPDATE cameras SET model = 16, params = zeroblob(48)"], "4.0", "E-SCHEMA-NO-PLACE … 1 … 16", "4.2"),
     "division": (
         ["UPDATE cameras SET model = 12, params = zeroblob(32)"],
         "3.13",
@@ -303,24 +266,14 @@ REFUSALS = {
         "E-SCHEMA-NO-PLACE … 1",
         "4.0",
     ),
-    "pair camera": (
-        [PAIR.format("camera2 = x'00'")],
-        "4.0",
-        "E-SCHEMA-NO-PLACE … 1",
-        "4.2",
-    ),
+    "pair camera": ([PAIR.format("camera2 = x'00'")], "4.0", "E-SCHEMA-NO-PLACE … 1", "4.2"),
     "two sensors": (
         [SECOND_CAMERA, "INSERT INTO rig_sensors VALUES (1, 2, 0, NULL)"],
         "3.11",
         "E-SCHEMA-NO-PLACE … 1",
         "3.12",
     ),
-    "IMU": (
-        ["UPDATE rigs SET ref_sensor_type = 1"],
-        "3.11",
-        "E-SCHEMA-NO-PLACE … 1",
-        "3.12",
-    ),
+    "IMU": (["UPDATE rigs SET ref_sensor_type = 1"], "3.11", "E-SCHEMA-NO-PLACE … 1", "3.12"),
     "frame of two": (
         [
             SECOND_CAMERA,
@@ -387,10 +340,11 @@ def refused(tmp_path):
     return message
 
 
-def test_an_unknown_schema_lists_the_known_ones(database, refused):
+def test_an_unknown_schema_and_a_folder_that_is_not_there(database, refused):
     assert refused(database, schema="3.7") == (
         "schema 3.7: unknown; give one of 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0, 4.2"
     )
+    assert re.search(r"out\.db: no folder .*/none; make it", refused(database, out="none/out.db"))
 
 
 def test_nothing_is_overwritten(database, refused, tmp_path):
@@ -402,17 +356,10 @@ def test_nothing_is_overwritten(database, refused, tmp_path):
     assert "out.db: exists" in refused(database.parent / "none.db")  # told before anything is read
 
 
-def test_a_folder_that_is_not_there(database, refused):
-    assert re.search(r"out\.db: no folder .*/none; make it", refused(database, out="none/out.db"))
-
-
-def test_a_database_that_pycolmap_has_open(database, refused):
+def test_a_database_in_use_or_left_with_side_files(database, refused):
     with closing(pycolmap.Database.open(str(database))):
         assert "database.db: in use by another program (database.db-wal, database.db-shm" in refused(database)
     assert "Exported" in repr(copy_database(database, database.parent / "out.db", "3.8"))
-
-
-def test_side_files_of_a_program_that_did_not_end_well(database, refused):
     Path(f"{database}-journal").write_bytes(b"")
     assert "in use by another program (database.db-journal beside it); close it" in refused(database)
 
@@ -434,23 +381,17 @@ def test_a_database_that_is_locked(database, refused):
         other.stdin.close()
 
 
-def spoil(database, how):
-    data = bytearray(database.read_bytes())
-    match how:
-        case "text":
-            data = b"this is not a database"
-        case "empty":
-            data = b""
-        case "cut short":
-            data = data[: len(data) // 2]
-        case "overwritten":
-            data[4096 * 5 : 4096 * 20] = b"\xff" * (4096 * 15)
-    database.write_bytes(data)
+DAMAGE = {
+    "text": lambda data: b"this is not a database",
+    "empty": lambda data: b"",
+    "cut short": lambda data: data[: len(data) // 2],
+    "overwritten": lambda data: data[: 4096 * 5] + b"\xff" * (4096 * 15) + data[4096 * 20 :],
+}
 
 
-@pytest.mark.parametrize("how", ["text", "empty", "cut short", "overwritten"])
+@pytest.mark.parametrize("how", DAMAGE)
 def test_a_damaged_database(how, database, refused):
-    spoil(database, how)
+    database.write_bytes(DAMAGE[how](database.read_bytes()))
     assert re.search(r"database\.db: damaged \(.+\); make the run again", refused(database))
 
 
@@ -568,13 +509,3 @@ def test_the_command_says_what_it_wrote(stcal_sfm, small_run, tmp_path):
     assert out.splitlines()[0] == "schema 3.8, checked: 8 images, 28 pairs, camera model OPENCV"
     assert str(tmp_path / "out.db") in out.splitlines()[1]
     assert state_of(small_run) == before
-
-
-def test_differences_are_told_column_by_column():
-    older, newer = SCHEMAS["3.8"], SCHEMAS["3.11"]
-    assert table_differences(older.tables, older) == []
-    priors = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
-    assert table_differences(older.tables, newer) == [
-        *(f"table images has prior_{name} REAL in place of no column" for name in priors),
-        "table pose_priors is missing",
-    ]

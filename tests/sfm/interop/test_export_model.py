@@ -28,7 +28,6 @@ FORMATS = ("colmap-bin", "colmap-txt", "nvm", "bundler")
 
 @pytest.fixture(scope="module")
 def exported(small_run, tmp_path_factory):
-    """Path of the exported model by format."""
     folder = tmp_path_factory.mktemp("exported")
     paths = {kind: folder / f"model.{kind}" for kind in FORMATS}
     for kind, path in paths.items():
@@ -63,7 +62,6 @@ def keypoints(small_run):
 
 @pytest.fixture
 def own(small_run, tmp_path):
-    """A copy of the small run, whose files may be changed."""
     return unsealed_copy(small_run, tmp_path / "run")
 
 
@@ -75,9 +73,6 @@ def labels_of(path) -> list[dict]:
 
 def xyz_of(row: dict) -> np.ndarray:
     return np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
-
-
-# --- readers, from the formats' documents -----------------------------------------------------------------------------
 
 
 def read_nvm(path):
@@ -143,9 +138,6 @@ def project_bundler(camera, xyz):
     return -f * p[:2] / p[2]
 
 
-# --- COLMAP -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["colmap-bin", "colmap-txt"])
 def test_colmap_has_the_runs_circles_poses_and_keypoints(exported, known, keypoints, kind):
     faces, scene, poses = known
@@ -195,9 +187,6 @@ def test_native_colmap_reads_it(exported, kind, tmp_path):
         if not line.startswith("#"):
             point_id, *xyz = line.split()[:4]
             assert np.abs(np.array(xyz, float) - ours.point3D(int(point_id)).xyz).max() < 1e-9
-
-
-# --- the other formats ------------------------------------------------------------------------------------------------
 
 
 def test_faces_and_board_differ_in_colour(exported):
@@ -313,9 +302,6 @@ def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(own, tmp_path):
     export_model(own, tmp_path / "model.nvm", "nvm")
     assert '\n12/IMG"1000.jpg ' in (tmp_path / "model.nvm").read_text(encoding="utf-8")
     assert "12/IMG 1000.jpg" in {name for name, *_ in read_nvm(tmp_path / "model.nvm")[0]}
-
-
-# --- the command ------------------------------------------------------------------------------------------------------
 
 
 def test_the_command(small_run, stcal_sfm, tmp_path):

@@ -14,7 +14,6 @@ from tests.shared import own_copy, unsealed_copy
 
 @pytest.fixture(scope="module")
 def own_run(small_run, tmp_path_factory):
-    """A copy of the small run; every test writes its model anew."""
     folder = tmp_path_factory.mktemp("fit") / "run"
     unsealed_copy(small_run, folder, ignore=shutil.ignore_patterns("cache", "overlays"))
     return folder
@@ -22,8 +21,6 @@ def own_run(small_run, tmp_path_factory):
 
 @pytest.fixture
 def changed(small_run, own_run):
-    """The copy with the small run's model after a change."""
-
     def change(spoil):
         model = pycolmap.Reconstruction(str(small_run / "colmap/target_model"))
         spoil(model)
@@ -83,29 +80,14 @@ def other_keypoint(model) -> None:
 
 
 CASES = {
-    "mirrored": (
-        move_points(lambda xyz: xyz * [-1, 1, 1]),
-        "E-MODEL-NOT-OF-RUN",
-    ),
+    "mirrored": (move_points(lambda xyz: xyz * [-1, 1, 1]), "E-MODEL-NOT-OF-RUN"),
     "mirrored through the origin": (behind, "E-MODEL-NOT-OF-RUN"),
-    "a point by 0.1 mm": (
-        move_point([0.1, 0, 0]),
-        "E-MODEL-NOT-OF-RUN",
-    ),
+    "a point by 0.1 mm": (move_point([0.1, 0, 0]), "E-MODEL-NOT-OF-RUN"),
     "a pose by 30 mm": (move_camera([0, 0, 30]), "E-MODEL-NOT-OF-RUN"),
-    "all by 5 mm": (
-        transformed(1.0, [5.0, 0, 0]),
-        "E-MODEL-NOT-OF-RUN … 12/IMG_1000.jpg … 5 … report.json",
-    ),
-    "larger by 1e-6": (
-        transformed(1 + 1e-6, [0.0, 0, 0]),
-        "E-MODEL-NOT-OF-RUN … report.json",
-    ),
+    "all by 5 mm": (transformed(1.0, [5.0, 0, 0]), "E-MODEL-NOT-OF-RUN … 12/IMG_1000.jpg … 5 … report.json"),
+    "larger by 1e-6": (transformed(1 + 1e-6, [0.0, 0, 0]), "E-MODEL-NOT-OF-RUN … report.json"),
     "a point gone": (without_a_point, "E-MODEL-NOT-OF-RUN … 12/IMG_1000.jpg … report.json"),
-    "a keypoint": (
-        other_keypoint,
-        "E-MODEL-NOT-OF-RUN … 12/IMG_1001.jpg … 3 … 0.002",
-    ),
+    "a keypoint": (other_keypoint, "E-MODEL-NOT-OF-RUN … 12/IMG_1001.jpg … 3 … 0.002"),
 }
 
 

@@ -9,14 +9,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import align_similarity
-from stcal.sfm.mapping.database import (
-    from_colmap_px,
-    image_ids,
-    labels_csv,
-    match_labels,
-    to_colmap_px,
-    write_database,
-)
+from stcal.sfm.mapping.database import from_colmap_px, image_ids, labels_csv, match_labels, to_colmap_px, write_database
 from stcal.sfm.mapping.incremental import map_group
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.mapping.pairs import PairOptions, image_graph, rank_pairs

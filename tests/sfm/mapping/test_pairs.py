@@ -64,22 +64,16 @@ def test_a_camera_that_did_not_move(scene, group):
         rank_pairs(still, scene.camera, PairOptions())
 
 
-def test_a_camera_that_only_turned(scene, group):
+def test_groups_without_an_initial_pair_say_why(scene, group):
     turned = []
     for i, angle in enumerate((0.0, 0.05, 0.1)):
         rays = np.column_stack([group[0].centre, np.ones(len(group[0]))]) @ Rigid.exp([0, angle, 0, 0, 0, 0]).rotation.T
         turned.append(replace(group[0], name=f"12/{i}", centre=rays[:, :2] / rays[:, 2:]))
     with fails_with("E-MAPPING-NO-PAIR"):
         rank_pairs(turned, scene.camera, PairOptions())
-
-
-def test_too_few_labels_in_common(scene, group):
     few = [group[0].select(range(6)), group[1].select(range(6, 12))]
     with fails_with("E-MAPPING-NO-PAIR … 8"):
         rank_pairs(few, scene.camera, PairOptions())
-
-
-def test_every_angle_over_the_limit(scene, group):
     with fails_with("E-MAPPING-NO-PAIR … --max-angle"):
         rank_pairs(group[:2], scene.camera, PairOptions(np.radians(1.5)))
 

@@ -178,7 +178,6 @@ def test_every_picture_of_a_video_is_read(tmp_path):
 
 
 def live(small_run, *words):
-    """What the command printed, which ends with the pictures."""
     files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json", "--port", "0"]
     result = CliRunner().invoke(app, ["sfm", "measure", "--live", *map(str, [*files, *words])], catch_exceptions=False)
     assert result.exit_code == 0, result.output

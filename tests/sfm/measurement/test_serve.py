@@ -58,10 +58,7 @@ def test_pages_get_the_newest_picture_and_the_last_one_before_the_end():
 
 @pytest.mark.parametrize(
     ("host", "code"),
-    [
-        ("0.0.0.0", "E-OPTION-NEEDS … --host 0.0.0.0 … --token"),
-        ("999.1.1.1", "E-SERVICE-ADDRESS … --host 999.1.1.1"),
-    ],
+    [("0.0.0.0", "E-OPTION-NEEDS … --host 0.0.0.0 … --token"), ("999.1.1.1", "E-SERVICE-ADDRESS … --host 999.1.1.1")],
 )
 def test_addresses_at_which_none_listens(host, code):
     with fails_with(code), served(LiveService(None), host, 0):

@@ -125,7 +125,6 @@ def test_forecast_is_the_spread_of_simulations(exact, common, draws):
 
 
 def joined(model: MetricModel, new: MetricModel) -> MetricModel:
-    """A group's model with the images of another model of it."""
     names = ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
     return replace(
         model,
@@ -137,7 +136,6 @@ def joined(model: MetricModel, new: MetricModel) -> MetricModel:
 
 
 def doubled(model: MetricModel) -> MetricModel:
-    """Every image taken twice."""
     return joined(model, replace(model, images=tuple(f"{name} again" for name in model.images)))
 
 
@@ -206,7 +204,6 @@ def advice(known):
 
 
 def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
-    """The forecast with further views, made anew."""
     models = {model.group: model for model in known.models}
     for view in views:
         models[view.group] = joined(models[view.group], view.model)
@@ -252,7 +249,6 @@ def test_advised_views_do_what_is_said(known, advice):
 
 
 def offered(known):
-    """Candidates of each group."""
     return [(model, candidates(known.scene, model, known.setup, known.noise)) for model in known.models]
 
 
@@ -268,7 +264,6 @@ def test_an_advised_view_beats_a_random_one(known, advice):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """A handful of candidates for each group."""
     monkeypatch.setattr(views, "GRID_DEG", 50.0)
 
 
@@ -446,7 +441,6 @@ def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigm
 
 
 def test_plan_remedies_are_plans_of_their_own():
-    """Twice the images is what a plan with twice the images says."""
     two, four = plan(), plan(images=4)
     assert two.remedies[0].sigma_mm == pytest.approx(four.forecast.worst()[1], rel=1e-9)
     assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95

@@ -42,7 +42,6 @@ def test_what_faces_json_may_not_hold(small_run, small_dataset, tmp_path, spoil,
 
 
 def scaled(content: dict, factor: float, keys=("circles", "target_from_face")) -> dict:
-    """Lengths times a factor."""
     content = json.loads(json.dumps(content))
     if "circles" in keys:
         content["circles"] = {label: [factor * v for v in xyz] for label, xyz in content["circles"].items()}
@@ -79,7 +78,6 @@ def test_a_run_of_another_size_is_compared(small_run, small_dataset, tmp_path, f
 
 
 def test_labels_that_cannot_be_compared_are_said(small_run, small_dataset, tmp_path):
-    """A run without its table of labels, or with a damaged one."""
     run = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
     assert compare(run, small_dataset / "truth.json").labels is not None
     (run / "labels.csv").write_text("image,label\n12/IMG_1000.jpg,1:a\n")

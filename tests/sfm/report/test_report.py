@@ -9,12 +9,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from stcal.report.document import environment
 from stcal.report.svg import Drawing, round_below
-from stcal.report.text import number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
 from stcal.sfm.report.page import report_html
@@ -201,7 +198,6 @@ def page(request) -> str:
 
 
 def rows_of(page: str, section: str) -> list[list[str]]:
-    """Cells of all table rows of a section, without markup."""
     part = page.split(f'<section id="{section}">')[1].split("</section>")[0]
     lines = re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
     return [
@@ -309,23 +305,9 @@ def test_left_out_with_reasons():
     assert ["1", "group a: face <6> has no frame"] in rows
 
 
-@pytest.mark.parametrize(
-    ("value", "digits", "text"),
-    [(None, 1, "–"), (float("nan"), 1, "–"), (-0.04, 1, "0.0"), (-100.0, 0, "-100"), (1.23456, 4, "1.2346")],
-)
-def test_number(value, digits, text):
-    assert number(value, digits) == text
-
-
 @pytest.mark.parametrize(("value", "below"), [(7.3, 5), (0.0299, 0.02), (3000, 2000), (0.0, 1), (float("nan"), 1)])
 def test_round_below(value, below):
     assert round_below(value) == pytest.approx(below)
-
-
-def test_table_escapes_all_but_markup():
-    page = environment().globals["table"](["<Name", "x < y (mm)"], [["<b>", Markup("<i>1</i>")]])
-    assert '<th scope="row" class="l">&lt;b&gt;</th><td><i>1</i></td>' in page
-    assert '<th scope="col">x &lt; y (mm)</th>' in page
 
 
 def test_a_large_set_shows_the_overlays_that_deserve_a_look():

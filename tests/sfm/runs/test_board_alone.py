@@ -21,7 +21,6 @@ BOARD = reference_board()
 
 @pytest.fixture(scope="module")
 def hidden(small_dataset, small_scene, tmp_path_factory):
-    """The small set with the target painted over."""
     own = SmallSet(tmp_path_factory.mktemp("alone") / "set")
     own_copy(small_dataset, own.folder)
     for group in ("12", "14"):
@@ -73,9 +72,6 @@ def test_a_target_in_view_is_asked_for(small_set, small_scene, stcal_sfm):
     assert "the board alone" in text
 
 
-# --- numbering ---
-
-
 def views(roll_deg: float) -> list[PlaneView]:
     """Both numberings of the reference board, from a camera that is turned about its axis."""
     labels = BOARD.labels()
@@ -95,16 +91,13 @@ def test_a_half_turn_is_a_symmetry_and_a_shift_is_none():
     assert not _is_symmetry(Rigid.exp([0, 0, np.pi / 2, 0, 0, 0]), BOARD)
 
 
-def test_numberings_follow_the_camera():
+def test_numberings_follow_the_camera_up_to_a_quarter_turn():
     """From each image to its nearest, over more than a quarter turn in all."""
     rolls = [0, 35, 70, 105]
     chosen, reasons = _numbered([views(r)[::-1] if i % 2 else views(r) for i, r in enumerate(rolls)])
     assert reasons == {}
     for i, roll in enumerate(rolls):
         assert np.allclose(chosen[i].camera_from_plane.matrix(), views(roll)[0].camera_from_plane.matrix())
-
-
-def test_a_quarter_turn_says_nothing():
     chosen, reasons = _numbered([views(0), views(88)])
     assert list(chosen) == [0]
     assert "board numbered from either end: the camera is turned by 88° or 92° from the nearest image" in reasons[1]

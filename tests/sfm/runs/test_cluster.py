@@ -50,7 +50,6 @@ class Here(Executor):
 
 @pytest.fixture
 def expected(small_run):
-    """Results of this process alone."""
     return {name: (small_run / name).read_bytes() for name in RESULTS}
 
 
@@ -75,12 +74,9 @@ def end(_):
     os._exit(1)
 
 
-def test_a_process_that_is_ended_from_outside_is_one_line():
+def test_processes_that_end_and_folders_that_workers_do_not_see_are_one_line(tmp_path):
     with fails_with("E-WORKER-DIED … 2"):
         dict(run_on_images(end, [(1,), (2,)], 2))
-
-
-def test_a_folder_that_workers_do_not_see_is_one_line(tmp_path):
     file = ImageFile(tmp_path / "elsewhere" / "a.jpg", "a.jpg", ".")
     with spread(Here(), 3), fails_with("E-WORKER-PATH … elsewhere … --send-images"):
         dict(run_on_images(len, [(file,)]))

@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 
 from stcal.design import reference_board, reference_target
-from stcal.io.design import board_toml, load_target, target_toml
+from stcal.io.design import board_toml, target_toml
 from stcal.sfm.data.patterns import measured_pitch_mm, pitch_hint
 from stcal.sfm.detect.sightings import likeness_notes
 from stcal.synthetic.scene import second_design
-from tests.outcome import fails_with
 
 pytestmark = pytest.mark.usefixtures("no_page")
 
@@ -115,17 +114,3 @@ def test_faces_that_one_circle_tells_apart_are_noted(stcal_sfm, tmp_path):
     code, out, _ = stcal_sfm("plan", "--target", path, "--images", 2, "--width", 1296, "--groups", "12")
     assert code == 0
     assert out.startswith(f"note: {one}\nnote: {mirrored}\n")
-
-
-def test_faces_of_one_pattern_end_a_command(stcal_sfm, tmp_path):
-    target = reference_target()
-    text = target_toml(target)
-    second = next(part for part in text.split("[[face]]") if part.startswith('\nid = "2"'))
-    path = tmp_path / "target.toml"
-    path.write_text(text + "\n[[face]]" + second.replace('id = "2"', 'id = "6"', 1))
-    with fails_with("E-TARGET-LIKENESS … 2 … 6"):
-        load_target(path)
-    code, _, err = stcal_sfm("plan", "--target", path)
-    assert code == 2
-    assert "faces 2 and 6 have the same pattern" in err
-    assert "change a circle on one of them" in err

@@ -14,7 +14,6 @@ from tests.outcome import fails_with
 
 @pytest.fixture
 def scratch(tmp_path, monkeypatch):
-    """Where temporary files go meanwhile."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))

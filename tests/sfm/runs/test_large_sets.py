@@ -91,15 +91,12 @@ def test_tracks_hold_together_whatever_is_missing(crowd, seed, share):
         assert partition(a) == partition(b)
 
 
-def test_pairs_are_those_with_enough_labels_in_common(crowd):
+def test_pairs_have_enough_labels_in_common_and_dots_of_their_group_only(crowd):
     scene, observations = crowd
     few = [observations[0], observations[1].select(np.arange(MIN_SHARED)), observations[2].select([0, 1])]
     labels = [set(o.labels) for o in few]
     wanted = [[i, j] for i in range(3) for j in range(i + 1, 3) if len(labels[i] & labels[j]) >= MIN_SHARED]
     assert image_graph(few, scene.board, "all").pairs.tolist() == wanted
-
-
-def test_dots_of_the_board_join_images_of_one_group_only(crowd):
     scene, observations = crowd
     boards = [o.select([k for k, label in enumerate(o.labels) if label.startswith("board")]) for o in observations]
     for kind in ("all", "sparse"):

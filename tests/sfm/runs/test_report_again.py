@@ -17,55 +17,48 @@ from stcal.sfm.runs.text import run_text
 from stcal.sfm.runs.transaction import added_results
 from tests.outcome import INPUT, assert_error
 from tests.report.browser import faults, opened, show, sideways_px
-from tests.shared import own_copy
-
-
-@pytest.fixture
-def own(small_run, tmp_path):
-    """A copy of the small run to write to."""
-    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
 @pytest.mark.slow
-def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatch):
+def test_the_same_files_make_the_same_page(own_run, small_run, stcal_sfm, monkeypatch):
     monkeypatch.setattr(folder, "pdf_of", lambda page: page[:15].encode())
-    (own / "report.html").write_text("spoilt")
-    assert verify(own).notes()
-    code, out, _ = stcal_sfm("report", own, "--pdf")
-    assert (code, out) == (0, f"report: {own}/report.html\nreport: {own}/report.pdf\n")
-    assert (own / "report.html").read_bytes() == (small_run / "report.html").read_bytes()
-    assert (own / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
-    assert verify(own).notes() == []
-    with added_results(own) as stage:
+    (own_run / "report.html").write_text("spoilt")
+    assert verify(own_run).notes()
+    code, out, _ = stcal_sfm("report", own_run, "--pdf")
+    assert (code, out) == (0, f"report: {own_run}/report.html\nreport: {own_run}/report.pdf\n")
+    assert (own_run / "report.html").read_bytes() == (small_run / "report.html").read_bytes()
+    assert (own_run / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
+    assert verify(own_run).notes() == []
+    with added_results(own_run) as stage:
         (stage / "report.html").write_text("another")
-    assert not (own / "report.pdf").exists()  # it was made of the page before
-    assert verify(own).notes() == []
+    assert not (own_run / "report.pdf").exists()  # it was made of the page before
+    assert verify(own_run).notes() == []
 
 
-def test_files_that_the_run_did_not_leave_so_are_said(own, stcal_sfm):
+def test_files_that_the_run_did_not_leave_so_are_said(own_run, stcal_sfm):
     """Fewer lines of the table of centres, of which the page draws residuals."""
-    lines = (own / "labels.csv").read_text().splitlines(keepends=True)
-    (own / "labels.csv").write_text("".join(lines[: len(lines) // 2]))
-    code, out, _ = stcal_sfm("report", own)
+    lines = (own_run / "labels.csv").read_text().splitlines(keepends=True)
+    (own_run / "labels.csv").write_text("".join(lines[: len(lines) // 2]))
+    code, out, _ = stcal_sfm("report", own_run)
     assert code == 0
     assert out.startswith("note: the run's folder is not as the run left it: 1 changed (labels.csv)\n")
 
 
 @pytest.mark.slow
-def test_into_a_file_of_ones_own(own, tmp_path, stcal_sfm):
-    before = (own / RUN_MARKER).read_bytes()
-    code, out, _ = stcal_sfm("report", own, "--pdf", "--out", tmp_path / "for the lab.html")
+def test_into_a_file_of_ones_own(own_run, tmp_path, stcal_sfm):
+    before = (own_run / RUN_MARKER).read_bytes()
+    code, out, _ = stcal_sfm("report", own_run, "--pdf", "--out", tmp_path / "for the lab.html")
     assert (code, out) == (0, f"report: {tmp_path}/for the lab.html\nreport: {tmp_path}/for the lab.pdf\n")
-    assert (tmp_path / "for the lab.html").read_bytes() == (own / "report.html").read_bytes()
+    assert (tmp_path / "for the lab.html").read_bytes() == (own_run / "report.html").read_bytes()
     assert (tmp_path / "for the lab.pdf").read_bytes().startswith(b"%PDF")
-    assert (own / RUN_MARKER).read_bytes() == before
-    assert not (own / "report.pdf").exists()
+    assert (own_run / RUN_MARKER).read_bytes() == before
+    assert not (own_run / "report.pdf").exists()
 
 
 @pytest.mark.slow
-def test_photographs_that_are_gone_are_counted(own, tmp_path, stcal_sfm):
-    shutil.rmtree(own / "overlays" / "12")
-    code, out, _ = stcal_sfm("report", own, "--out", tmp_path / "page.html")
+def test_photographs_that_are_gone_are_counted(own_run, tmp_path, stcal_sfm):
+    shutil.rmtree(own_run / "overlays" / "12")
+    code, out, _ = stcal_sfm("report", own_run, "--out", tmp_path / "page.html")
     assert code == 0
     assert out.startswith("4 overlays are no longer in the folder: the report is without them\n")
     page = (tmp_path / "page.html").read_text()
@@ -74,17 +67,17 @@ def test_photographs_that_are_gone_are_counted(own, tmp_path, stcal_sfm):
     assert "Overlay of 12/" not in page
 
 
-def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
+def test_what_cannot_be_made_is_said_in_one_line(own_run, tmp_path, stcal_sfm):
     assert_error(stcal_sfm("report", tmp_path), INPUT, "E-RUN-FOLDER", "--out")
     assert_error(
-        stcal_sfm("report", own, "--out", tmp_path / "a.pdf"), INPUT, "E-OUTPUT-SUFFIX", "a.html", "--pdf", "a.pdf"
+        stcal_sfm("report", own_run, "--out", tmp_path / "a.pdf"), INPUT, "E-OUTPUT-SUFFIX", "a.html", "--pdf", "a.pdf"
     )
-    assert_error(stcal_sfm("report", own, "--out", own / "report.html"), INPUT, "E-OUTPUT-IS-INPUT", "run")
-    content = json.loads((own / "report.json").read_text())
+    assert_error(stcal_sfm("report", own_run, "--out", own_run / "report.html"), INPUT, "E-OUTPUT-IS-INPUT", "run")
+    content = json.loads((own_run / "report.json").read_text())
     del content["faces"]
-    (own / "report.json").write_text(json.dumps(content))
-    assert_error(stcal_sfm("report", own), INPUT, "E-RUN-DAMAGED", "report.json", "faces")
-    assert (own / "report.html").exists()
+    (own_run / "report.json").write_text(json.dumps(content))
+    assert_error(stcal_sfm("report", own_run), INPUT, "E-RUN-DAMAGED", "report.json", "faces")
+    assert (own_run / "report.html").exists()
 
 
 @pytest.mark.slow
@@ -95,11 +88,11 @@ def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
         ("labels.csv", "\n1,0,", "\n1,0,12/IMG_1000.jpg,12,x,0,0,0,0,1,0,1,left,0\n1,0,"),
     ],
 )
-def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own, stcal_sfm, name, old, new):
-    text, before = (own / name).read_text(), (own / "report.html").read_bytes()
-    (own / name).write_text(text.replace(old, new, 1))
-    assert_error(stcal_sfm("report", own), INPUT, "E-RUN-DAMAGED", f"{name}")
-    assert (own / "report.html").read_bytes() == before
+def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own_run, stcal_sfm, name, old, new):
+    text, before = (own_run / name).read_text(), (own_run / "report.html").read_bytes()
+    (own_run / name).write_text(text.replace(old, new, 1))
+    assert_error(stcal_sfm("report", own_run), INPUT, "E-RUN-DAMAGED", f"{name}")
+    assert (own_run / "report.html").read_bytes() == before
 
 
 def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run):

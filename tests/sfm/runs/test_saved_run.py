@@ -20,7 +20,7 @@ from stcal.sfm.measurement.target import read_target
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.shared import own_copy, unsealed_copy
 
 FRAME = ("id", "ids", "origin", "x", "y")
@@ -160,13 +160,8 @@ def test_which_faces_the_photographs_were_to_show(groups, given, expected):
 
 
 def test_an_expected_face_that_the_design_lacks():
-    with fails_with("E-TARGET-NO-FACE … 7"):
-        RunOptions(expect_faces=("7",)).settled(reference_target())
-    with fails_with("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5"):
-        RunOptions(reference_face="9").settled(reference_target())
-
-
-# --- damaged, unfinished, of another version ---
+    refuses("E-TARGET-NO-FACE … 7", RunOptions(expect_faces=("7",)).settled, reference_target())
+    refuses("E-TARGET-NO-FACE … 9 … 1, 2, 3, 4, 5", RunOptions(reference_face="9").settled, reference_target())
 
 
 def edit(path, change) -> None:
@@ -214,12 +209,7 @@ def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
 
 
 @pytest.mark.parametrize(
-    ("name", "key"),
-    [
-        (".stcal/run.json", "images"),
-        ("report.json", "groups"),
-        ("faces.json", "circles"),
-    ],
+    ("name", "key"), [(".stcal/run.json", "images"), ("report.json", "groups"), ("faces.json", "circles")]
 )
 def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
     edit(own_run / name, lambda content: content.pop(key))
@@ -333,7 +323,6 @@ def test_rows_of_the_images_in_another_order_are_the_same(small_run, tmp_path):
 
 
 def nudge(path):
-    """Changes a digit of a number, which stays readable."""
     text = path.read_text(encoding="utf-8")
     place = max(match.start() for match in re.finditer(r"(?<=\d\.\d)\d", text))
     path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], encoding="utf-8")

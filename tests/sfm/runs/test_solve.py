@@ -11,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.images import Skipped
 from stcal.sfm.runs.solve import LIKELY, explained, require_usable, usable_groups, wrong_file
 from stcal.sfm.runs.text import run_text
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,6 @@ def group(scene, labels_only):
 
 
 def only(group, board: bool):
-    """Every image with its dots alone, or with its circles alone."""
     return [
         image.select([i for i, label in enumerate(image.labels) if str(label).startswith("board") == board])
         for image in group
@@ -34,12 +33,9 @@ def test_two_images_with_board_and_face_will_do(group):
 
 
 def test_what_is_missing_is_named(group):
-    with fails_with("E-GROUP-FEW-IMAGES"):
-        require_usable(group[:1])
-    with fails_with("E-GROUP-NO-FACE … 5"):
-        require_usable(only(group, board=True))
-    with fails_with("E-GROUP-NO-BOARD … 5"):
-        require_usable(only(group, board=False))
+    refuses("E-GROUP-FEW-IMAGES", require_usable, group[:1])
+    refuses("E-GROUP-NO-FACE … 5", require_usable, only(group, board=True))
+    refuses("E-GROUP-NO-BOARD … 5", require_usable, only(group, board=False))
 
 
 def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):

@@ -11,7 +11,7 @@ from stcal.sfm.interop import crosscheck as interop
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
-from tests.outcome import INPUT, assert_error, fails_with
+from tests.outcome import INPUT, assert_error, fails_with, refuses
 from tests.shared import own_copy
 
 MARKER = MarkerFile.of("images", RunOptions())
@@ -19,7 +19,6 @@ MARKER = MarkerFile.of("images", RunOptions())
 
 @pytest.fixture
 def made(tmp_path):
-    """A run's folder of a few files."""
     with run_folder(tmp_path / "run", MARKER, {}) as folder:
         for name in ("faces.json", "report.json", "colmap/models/12/images.bin", "overlays/12/a.jpg"):
             (folder.stage / name).parent.mkdir(parents=True, exist_ok=True)
@@ -50,11 +49,7 @@ SPOILT = {
     "a folder gone": (lambda run: shutil.rmtree(run / "colmap/models"), "missing", "colmap/models/12/images.bin"),
     "one letter": (lambda run: (run / "faces.json").write_text("faces.jsoN"), "changed", "faces.json"),
     "a link": (lambda run: link(run / "faces.json"), "changed", "faces.json"),
-    "a pipe": (
-        lambda run: ((run / "report.json").unlink(), os.mkfifo(run / "report.json")),
-        "changed",
-        "report.json",
-    ),
+    "a pipe": (lambda run: ((run / "report.json").unlink(), os.mkfifo(run / "report.json")), "changed", "report.json"),
     "the marker": (lambda run: edit_marker(run, lambda c: c.update(images="/elsewhere")), "changed", RUN_MARKER),
     "its hashes": (lambda run: edit_marker(run, lambda c: c["sha256"].popitem()), "changed", RUN_MARKER),
     "a file among the results": (lambda run: (run / "colmap/models/new.bin").touch(), "added", "colmap/models/new.bin"),
@@ -126,13 +121,10 @@ def test_a_run_without_hashes_gets_none(made):
     with added_results(made) as stage:
         (stage / "compare.json").write_text("x")
     assert (made / "compare.json").read_text() == "x"
-    with fails_with(f"E-RUN-UNFINISHED … {RUN_MARKER}"):
-        verify(made)
+    refuses(f"E-RUN-UNFINISHED … {RUN_MARKER}", verify, made)
     edit_marker(made, lambda content: content.update(sha256=3))
-    with fails_with(f"E-RUN-DAMAGED … {RUN_MARKER} … sha256: 3:"):
-        verify(made)
-    with fails_with("E-RUN-FOLDER"):
-        verify(made / "colmap/models")
+    refuses(f"E-RUN-DAMAGED … {RUN_MARKER} … sha256: 3:", verify, made)
+    refuses("E-RUN-FOLDER", verify, made / "colmap/models")
 
 
 def test_compare_adds_its_file(small_run, small_dataset, tmp_path, stcal_sfm):

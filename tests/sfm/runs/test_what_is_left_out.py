@@ -137,8 +137,7 @@ def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only)
         board = replace(scene.board, sigma_mm=factor * scene.board.sigma_mm)
         models = [
             with_sigma(
-                replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)),
-                SigmaFactors(factor, factor, factor),
+                replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)), SigmaFactors(factor, factor, factor)
             )
             for m in labels_only.models(scene, observed)
         ]

@@ -15,7 +15,7 @@ from stcal.handeye.data.record import Said
 from stcal.workflows.handeye_inputs import one_source, read_input
 from stcal.workflows.robot_at_images import read_robot_poses
 from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 5).pairs
@@ -130,12 +130,9 @@ def test_what_is_no_array_of_poses_is_named(tmp_path, name, content, part):
     assert part in refused(tmp_path / name)
 
 
-def test_a_small_archive_of_much_is_not_unpacked(tmp_path):
+def test_archives_of_much_and_programs_are_no_arrays(tmp_path):
     (tmp_path / "a.npz").write_bytes(archived(bytes(101_000_000)))
     assert "101 MB unpacked, at most 100 MB are read" in refused(tmp_path / "a.npz")
-
-
-def test_a_program_is_no_array(tmp_path):
     (tmp_path / "b.npy").write_bytes(pickle.dumps(GOOD))
     assert read_robot(tmp_path / "b.npy", Said()) is None  # the reader of tables says that it is no text
 
@@ -303,12 +300,9 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     between = ";" if ";" in head else ","
     path = written(tmp_path, f"{head}\n{between.join('123456')}\n", name)
     said = Said(rotation="ur-rotvec")
-    with fails_with("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm"):
-        read_input(path, statements=said)
-    with fails_with("E-POSES-NOT-FOUND … u"):
-        one_source(path, path, "image", said)
-    with fails_with("E-POSES-NOT-FOUND … u"):
-        read_robot_poses(path, statements=said)
+    refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", read_input, path, statements=said)
+    refuses("E-POSES-NOT-FOUND … u", one_source, path, path, "image", said)
+    refuses("E-POSES-NOT-FOUND … u", read_robot_poses, path, statements=said)
 
 
 def test_half_of_decimal_commas_is_no_list_of_numbers(tmp_path):

@@ -10,7 +10,6 @@ from stcal.handeye.data.record import Said
 from stcal.workflows.handeye_inputs import one_source, read_input
 from stcal.workflows.robot_at_images import read_robot_poses
 from tests.handeye.written import FORMATS, REFUSED
-from tests.outcome import fails_with
 from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 7).pairs
@@ -59,12 +58,3 @@ def test_other_formats_are_refused_in_a_line(name, tmp_path):
         message = str(caught.value)
         assert "\n" not in message
         assert str(path) in message
-
-
-def test_what_is_read_is_named_where_a_file_is_not_understood(tmp_path):
-    (tmp_path / "poses").write_text(REFUSED["camodocal"])
-    named = "frameCount, T1_0 … table … TUM … JSON, npy, npz … FileStorage … easy_handeye … MoveIt … p[x, y, z"
-    with fails_with(f"E-POSES-NOT-FOUND … {named}"):
-        read_robot_poses(tmp_path / "poses")
-    with fails_with("E-POSES-NOT-FOUND … a folder … a table"):
-        read_robot_poses(tmp_path)
