@@ -85,8 +85,8 @@ def timed_handeye(scratch: Path) -> dict[str, dict]:
     import handeye_shared
 
     from stcal.handeye import HandEyeOptions
-    from stcal.workflows.calibrate_handeye import Splits, calibrate
     from stcal.workflows.handeye_inputs import read_input
+    from stcal.workflows.handeye_run import Splits, calibrate
 
     rows = {}
     folder = photographed_chessboards(scratch / "chessboards", VIEWS, 1.0)

@@ -22,8 +22,8 @@ from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_report
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
-from stcal.workflows.calibrate_handeye import ALL, Splits, calibrate
 from stcal.workflows.handeye_inputs import read_input
+from stcal.workflows.handeye_run import ALL, Splits, calibrate
 
 CHARUCO = """type = "charuco"
 rows = 7

@@ -232,8 +232,8 @@ def handeye(
     from stcal.handeye.report.page import outcome_report
     from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.calibrate_handeye import calibrate_handeye
     from stcal.workflows.handeye_inputs import without_flips
+    from stcal.workflows.handeye_run import calibrate_handeye
     from stcal.workflows.robot_at_images import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
@@ -338,7 +338,7 @@ def _require_fitting(
 ) -> None:
     """Checks that the options of camera and method are compatible."""
     from stcal.handeye import METHODS
-    from stcal.workflows.calibrate_handeye import ALL
+    from stcal.workflows.handeye_run import ALL
 
     if camera_out and not (refine_camera or with_arm):
         raise InputError(
@@ -375,7 +375,7 @@ def _require_frames(
 def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":
     """Returns the options of differential evolution, with the defaults for bounds that were not given."""
     from stcal.handeye import EvolutionOptions
-    from stcal.workflows.calibrate_handeye import ALL
+    from stcal.workflows.handeye_run import ALL
 
     turn = _bounds("--de-bounds-deg", bounds_deg, math.radians(1))
     shift = _bounds("--de-bounds-mm", bounds_mm, 1.0)
@@ -436,7 +436,7 @@ def plan(
     from stcal.handeye.plan import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
-    from stcal.workflows.calibrate_handeye import plan_handeye
+    from stcal.workflows.handeye_run import plan_handeye
     from stcal.workflows.robot_at_images import Timing
 
     robot, timing = load_robot(robot_file) if robot_file else None, Timing()

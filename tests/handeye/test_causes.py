@@ -12,8 +12,8 @@ from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.report.outcome import judged
 from stcal.handeye.solve import handeye
-from stcal.workflows.calibrate_handeye import Splits, calibrate, lag_tried
 from stcal.workflows.handeye_inputs import HandEyeInput
+from stcal.workflows.handeye_run import Splits, calibrate, lag_tried
 from tests.outcome import fails_with
 from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, simulated
 from tests.support.handeye_stream import simulated_stream

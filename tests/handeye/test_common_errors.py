@@ -13,8 +13,8 @@ from stcal.handeye.solve import handeye as handeye_by
 from stcal.handeye.validate import with_common_errors, with_jackknife
 from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
-from stcal.workflows.calibrate_handeye import Splits, calibrate
 from stcal.workflows.handeye_inputs import PREFIXES, HandEyeInput
+from stcal.workflows.handeye_run import Splits, calibrate
 from tests.support.handeye import simulated, squared
 
 COMMON = np.array([[1e-3, 0, 0, 0, 0.4, 0], [0, -1e-3, 0, 0.4, 0, 0], [0, 0, 0, 0, 0, 0.8]]).T

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.workflows.calibrate_handeye import Splits
+from stcal.workflows.handeye_run import Splits
 from tests.scripts import load_script
 
 MEAN_MM = 0.85
