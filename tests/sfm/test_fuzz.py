@@ -100,12 +100,8 @@ def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
 
 BRIEF = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2]
 """Those of calls that take together less than a minute of processor time; `scripts/full` makes all mistakes."""
-SLOW = [
-    pytest.param(name, marks=pytest.mark.slow)
-    for name in MISTAKES
-    if name not in BRIEF and name.startswith(("identify", "axes", "compensate", "verify", "locate", "register"))
-]
-"""Mistakes with robots, instruments and located targets, which no other test tells."""
+SLOW = sampled([name for name in MISTAKES if name not in BRIEF], kept=range(0, len(MISTAKES), 4))
+"""The others, of which `.ci/run` makes every fourth."""
 
 
 @pytest.mark.parametrize("name", [*BRIEF, *SLOW])
