@@ -20,9 +20,10 @@ from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, 
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.network import free_network
+from stcal.sfm.adjust.photographs import with_differences
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
-from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px
+from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
 FLATNESS_MM = 0.02
@@ -61,6 +62,8 @@ class AdjustOptions:
             )
 
 
+NOTED = 1.25
+"""Ratio from which it is said by how much photographs differ: of 16 photographs, chance is above in one run of 1000."""
 JOINT_ROUNDS = 2
 """Number of joint adjustments. Eccentricity changes by nanometres between the first and the second."""
 
@@ -155,13 +158,18 @@ def calibrate(
     step(None)
     if joint_rounds:
         state, factors = _adjust_all(metric, factors, camera, target, board, options, prior, step)
-        joint = state.result()
+        state = with_differences(state, calibrated, target, options.frame)
+        joint = result_of(state)
         calibrated = calibrated_target(joint, calibrated, target, options.frame, state)
         circle_sigma_px = joint.sigma_scale * centre_sigma_px(state.blocks, CIRCLES)
         step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
         notes += _unsettled(joint)
+        if state.differ > NOTED:
+            notes.append(
+                f"photographs differ {state.differ:.1f} times more than their pixels explain: σ are larger by that"
+            )
     return Calibration(
         target=calibrated,
         scales=scales,
@@ -297,14 +305,15 @@ def _adjust_all(
     covariances = [m.covariance_px2 for m in models]
     rounds = _joint_rounds(options, prior)
     prior = prior if options.refine_camera else None
-    current, shape_factors = camera, (1.0, 1.0)
+    current, shape_factors = camera, (1.0, 1.0, 1.0)
     for last in [False] * (rounds - 1) + [True]:
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
         models = [with_sigma(replace(m, covariance_px2=c), factors) for m, c in zip(models, covariances, strict=True)]
         settled = EXACTLY if last else NEAR
         state = adjusted(models, board, camera, options.flatness_mm, prior, current, None, shape_factors, settled)
-        shape_factors = state.setting.print_factor, state.setting.bend_factor
+        own = state.setting
+        shape_factors = own.print_factor, own.bend_factor, own.print_amplitude
         models, current = [block.model for block in state.blocks], state.shared.camera
         step(None)
         if prior is not None:

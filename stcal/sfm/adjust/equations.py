@@ -11,6 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import perturbed
 from stcal.geometry.normal_equations import Reduction, blocks_of, free_motions, reduce
 from stcal.geometry.plane import fit_plane
+from stcal.geometry.print_modes import AMPLITUDES
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
@@ -156,16 +157,20 @@ def without_cameras(
     return equations.normal - cameras.normal, equations.right - cameras.right, cameras
 
 
-def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.ndarray:
-    """Whitened equations (2n − 6, 3p + q) of one image, orthogonal to its pose, over points and intrinsics."""
+def rows_of_view(
+    model: GroupModel, camera: Camera, basis: np.ndarray, root: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened equations (2n − 6, 3p + q) of one image over points and intrinsics, orthogonal to its pose, and the
+    directions (2n, 2n − 6) of its coordinates that they are; ``root``: (2n,) of robust weights."""
     by_pose, by_point = projection_jacobians(model, camera)
     n, p = len(model.point_index), len(model.labels)
     rows = np.zeros((n, 2, 3 * p + basis.shape[1]))
     columns = 3 * model.point_index[:, None] + np.arange(3)
     rows[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = model.whiten(by_point)
     rows[:, :, 3 * p :] = model.whiten(model.by_parameters(camera) @ basis)
-    across = np.linalg.qr(model.whiten(by_pose).reshape(2 * n, 6), mode="complete")[0][:, 6:]
-    return across.T @ rows.reshape(2 * n, -1)
+    weight = (np.ones(2 * n) if root is None else root)[:, None]
+    across = np.linalg.qr(weight * model.whiten(by_pose).reshape(2 * n, 6), mode="complete")[0][:, 6:]
+    return across.T @ (weight * rows.reshape(2 * n, -1)), across
 
 
 def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndarray):
@@ -251,6 +256,7 @@ class Setting:
     huber: float
     print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
     bend_factor: float = 1.0  # off their plane
+    print_amplitude: float = AMPLITUDES[0]  # of the smooth deviations of their prints
 
     def places(self, shared: Shared) -> "Places":
         """Returns the indices of the shared unknowns."""
@@ -409,7 +415,14 @@ def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
         within = setting.print_factor * (face.sigma_mm or 1.0)
         weight = np.tile([within**-2, within**-2, 0.0 if np.isinf(off) else off**-2], (len(members), 1))
         try:
-            yield Shape.of(members, design, shared.xyz_model[members], weight, alone * face.size_sigma)
+            yield Shape.of(
+                members,
+                design,
+                shared.xyz_model[members],
+                weight,
+                alone * face.size_sigma,
+                setting.print_amplitude,
+            )
         except DegenerateError:  # corners on a line
             continue
 

@@ -12,6 +12,7 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.plane import fit_planes
+from stcal.geometry.print_modes import AMPLITUDES, PrintModes, Told
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.refine import projection_jacobians
@@ -29,46 +30,54 @@ class Shape:
     rotation: np.ndarray  # (3, 3) model_from_face
     off_mm: np.ndarray  # (n, 3) points minus design, face frame
     weight: np.ndarray  # (n, 3) 1/σ²
-    by_pose: np.ndarray  # (3n, 7) derivative of ``off_mm`` by the pose and the relative size of the print
-    size: float  # relative, minus 1
-    size_weight: float  # infinite if the size is exact
+    # (3n, k) derivative of ``off_mm`` by the pose, the relative size of the print if it is free, and the print's modes
+    by_pose: np.ndarray
+    prior: np.ndarray  # (k,) weights of these unknowns about 0
+    value: np.ndarray  # (k - 6,) size, minus 1, and modes
+    sized: bool  # whether the size is free
 
     @classmethod
     def of(
-        cls, members: np.ndarray, design: np.ndarray, xyz: np.ndarray, weight: np.ndarray, size_sigma: float
+        cls,
+        members: np.ndarray,
+        design: np.ndarray,
+        xyz: np.ndarray,
+        weight: np.ndarray,
+        size_sigma: float,
+        amplitude: float = AMPLITUDES[0],
     ) -> "Shape":
-        """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size."""
-        pose, size = align_rigid(xyz, design), 0.0
-        size_weight = size_sigma**-2 if size_sigma else np.inf
-        free = 7 if size_sigma else 6
+        """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size; ``amplitude`` : of the
+        smooth deviations of its print."""
+        modes = PrintModes.of(design[:, :2])
+        unit = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
+        smooth = -modes.modes.reshape(len(xyz), 3, -1)
+        others = np.concatenate([-design[:, :, None], smooth], axis=2) if size_sigma else smooth
+        prior = np.concatenate(
+            [np.zeros(6), [size_sigma**-2] if size_sigma else [], (amplitude * modes.spread_mm) ** -2.0]
+        )
+        pose, value = align_rigid(xyz, design), np.zeros(len(prior) - 6)
         for _ in range(SHAPE_STEPS):
             in_face = (xyz - pose.translation) @ pose.rotation
-            off = in_face - (1 + size) * design
-            unit = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
-            by_pose = np.concatenate([skew(in_face), -unit, -design[:, :, None]], axis=2).reshape(-1, 7)[:, :free]
+            off = in_face - design + others @ value
+            by_pose = np.concatenate([skew(in_face), -unit, others], axis=2).reshape(len(weight) * 3, -1)
             weighted = weight.reshape(-1, 1) * by_pose
-            normal, right = by_pose.T @ weighted, weighted.T @ off.ravel()
-            if size_sigma:
-                normal[6, 6] += size_weight
-                right[6] += size_weight * size
-            step = -np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+            normal, right = by_pose.T @ weighted + np.diag(prior), weighted.T @ off.ravel()
+            right[6:] += prior[6:] * value
+            scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+            step = -scale * np.linalg.lstsq(normal * scale[:, None] * scale, scale * right, rcond=1e-12)[0]
             if np.abs(step).max() < SHAPE_SETTLED:
                 break
-            pose, size = pose @ Rigid.exp(step[:6]), size + float(step[6]) if size_sigma else 0.0
-        return cls(members, pose.rotation, off, weight, by_pose, size, size_weight)
+            pose, value = pose @ Rigid.exp(step[:6]), value + step[6:]
+        return cls(members, pose.rotation, off, weight, by_pose, prior, value, bool(size_sigma))
 
     def cost(self) -> float:
         """Returns the squared deviations over σ²."""
-        own = self.size_weight * self.size**2 if np.isfinite(self.size_weight) else 0.0
-        return float((self.weight * self.off_mm**2).sum()) + own
+        return float((self.weight * self.off_mm**2).sum() + self.prior[6:] @ self.value**2)
 
     def _to_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose by the deviations (6, 3n), and its covariance (6, 6), with one more row if the size is free."""
+        """The unknowns by the deviations (k, 3n), and their covariance (k, k)."""
         weighted = self.weight.reshape(-1, 1) * self.by_pose
-        normal = self.by_pose.T @ weighted
-        if np.isfinite(self.size_weight):
-            normal[6, 6] += self.size_weight
-        inverse = generalised_inverse(normal)
+        inverse = generalised_inverse(self.by_pose.T @ weighted + np.diag(self.prior))
         return inverse @ weighted.T, inverse
 
     def slope(self) -> np.ndarray:
@@ -76,7 +85,7 @@ class Shape:
         return ((self.weight * self.off_mm) @ self.rotation.T).ravel()
 
     def normal(self) -> np.ndarray:
-        """Returns the normal matrix (3n, 3n) over the points, model frame, with the pose eliminated."""
+        """Returns the normal matrix (3n, 3n) over the points, model frame, with pose, size and modes eliminated."""
         n = len(self.members)
         weighted = self.weight.reshape(-1, 1) * self.by_pose
         inner = np.diag(self.weight.ravel()) - weighted @ self._to_pose()[0]
@@ -85,23 +94,34 @@ class Shape:
 
     def by_size(self) -> np.ndarray:
         """Returns the right-hand side (3n,) that a stated size one σ off brings, model frame; 0 for an exact size."""
-        if not np.isfinite(self.size_weight):
+        if not self.sized:
             return np.zeros(self.off_mm.size)
         weighted = self.weight.reshape(-1, 1) * self.by_pose
-        force = weighted @ self._to_pose()[1][:, 6] * np.sqrt(self.size_weight)
+        force = weighted @ self._to_pose()[1][:, 6] * np.sqrt(self.prior[6])
         return (force.reshape(-1, 3) @ self.rotation.T).ravel()
 
-    def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
-        """Variance of adjusted deviations, by that of the points, over the stated one, (n, 3), at most 1."""
+    def _in_face(self, covariance_mm2: np.ndarray) -> np.ndarray:
         n = len(self.members)
         turned = covariance_mm2.reshape(n, 3, n, 3)
         turned = np.einsum("ai,manb,bj->minj", self.rotation, turned, self.rotation, optimize=True)
-        turned = turned.reshape(3 * n, 3 * n)
+        return turned.reshape(3 * n, 3 * n)
+
+    def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """Variance of adjusted deviations, by that of the points, over the stated one, (n, 3), at most 1."""
+        turned = self._in_face(covariance_mm2)
         to_pose, of_pose = self._to_pose()
-        left = np.eye(3 * n) - self.by_pose @ to_pose
+        left = np.eye(len(turned)) - self.by_pose @ to_pose
         variance = np.einsum("ij,jk,ik->i", left, turned, left, optimize=True)
         variance = variance + np.einsum("ij,jk,ik->i", self.by_pose, of_pose, self.by_pose)
-        return self.weight * variance.reshape(n, 3)
+        return self.weight * variance.reshape(-1, 3)
+
+    def told(self, covariance_mm2: np.ndarray, amplitude: float) -> Told:
+        """Returns what the adjusted points tell about the modes of the print; ``covariance_mm2``: (3n, 3n) of these."""
+        to_pose, of_pose = self._to_pose()
+        of_points = to_pose @ self._in_face(covariance_mm2) @ to_pose.T
+        modes = slice(6 + self.sized, len(self.prior))
+        spread = 1 / np.sqrt(self.prior[modes]) / amplitude
+        return Told(self.value[self.sized :], (of_pose + of_points)[modes, modes], np.zeros_like(spread), spread)
 
 
 FrameKind = Literal["plane", "three-point"]

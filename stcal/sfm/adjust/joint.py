@@ -13,6 +13,7 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minimum, minimise
 from stcal.geometry.normal_equations import constrained_inverse
+from stcal.geometry.print_modes import AMPLITUDES, found_amplitude
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.model import CameraPrior
@@ -39,6 +40,8 @@ from stcal.sfm.adjust.equations import (
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import GroupModel, MetricModel
 
+ShapeFactors = tuple[float, float, float]
+"""``print_factor``, ``bend_factor`` and ``print_amplitude`` of faces of known shape."""
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 NEAR = 1e-8
@@ -79,6 +82,8 @@ class JointResult:
     last_move_px: float  # largest move of a projection by the last whole step
     print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
     bend_factor: float = 1.0  # off their plane
+    print_amplitude: float = AMPLITUDES[0]  # of the smooth deviations of their prints
+    differ: float = 1.0  # by how much photographs differ more than their pixels explain, as a ratio of σ
 
     def __post_init__(self):
         c = len(self.labels)
@@ -105,9 +110,10 @@ class Adjusted:
     setting: Setting  # weights included
     normal: np.ndarray  # over the shared unknowns
     move_px: float  # largest move of a projection by the next whole step
+    differ: float = 1.0  # by how much photographs differ more than their pixels explain, as a ratio of σ
 
     def result(self) -> JointResult:
-        """Returns the result with its covariances."""
+        """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``."""
         places = self.setting.places(self.shared)
         equations = self.normal, places.circles, places.intrinsics
         return _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
@@ -127,7 +133,7 @@ def adjusted(
     start: Camera | None = None,  # of the intrinsics
     # share of the board's variance common to all groups; no residual is then down-weighted
     common: float | None = None,
-    factors: tuple[float, float] = (1.0, 1.0),  # ``print_factor`` and ``bend_factor`` of an earlier result
+    factors: ShapeFactors = (1.0, 1.0, 1.0),  # of an earlier result
     settled: float = EXACTLY,  # largest predicted decrease of the last step, as a share of χ²
 ) -> Adjusted:
     """Adjusts metric models that share one frame. The dots show whether the board kept its shape between the groups
@@ -149,14 +155,20 @@ def adjusted(
 
 def adjust_part(
     models: Sequence[MetricModel], board: BoardDesign, flatness_mm: float | None, whole: JointResult
-) -> JointResult:
+) -> Adjusted:
     """Adjusts a part of the models of a ``whole`` joint result, with its weights, camera, factors and common share."""
     # Of a single group, the variance of its board is the same whatever share of it other groups have.
     common = whole.board_common if len(models) > 1 else 0.0
     blocks, shared, setting = _start(models, board, whole.camera, flatness_mm, None, common)
     huber = HUBER * _robust_sigma(blocks, shared.camera)
-    setting = replace(setting, huber=huber, print_factor=whole.print_factor, bend_factor=whole.bend_factor)
-    return _minimise(blocks, shared, setting, NEARLY).result()
+    setting = replace(
+        setting,
+        huber=huber,
+        print_factor=whole.print_factor,
+        bend_factor=whole.bend_factor,
+        print_amplitude=whole.print_amplitude,
+    )
+    return replace(_minimise(blocks, shared, setting, NEARLY), differ=whole.differ)
 
 
 SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
@@ -168,36 +180,39 @@ LEAST_FACTOR = 0.1
 
 
 def _with_shape_factors(
-    blocks: list[Block], shared: Shared, setting: Setting, factors: tuple[float, float]
+    blocks: list[Block], shared: Shared, setting: Setting, factors: ShapeFactors
 ) -> tuple[list[Block], Shared, Setting]:
-    """Returns the state near its minimum with the factors on the σ of faces of known shape that belong to it."""
-    setting = replace(setting, print_factor=factors[0], bend_factor=factors[1])
+    """Returns the state near its minimum with the σ of faces of known shape that belong to it."""
+    names = ("print_factor", "bend_factor", "print_amplitude")
+    setting = replace(setting, **dict(zip(names, factors, strict=True)))
     for _ in range(SHAPE_ROUNDS):
         state = _descent(blocks, shared, setting, NEARLY).state
         blocks, shared = list(state.blocks), state.shared
-        within, off = _shape_factors(blocks, shared, setting)
-        change = max(abs(within / setting.print_factor - 1), abs(off / setting.bend_factor - 1))
-        setting = replace(setting, print_factor=within, bend_factor=off)
-        if change < SETTLED_FACTOR:
+        before, factors = factors, _shape_factors(blocks, shared, setting)
+        setting = replace(setting, **dict(zip(names, factors, strict=True)))
+        if np.abs(np.log(np.divide(factors, before))).max() < SETTLED_FACTOR:
             break
     return blocks, shared, setting
 
 
-def _shape_factors(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[float, float]:
-    """Returns print and bend factor: variance components (Förstner 1979), with the stated σ as a weak prior."""
+def _shape_factors(blocks: list[Block], shared: Shared, setting: Setting) -> ShapeFactors:
+    """Returns print and bend factor, variance components (Förstner 1979) with the stated σ as a weak prior, and the
+    amplitude of the prints' smooth deviations."""
     normal, _, _ = normal_equations(blocks, shared, setting)
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
-    square, freedom = np.zeros(2), np.zeros(2)
+    square, freedom, prints = np.zeros(2), np.zeros(2), []
     for shape in equations.shapes(shared, setting):
         place = (3 * shape.members[:, None] + np.arange(3)).ravel()
-        left = np.where(shape.weight > 0, 1 - shape.leverage(inverse[np.ix_(place, place)]), 0.0)
+        own = inverse[np.ix_(place, place)]
+        left = np.where(shape.weight > 0, 1 - shape.leverage(own), 0.0)
         normalised_square = shape.weight * shape.off_mm**2
         square += [normalised_square[:, :2].sum(), normalised_square[:, 2].sum()]
         freedom += [left[:, :2].sum(), left[:, 2].sum()]
+        prints.append(shape.told(own, setting.print_amplitude))
     before = np.array([setting.print_factor, setting.bend_factor])
     variance = (before**2 * square + PRIOR_FREEDOM) / (np.maximum(freedom, 0) + PRIOR_FREEDOM)
     within, off = np.maximum(np.sqrt(variance), LEAST_FACTOR).tolist()
-    return within, off
+    return within, off, found_amplitude(prints, setting.print_amplitude)
 
 
 def covariance_of(
@@ -244,7 +259,7 @@ class Extensible:
     def lowered(self, view: MetricModel, to_functions: np.ndarray) -> np.ndarray:
         """Returns by how much one more view lowers the variances of f functions of the circles, (f,) (Woodbury 1950).
         ``to_functions``: (3p + q, f) covariance between points and intrinsics, and the functions."""
-        rows = rows_of_view(view, self.camera, self.basis)
+        rows, _ = rows_of_view(view, self.camera, self.basis)
         inner = np.eye(len(rows)) + rows @ self.points[view.group] @ rows.T
         half = solve_triangular(np.linalg.cholesky(inner), rows @ to_functions, lower=True)
         return (half**2).sum(0)
@@ -260,7 +275,15 @@ def extensible(
     photographs: Mapping[str, np.ndarray] | None = None,
 ) -> Extensible:
     """Returns the :class:`Extensible` covariance of models; arguments as of :func:`covariance_of`."""
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
+    return _extensible(*_start(models, board, camera, flatness_mm, prior, common, photographs))
+
+
+def points_of(state: Adjusted) -> Extensible:
+    """Returns the covariances of the points at the minimum of an adjustment; σ₀ is 1."""
+    return _extensible(list(state.blocks), state.shared, state.setting)
+
+
+def _extensible(blocks: list[Block], shared: Shared, setting: Setting) -> Extensible:
     normal, _, groups = normal_equations(blocks, shared, setting)
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     circles = inverse[setting.places(shared).circles]
@@ -467,4 +490,5 @@ def _result(
         move_px,
         setting.print_factor,
         setting.bend_factor,
+        setting.print_amplitude,
     )

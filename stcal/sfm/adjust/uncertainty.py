@@ -1,7 +1,7 @@
 """Covariances of faces and circles, and what each kind of observation contributes to them."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -265,16 +265,32 @@ class Contributions:
         freeze(self, "by_intrinsics", (c, len(PARAMETER_NAMES)), "intrinsics")
 
 
+def result_of(state: Adjusted, parts: "_Parts | None" = None) -> JointResult:
+    """Returns the result of an adjustment, with covariances by how much its photographs differ."""
+    joint, variance = state.result(), state.differ**2
+    if variance > 1:
+        of_kind = (parts or _parts_of(state)).covariance
+        added = (1 - 1 / variance) * joint.sigma_scale**2 * (of_kind[CIRCLES] + of_kind[DOTS])
+        joint = replace(
+            joint,
+            covariance_mm2=joint.covariance_mm2 + (added + added.T) / 2,
+            camera_covariance=variance * joint.camera_covariance,
+            differ=state.differ,
+        )
+    return joint
+
+
 def contributions_of(state: Adjusted) -> Contributions:
     """Splits the covariance at the minimum of an adjustment into the contributions of the observations."""
-    joint, parts = state.result(), _parts_of(state)
+    parts = _parts_of(state)
+    joint = result_of(state, parts)
     variance = joint.sigma_scale**2
     return Contributions(
         joint,
         {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in parts.covariance.items()},
         parts.by_scale,
         parts.by_intrinsics,
-        {kind: joint.sigma_scale * centre_sigma_px(state.blocks, kind) for kind in (CIRCLES, DOTS)},
+        {kind: state.differ * joint.sigma_scale * centre_sigma_px(state.blocks, kind) for kind in (CIRCLES, DOTS)},
     )
 
 
@@ -302,7 +318,7 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
     for block, reduced in zip(blocks, groups, strict=True):
         group_answer = _Answer.of(block, reduced, inverse[setting.outer(block, shared)], shared)
         for kind, rows, lens_rows in group_answer.images(block, shared, setting):
-            covariance[kind] += rows.T @ rows
+            covariance[kind] += state.differ**2 * rows.T @ rows
             by_intrinsics += rows.T @ lens_rows if fixed else 0.0
         rows = group_answer.board(block, shared)
         covariance[BOARD] += rows.T @ rows

@@ -21,13 +21,11 @@ from stcal.sfm.camera.checks import (
     Candidate,
     HeldOut,
     ProjectionSigma,
-    SplitHalf,
     choose_model,
     held_out,
     image_grid,
     projection_jacobian,
     projection_sigma,
-    split_half,
 )
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
@@ -66,7 +64,6 @@ class CameraCalibration(Brief):
     skipped: tuple[Skipped, ...]  # files and images without a board, and why
     rounds: int  # of detection
     projection: ProjectionSigma
-    split: SplitHalf | None  # None with fewer than six views
     held_out: HeldOut | None  # None with fewer than four
     warnings: tuple[str, ...]  # problems that the σ may not show, and what to do about them
     candidates: tuple[Candidate, ...] = ()  # lens models that were tried, empty if a model was given
@@ -233,15 +230,14 @@ def judged(
 ) -> CameraCalibration:
     """Returns a calibration with its checks and warnings; ``settled``: whether the detection rounds converged."""
     projection = projection_sigma(result)
-    split = split_half(result, views, board)
     unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
-    warnings = [*unseen, *_of_rounds(result, settled), *_warnings(result, projection, split, board)]
+    warnings = [*unseen, *_of_rounds(result, settled), *_warnings(result, projection, board)]
     try:
         of_held_out = held_out(result, views, board)
     except StcalError as error:
         of_held_out = None
         warnings.append(f"no views could be held out, as the others alone are too few: {error}")
-    return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, of_held_out, tuple(warnings))
+    return CameraCalibration(result, tuple(views), skipped, rounds, projection, of_held_out, tuple(warnings))
 
 
 def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:
@@ -277,6 +273,13 @@ def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile]
 
 def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -> None:
     """Checks that the views determine the focal length and that the lens model fits them."""
+    rms = weighted_rms_px(result)
+    if rms > MAX_RESIDUAL_PX:
+        raise DegenerateError(
+            "E-CALIBRATE-MISFIT",
+            f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
+            "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom",
+        )
     relative = float((result.sigma()[0] / result.camera.focal[0]).max())
     if relative > MAX_FOCAL_SIGMA:
         raise DegenerateError(
@@ -284,13 +287,6 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
             f"camera: focal length determined to {100 * relative:.2g} % by {len(views)} views, "
             f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {_spread_deg(result):.0f}°); "
             "add views in which the board is tilted by 20° to 40°, about different axes",
-        )
-    rms = weighted_rms_px(result)
-    if rms > MAX_RESIDUAL_PX:
-        raise DegenerateError(
-            "E-CALIBRATE-MISFIT",
-            f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
-            "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom",
         )
 
 
@@ -332,9 +328,7 @@ def _of_rounds(result: Intrinsics, settled: bool) -> list[str]:
     return warnings
 
 
-def _warnings(
-    result: Intrinsics, projection: ProjectionSigma, split: SplitHalf | None, board: BoardDesign
-) -> list[str]:
+def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesign) -> list[str]:
     """Returns warnings, and what the user should do about them."""
     warnings = []
     if result.restarted:
@@ -358,11 +352,9 @@ def _warnings(
             f"dots deviate from the grid {result.factors.dots:.1f} times as much as the board file says: "
             f"sigma_mm = {result.factors.dots * board.sigma_mm:.3g} fits, {board.sigma_mm:g} is stated"
         )
-    if split is None:
-        warnings.append("fewer than six views: no split-half check; add views")
-    elif split.verdict != "passed":
+    if result.differ > SUSPICIOUS_FACTOR:
         warnings.append(
-            f"two halves of the views differ by more than chance (p = {split.p_value:.2g}): σ are too small; "
-            "keep focus and zoom fixed, look at the outliers, or choose a --model with more parameters"
+            f"photographs differ {result.differ:.1f} times more than their pixels explain, and σ are larger by that; "
+            "keep focus and zoom fixed, and the light even"
         )
     return warnings

@@ -1,12 +1,11 @@
-"""Checks of calibrated intrinsics: σ of projections, halves of the views, cross-validation of lens models."""
+"""Checks of calibrated intrinsics: σ of projections over the image, cross-validation of lens models."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.special import chdtrc
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
@@ -22,16 +21,11 @@ from stcal.sfm.camera.intrinsics import (
     model_of_views,
     model_parameters,
     of_some_views,
-    of_two_halves,
     start_camera,
 )
 from stcal.sfm.data.model import ImageObservations, by_group
 
-Verdict = Literal["passed", "suspicious", "failed"]
-SUSPICIOUS_P, FAILED_P = 1e-2, 1e-4
-"""p-values below which the halves' difference is suspicious or failed: false-alarm probabilities."""
 GRID = (13, 9)
-MIN_HALF = 3
 MIN_REACH = 0.75
 """Smallest advised reach of dots from the middle towards a corner. Beyond it little distortion is extrapolated."""
 
@@ -48,18 +42,6 @@ class ProjectionSigma:
     def __post_init__(self):
         for name in ("xy_px", "sigma_px", "reach", "corner_sigma_px"):
             freeze(self, name, what=name)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SplitHalf:
-    """Comparison of the intrinsics from every second view with those from the other views, on the same boards."""
-
-    difference: np.ndarray  # (q,) of the parameters
-    sigma: np.ndarray
-    p_value: float  # of the χ² of all q
-    largest_px: float  # difference of a projection over the image
-    largest_sigma_px: float  # per axis
-    verdict: Verdict
 
 
 def image_grid(camera: Camera) -> np.ndarray:
@@ -101,29 +83,6 @@ def projection_sigma(result: Intrinsics) -> ProjectionSigma:
     reach = np.minimum.reduce(dots[:, None] * corners / middle, axis=2).max(0)
     corner_index = [int(np.argmin(((xy - middle - corner * middle) ** 2).sum(1))) for corner in corners]
     return ProjectionSigma(xy, sigma, np.maximum(reach, 0), sigma[corner_index])
-
-
-def split_half(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> SplitHalf | None:
-    """Compares both halves of the views by one adjustment with two cameras; None with fewer than six views."""
-    if len(views) < 2 * MIN_HALF:
-        return None
-    both = of_two_halves(result, views, board)
-    q = len(both.covariance) // 2
-    difference = np.subtract(*(model_parameters(camera, result.colmap_model) for camera in reversed(both.cameras)))
-    subtract = np.hstack([-np.eye(q), np.eye(q)])
-    covariance = subtract @ both.covariance @ subtract.T
-    p_value = float(chdtrc(q, difference @ np.linalg.solve(covariance, difference)))
-    jacobian = projection_jacobian(result.camera, result.colmap_model)
-    length = np.linalg.norm(jacobian @ difference, axis=1)
-    worst = int(np.argmax(length))
-    return SplitHalf(
-        difference,
-        np.sqrt(np.diag(covariance)),
-        p_value,
-        float(length[worst]),
-        float(_sigma_px(jacobian, covariance)[worst]),
-        "passed" if p_value >= SUSPICIOUS_P else "suspicious" if p_value >= FAILED_P else "failed",
-    )
 
 
 def _sigma_px(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:

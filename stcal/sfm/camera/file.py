@@ -10,7 +10,6 @@ from pydantic import Field
 from stcal.geometry.camera import parameter_names
 from stcal.io.json import ByName, Matrix, NamedReason, Part, ResultFile
 from stcal.sfm.camera.calibrate import CORNERS, OUTLIER_WEIGHT, CameraCalibration, residual_rms_px
-from stcal.sfm.camera.checks import Verdict
 from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
 
 ByCorner = Annotated[str, "corner"]
@@ -19,6 +18,13 @@ ByCorner = Annotated[str, "corner"]
 class Parameter(Part):
     value: float
     sigma: float
+    freedom: float
+
+
+class Print(Part):
+    folder: str
+    stretch: float
+    shear: float
 
 
 class Corner(Part):
@@ -31,15 +37,6 @@ class Projection(Part):
     corners: dict[ByCorner, Corner] = Field(
         description="`reach` of the dots towards it, 1 at the corner, and `sigma_px` there"
     )
-
-
-class Halves(Part):
-    verdict: Verdict
-    p_value: float
-    difference: dict[str, float]
-    sigma: dict[str, float]
-    largest_px: float
-    largest_sigma_px: float
 
 
 class HeldOutViews(Part):
@@ -77,8 +74,8 @@ class CalibrationFile(ResultFile):
     model: str = Field(description="COLMAP model")
     size_px: tuple[int, int] = Field(description="width and height")
     parameters: dict[ByName, Parameter] = Field(
-        description="`value`, `sigma`, in the model's order; px and OpenCV pixel origin, distortion coefficients "
-        "without unit"
+        description="`value`, `sigma`, and the degrees of freedom `freedom` that the photographs have for it, in the "
+        "model's order; px and OpenCV pixel origin, distortion coefficients without unit"
     )
     correlation: Matrix = Field(description="in the order of `parameters`")
     residual_rms_px: float = Field(description="per coordinate")
@@ -86,19 +83,22 @@ class CalibrationFile(ResultFile):
         description="by which residuals exceed the centres' own σ (not below 1); σ are scaled by it"
     )
     dot_sigma_factor: float = Field(
-        description="by which dots are farther from the grid than the `sigma_mm` of the board file says, but for bends "
-        "of a board that is not flat (below 1: nearer); it is in all σ"
+        description="by which dots are farther from the grid than the `sigma_mm` of the board file says, but for the "
+        "smooth stretch and bends of the print (below 1: nearer); it is in all σ"
+    )
+    photographs_differ: float = Field(
+        description="by how much photographs differ more than their pixels explain, as a ratio of σ; σ are those of "
+        "independent photographs, never below those of independent pixels"
+    )
+    prints: list[Print] = Field(
+        description="by `folder`: how much longer the board is printed along its rows than across, relative "
+        "(`stretch`), and its `shear`; both are adjusted"
     )
     redundancy: int = Field(description="degrees of freedom")
     rounds: int = Field(description="of detection")
     projection: Projection = Field(
         description="σ per axis of where a known direction is seen, up to a rotation of the camera: `median_sigma_px` "
         "over the image, and in the corners"
-    )
-    split_half: Halves | None = Field(
-        description="every second view against the others: `verdict` `passed`, `suspicious` (p < 0.01) or `failed` "
-        "(p < 0.0001), `p_value`, `difference` and its `sigma` by parameter, `largest_px` difference of a projection "
-        "over the image, `largest_sigma_px` per axis there; null with fewer than six views"
     )
     held_out: HeldOutViews | None = Field(
         None,
@@ -122,33 +122,26 @@ class CalibrationFile(ResultFile):
     @classmethod
     def of(cls, calibration: CameraCalibration) -> "CalibrationFile":
         """Returns the file of a calibrated camera."""
-        result, projection, split = calibration.intrinsics, calibration.projection, calibration.split
+        result, projection = calibration.intrinsics, calibration.projection
         camera, sigma, names = result.camera, result.sigma(), parameter_names(result.colmap_model)
-        values = zip(names, model_parameters(camera, result.colmap_model), sigma, strict=True)
+        values = zip(names, model_parameters(camera, result.colmap_model), sigma, result.freedom, strict=True)
         corners = zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
         return cls(
             format="stcal camera 1",
             model=result.colmap_model,
             size_px=(camera.width, camera.height),
-            parameters={name: Parameter(value=value, sigma=own) for name, value, own in values},
+            parameters={name: Parameter(value=value, sigma=own, freedom=free) for name, value, own, free in values},
             correlation=result.covariance / np.outer(sigma, sigma),
             residual_rms_px=residual_rms_px(result),
             centre_sigma_factor=result.factors.centres,
             dot_sigma_factor=result.factors.dots,
+            photographs_differ=result.differ,
+            prints=[Print(folder=own, stretch=two[0], shear=two[1]) for own, two in result.prints().items()],
             redundancy=result.redundancy,
             rounds=calibration.rounds,
             projection=Projection(
                 median_sigma_px=float(np.median(projection.sigma_px)),
                 corners={corner: Corner(reach=reach, sigma_px=own) for corner, reach, own in corners},
-            ),
-            split_half=split
-            and Halves(
-                verdict=split.verdict,
-                p_value=split.p_value,
-                difference=dict(zip(names, split.difference, strict=True)),
-                sigma=dict(zip(names, split.sigma, strict=True)),
-                largest_px=split.largest_px,
-                largest_sigma_px=split.largest_sigma_px,
             ),
             held_out=calibration.held_out
             and HeldOutViews(rms_px=calibration.held_out.rms_px(), folds=calibration.held_out.folds),

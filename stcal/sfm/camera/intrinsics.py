@@ -9,13 +9,14 @@ from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.geometry.variances import sigma_factor
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.equations import BoardShape, Normal, Setting, State, dots_costs, minimum, moved
+from stcal.sfm.camera.equations import Board, Normal, Setting, State, dots_costs, minimum, moved
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectedImage
 
@@ -139,8 +140,7 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
 
 
 MAX_ROUNDS = 20
-FLAT_AFTER = 2
-"""Number of rounds after which σ are known well enough to test which boards are flat."""
+LEAST_ROUNDS = 2
 SETTLED_FACTOR = 0.005
 """Largest relative change of a variance component in the last round."""
 SETTLED_SHIFT_PX = 1e-5
@@ -163,13 +163,15 @@ class SigmaFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intrinsics:
-    """Intrinsics of c cameras after the adjustment."""
+    """Intrinsics of a camera after the adjustment."""
 
-    cameras: tuple[Camera, ...]
+    camera: Camera
     colmap_model: str
-    covariance: np.ndarray  # (cq, cq) of the parameters of ``colmap_model``, camera by camera
-    models: tuple[MetricModel, ...]  # of one folder's board by one camera, mm, board frame
-    camera_of: tuple[int, ...]  # of each model
+    covariance: np.ndarray  # (q, q) of the parameters of ``colmap_model``, by how the photographs differ
+    independent: np.ndarray  # (q, q) by independent errors of pixels
+    differ: float  # by how much photographs differ more than their pixels explain, as a ratio of σ
+    freedom: np.ndarray  # (q,) effective degrees of freedom of what the photographs tell
+    models: tuple[MetricModel, ...]  # of one folder's board each, mm, board frame
     factors: SigmaFactors
     huber: float  # length of a normalised residual beyond which its weight decreases
     redundancy: int
@@ -177,25 +179,22 @@ class Intrinsics:
     solution: tuple[State, Setting]  # from which solutions of some of the views start
     restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
 
-    @property
-    def camera(self) -> Camera:
-        """The first camera. There are others only in a comparison of cameras."""
-        return self.cameras[0]
-
     def sigma(self) -> np.ndarray:
-        """Returns the standard deviations of the parameters, (cq,)."""
+        """Returns the standard deviations of the parameters, (q,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def residuals_px(self) -> np.ndarray:
         """Returns the residuals of all observations, (n, 2)."""
-        parts = [m.residuals_px(self.cameras[k]) for m, k in zip(self.models, self.camera_of, strict=True)]
-        return np.concatenate(parts)
+        return np.concatenate([model.residuals_px(self.camera) for model in self.models])
+
+    def prints(self) -> dict[str, tuple[float, float]]:
+        """Returns by how much more the board of each folder is stretched along its rows than across, and its shear."""
+        boards = self.solution[1].boards
+        return {m.group: boards[m.group].modes.stretch(m.xyz_model - boards[m.group].places) for m in self.models}
 
     def weights(self) -> list[np.ndarray]:
         """Returns the Huber weights of each model."""
-        return [
-            robust_weights(m, self.cameras[k], self.huber) for m, k in zip(self.models, self.camera_of, strict=True)
-        ]
+        return [robust_weights(model, self.camera, self.huber) for model in self.models]
 
 
 def model_parameters(camera: Camera, colmap_model: str) -> np.ndarray:
@@ -221,42 +220,44 @@ def adjust_intrinsics(
     board: BoardDesign,
     start: Camera,
     colmap_model: str,
-    camera_of_view: Sequence[int] | None = None,  # for a comparison of cameras 0, 1, … on the same boards
-    factors: SigmaFactors | None = None,  # of σ; estimated if None
     held: bool = False,  # intrinsics stay at ``start``, and ``covariance`` is (0, 0)
 ) -> Intrinsics:
     """Adjusts the intrinsics from ``start`` by at least three views, with dots of the board only."""
     basis = intrinsic_basis(colmap_model)[:, : 0 if held else None]
-    state = _start_state(views, camera_of_view or [0] * len(views), board, start)
-    c = len(state.cameras)
+    models = []
+    for folder, members in by_group(views).items():
+        labels = tuple(sorted({label for view in members for label in view.labels}))
+        models.append(model_of_views(folder, labels, members, board, start))
+    state = State(tuple(models), start)
     setting = Setting(
-        basis=(basis,) * c,
-        weight=(np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),) * c,
-        start=(start,) * c,
-        shape={model.group: BoardShape.of(model.xyz_model) for model in state.models},
+        basis=basis,
+        weight=np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),
+        start=start,
+        boards={m.group: Board(m.xyz_model, PrintModes.of(m.xyz_model[:, :2])) for m in models},
         sigma_mm=board.sigma_mm,
         huber=np.inf,
     )
     try:
-        return _adjusted(state, setting, board, colmap_model, factors)
+        return _adjusted(state, setting, board, colmap_model)
     except ConvergenceError:
         if held:
             raise
     # A focal length far off makes the rest of the lens wander: it comes first, alone.
-    result = _adjusted(_with_focal_length(state, setting), setting, board, colmap_model, factors)
+    result = _adjusted(_with_focal_length(state, setting), setting, board, colmap_model)
     return replace(result, restarted=True)
 
 
 def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
     """Returns the intrinsics of an adjustment, from its ``last`` normal equations."""
-    state, setting = last.state, last.setting
-    covariance = np.linalg.inv(last.normal)
+    state, setting, by_photographs = last.state, last.setting, last.by_photographs()
     return Intrinsics(
-        cameras=state.cameras,
+        camera=state.camera,
         colmap_model=colmap_model,
-        covariance=(covariance + covariance.T) / 2,
+        covariance=by_photographs.covariance,
+        independent=by_photographs.independent,
+        differ=by_photographs.differ,
+        freedom=by_photographs.freedom,
         models=state.models,
-        camera_of=state.camera_of,
         factors=factors,
         huber=setting.huber,
         redundancy=state.redundancy(setting.kept),
@@ -278,20 +279,7 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
     last = _stepped(state.only({view.name for view in views}), setting)
     if last is None:
         return adjust_intrinsics(views, board, result.camera, result.colmap_model)
-    return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors), True)
-
-
-def of_two_halves(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
-    """Returns the intrinsics of two cameras, of which each took every second view of the same boards."""
-    state, setting = result.solution
-    half = [i % 2 for i in range(len(views))]
-    halves = state.in_two({view.name: k for view, k in zip(views, half, strict=True)})
-    last = _stepped(
-        halves, replace(setting, basis=setting.basis * 2, weight=setting.weight * 2, start=setting.start * 2)
-    )
-    if last is None:
-        return adjust_intrinsics(views, board, result.camera, result.colmap_model, half, result.factors)
-    return _intrinsics(last, result.colmap_model, result.factors, True)
+    return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
 
 
 def _stepped(state: State, setting: Setting) -> Normal | None:
@@ -307,16 +295,10 @@ def _stepped(state: State, setting: Setting) -> Normal | None:
     return None
 
 
-def _adjusted(
-    state: State, setting: Setting, board: BoardDesign, colmap_model: str, known: SigmaFactors | None
-) -> Intrinsics:
-    """Alternates minimisation and estimation of σ and eccentricity; ``known``: factors of σ, estimated if None."""
-    detected_covariance, factors = [m.covariance_px2 for m in state.models], known or SigmaFactors()
-    last: Normal | None = None
-    settled = False
+def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: str) -> Intrinsics:
+    """Alternates minimisation and estimation of σ, amplitudes of the prints, and eccentricity."""
+    detected_covariance, factors = [m.covariance_px2 for m in state.models], SigmaFactors()
     for round_index in range(MAX_ROUNDS):
-        if last is not None and round_index == FLAT_AFTER:
-            setting = replace(setting, shape=last.with_flat_boards())
         before = state
         state = _weighted(state, detected_covariance, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
@@ -325,38 +307,27 @@ def _adjusted(
         robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
         setting = replace(setting, huber=HUBER * robust)
         last = Normal.of(state, setting)
-        updated = known or _updated_factors(last, factors)
-        change = max(abs(updated.centres / factors.centres - 1), abs(updated.dots / factors.dots - 1))
-        factors = updated
-        settled = bool(round_index >= FLAT_AFTER and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
+        updated, boards = _updated_factors(last, factors)
+        changes = [updated.centres / factors.centres, updated.dots / factors.dots] + [
+            boards[folder].modes.amplitude / old.modes.amplitude for folder, old in setting.boards.items()
+        ]
+        factors, setting = updated, replace(setting, boards=boards)
+        change = float(np.abs(np.log(changes)).max())
+        settled = bool(round_index >= LEAST_ROUNDS and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
         if settled:
             break
-    assert last is not None
     return _intrinsics(last, colmap_model, factors, settled)
 
 
 def _with_focal_length(state: State, setting: Setting) -> State:
     """Returns the state of least cost over the focal lengths alone, each of all of a camera, with robust weights."""
     basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
-    weights = tuple(np.full((1, 1), camera.focal[0] ** -2.0) for camera in setting.start)
-    setting = replace(setting, basis=(basis,) * len(weights), weight=weights)
+    setting = replace(setting, basis=basis, weight=np.full((1, 1), setting.start.focal[0] ** -2.0))
     for _ in range(FOCAL_ROUNDS):
         state = minimum(state, setting)
         robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
         setting = replace(setting, huber=HUBER * robust)
     return state
-
-
-def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> State:
-    models, camera_numbers = [], []
-    camera_of = {v.name: k for v, k in zip(views, camera_of_view, strict=True)}
-    for folder, members in by_group(views).items():
-        labels = tuple(sorted({label for v in members for label in v.labels}))
-        for k in sorted({camera_of[v.name] for v in members}):
-            of_camera = [v for v in members if camera_of[v.name] == k]
-            models.append(model_of_views(folder, labels, of_camera, board, start))
-            camera_numbers.append(k)
-    return State(tuple(models), tuple(camera_numbers), (start,) * (max(camera_numbers) + 1))
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
@@ -385,19 +356,20 @@ def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board:
     models = tuple(
         replace(
             m,
-            shift_px=eccentricity_px(m, state.cameras[k], radius, 1.0),
+            shift_px=eccentricity_px(m, state.camera, radius, 1.0),
             covariance_px2=factors.centres**2 * covariance,
         )
-        for m, k, covariance in zip(state.models, state.camera_of, own, strict=True)
+        for m, covariance in zip(state.models, own, strict=True)
     )
     return replace(state, models=models)
 
 
-def _updated_factors(last: Normal, factors: SigmaFactors) -> SigmaFactors:
-    """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy."""
+def _updated_factors(last: Normal, factors: SigmaFactors) -> tuple[SigmaFactors, dict[str, Board]]:
+    """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy, and
+    the boards with the amplitudes of their prints."""
     state, setting = last.state, last.setting
-    dots_left, dots = last.dots_left(), factors.dots
-    image_redundancy = state.redundancy(setting.kept) - dots_left
+    dots_left, boards = last.with_found_prints()
+    dots, image_redundancy = factors.dots, state.redundancy(setting.kept) - dots_left
     if dots_left > MIN_BOARD_REDUNDANCY:
         dots = max(LEAST_DOTS, dots * sigma_factor(dots_costs(state, setting)[0], dots_left))
-    return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots)
+    return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards

@@ -8,7 +8,7 @@ from stcal.report.document import Document, Section, Table, alarms, page_only, p
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
 from stcal.sfm.camera.calibrate import CameraCalibration
-from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
+from stcal.sfm.camera.checks import GRID
 from stcal.sfm.camera.file import CalibrationFile
 
 CELLS = (12, 8)
@@ -43,6 +43,13 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
         f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
     )
+    differ = f"photographs differ {summary.photographs_differ:.2f} times as much as their pixels explain; σ include it"
+    prints = [
+        f"board{'' if each.folder == '.' else f' of {each.folder}'}: printed {100 * abs(each.stretch):.3f} % longer "
+        f"{'along its rows than across' if each.stretch > 0 else 'across its rows than along'}, sheared by "
+        f"{100 * abs(each.shear):.3f} %"
+        for each in summary.prints
+    ]
     return Document(
         "Calibration of a camera",
         f"{where}: {summary.model}, {summary.size_px[0]}×{summary.size_px[1]} px: {len(result.views)} views of the "
@@ -57,8 +64,9 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
                     "the principal point counts from the centre of the top-left pixel; the camera file, as COLMAP's, "
                     f"counts from that pixel's corner, so that cx, cy are {COLMAP_PIXEL_ORIGIN:g} px larger there",
                     sigma,
+                    differ,
                     held_out,
-                    *_split_half(result),
+                    *prints,
                     plot(lambda: distortion_figure(lens), "What the lens moves"),
                 ],
                 terminal=True,
@@ -70,15 +78,6 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
                     "which poses absorb. White: dots",
                     plots(
                         plot(lambda: sigma_map(result), "σ of a projection over the image", "σ, by the covariance", ""),
-                        None
-                        if result.split is None
-                        else plot(
-                            lambda: _halves(result),
-                            "difference of two halves over the image",
-                            f"Every second view against the others: {result.split.verdict}, p = "
-                            f"{result.split.p_value:.2g}",
-                            "",
-                        ),
                     ),
                 ],
             ),
@@ -117,17 +116,6 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     )
 
 
-def _split_half(result: CameraCalibration) -> list[str]:
-    split = result.split
-    if split is None:
-        return []
-    return [
-        f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
-        f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected (suspicious by chance in one "
-        f"calibration in {1 / SUSPICIOUS_P:,.0f}, failed in one in {1 / FAILED_P:,.0f})"
-    ]
-
-
 def _image_axes(camera: Camera) -> Axes:
     drawing = Drawing(5.6, 0.6 + 4.4 * camera.height / camera.width)
     box = drawing.panels(top=20, right=44)[0]
@@ -152,12 +140,6 @@ def _map(result: CameraCalibration, values: np.ndarray, label: str) -> Drawing:
 
 def sigma_map(result: CameraCalibration) -> Drawing:
     return _map(result, result.projection.sigma_px, "σ, px")
-
-
-def _halves(result: CameraCalibration) -> Drawing:
-    assert result.split is not None
-    moved = projection_jacobian(result.intrinsics.camera, result.intrinsics.colmap_model) @ result.split.difference
-    return _map(result, np.linalg.norm(moved, axis=1), "px")
 
 
 def residual_map(result: CameraCalibration) -> Drawing:

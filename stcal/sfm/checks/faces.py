@@ -18,7 +18,7 @@ from stcal.sfm.adjust.calibration import AdjustOptions, Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
-from stcal.sfm.adjust.uncertainty import calibrated_target
+from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
 from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Guilt, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import MetricModel
 
@@ -69,7 +69,7 @@ def _adjusted(models: Sequence[MetricModel], board, flatness_mm, whole: JointRes
     if not models:
         return _unfixed(models)
     try:
-        return adjust_part(models, board, flatness_mm, whole)
+        return result_of(adjust_part(models, board, flatness_mm, whole))
     except StcalError as error:
         return error
     except np.linalg.LinAlgError:

@@ -12,6 +12,7 @@ from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.equations import rows_of_view
 from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
+from stcal.sfm.adjust.uncertainty import result_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.bodies import body_views
 from stcal.sfm.planning.forecast import (
@@ -103,7 +104,7 @@ class Known(Brief):
 def known_of(run: SavedRun) -> Known:
     """Returns the geometry of a finished run, adjusted once more for the data that ``faces.json`` does not contain."""
     again = adjusted_run(run)
-    joint = again.state.result()
+    joint = result_of(again.state)
     heights, rim_sigma_mm = run.rims_mm()
     rims = rim_covariance_mm2(joint, again.start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
     setup = Setup(
@@ -198,7 +199,7 @@ def _greedy(
         progress(f"view {len(chosen) + 1}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         chosen.append(Choice(views[best], *worst_of(results[best])))
-        rows = rows_of_view(views[best].model, setup.camera, basis_of(setup.prior))
+        rows, _ = rows_of_view(views[best].model, setup.camera, basis_of(setup.prior))
         photographs[views[best].group] = photographs[views[best].group] + rows.T @ rows
         keep = _promising(results) - {best}
         views = [views[i] for i in sorted(keep)]

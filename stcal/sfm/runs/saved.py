@@ -40,6 +40,7 @@ from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
+from stcal.sfm.adjust.photographs import with_differences
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -329,7 +330,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     )
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
-    return AdjustedRun(state, start, prior)
+    return AdjustedRun(with_differences(state, start, run.target_design, run.options.frame), start, prior)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ import pytest
 
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid, Similarity, align_similarity
+from stcal.sfm.adjust.calibration import NOTED, AdjustOptions, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px, refine
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -138,6 +139,41 @@ def test_joint_beats_the_chain(draws, labels_only):
         for values, one in ((joint, target), (chain, chained)):
             values += [float((e[3:] ** 2).sum()) for e in pose_errors(scene, one).values()]
     assert 1.15 < np.sqrt(np.mean(chain) / np.mean(joint)) < 1.4
+
+
+def with_a_field(images, rng, sigma_px: float, length_px: float = 250.0):
+    """The images with errors that neighbouring places of one photograph have in common."""
+    moved = []
+    for image in images:
+        apart = ((image.centre_px[:, None] - image.centre_px) ** 2).sum(2)
+        root = np.linalg.cholesky(np.exp(-apart / 2 / length_px**2) + 1e-9 * np.eye(len(image)))
+        moved.append(replace(image, centre_px=image.centre_px + sigma_px * root @ rng.standard_normal((len(image), 2))))
+    return moved
+
+
+@pytest.mark.slow
+def test_sigma_grow_by_how_much_photographs_differ(scenes, labels_only):
+    """With a field of twice the centres' σ, errors are beyond σ of independent pixels, and within those stated."""
+    stated, independent = [], []
+    for seed, scene in enumerate(scenes):
+        radius, rng = scene.target.radius_of() | scene.board.radius_of(), np.random.default_rng(seed)
+        plain = labels_only.observations(scene, NOISE_PX, rng)
+        differ = []
+        for images in (plain, with_a_field(plain, rng, 2 * NOISE_PX)):
+            starts = labels_only.models(scene, images)
+            models = [
+                adjust(replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)), scene.camera) for m in starts
+            ]
+            found = calibrate(models, scene.camera, scene.target, scene.board, AdjustOptions(scene.target.faces[0].id))
+            differ.append(found.joint.differ)
+        assert differ[0] < 1.25
+        assert differ[1] > 1.2
+        assert (found.joint.differ > NOTED) == any("photographs differ" in note for note in found.notes)
+        for face, error in pose_errors(scene, found.target).items():
+            square = error @ np.linalg.solve(found.target.face_covariance[face], error) / 6
+            stated.append(square)
+            independent.append(square * found.joint.differ**2)  # but for the board's part
+    assert np.mean(stated) < 1.6 < np.mean(independent)  # 1.09 and 1.99
 
 
 def test_circles_carry_covariances_in_the_target_frame(scene, labels_only):

@@ -1,0 +1,173 @@
+#!/usr/bin/env python
+"""Are σ true? Random halves of real photographs, two cameras of one body, and simulated views, against stated σ.
+
+Printed is χ² per degree of freedom, 1 where σ are right. Cameras: the views of a set are drawn into two halves, each
+calibrates by itself, and the difference of the two answers is over the sum of their covariances. Bodies: two cameras
+have photographed one cube, each with its own run; the poses of its faces are compared. Simulated: errors against the
+truth, `field` with errors of twice the noise that neighbouring places of a photograph have in common, `print` with
+boards stretched, sheared and curved as printers do, `bad` with one photograph whose errors are eight times the noise.
+
+.venv/bin/python scripts/studies/halves_study.py [--part all|cameras|bodies|simulated] [--draws N]
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from real_bodies import pycamset_cube
+from scipy.spatial.transform import Rotation
+
+from scripts.runner import options_of
+from stcal.boards.design import ChessboardDesign
+from stcal.boards.file import load_flat_board
+from stcal.design import BoardDesign, reference_board
+from stcal.errors import StcalError
+from stcal.geometry.camera import Camera
+from stcal.geometry.print_modes import PrintModes
+from stcal.io.design import target_of
+from stcal.sfm import pipeline
+from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
+from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
+from stcal.sfm.data.model import ImageObservations
+from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+CAMERAS = {
+    "ChArUco 1, real": ("real/pycamset_charuco/1", "real/pycamset_charuco/board.toml"),
+    "ChArUco 2, real": ("real/pycamset_charuco/2", "real/pycamset_charuco/board.toml"),
+    "chessboard, real": ("real/multidic_chessboard/201", "real/multidic_chessboard/board.toml"),
+    "dots, rendered clean": ("stereo_target/clean/images", None),
+    "dots, rendered exact": ("stereo_target/exact/images_png", None),
+    "dots, rendered focus": ("stereo_target/focus/images_png", None),
+}
+GROUPS = {"f": slice(0, 2), "c": slice(2, 4), "lens": slice(4, None), "all": slice(None)}
+KINDS = ("none", "field", "print", "few", "few print", "bad")
+NOISE_PX = 0.02
+FIELD_PX = 250.0
+TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
+
+
+def squares(off: np.ndarray, covariance: np.ndarray) -> list[float]:
+    """χ² per degree of freedom of each group of parameters."""
+    parts = [(off[own], covariance[own, own]) for own in GROUPS.values()]
+    return [float(e @ np.linalg.solve(c, e) / len(e)) for e, c in parts]
+
+
+def row(name: str, table: Sequence[Sequence[float]], *more: str) -> str:
+    """A row of the table: the mean of each column, and its standard error for the last."""
+    values = np.array(table)
+    error = values[:, -1].std(ddof=1) / np.sqrt(len(values))
+    return f"| {' | '.join([name, *(f'{v:.2f}' for v in values.mean(0)), f'{error:.2f}', *more])} |"
+
+
+def parameters(result: Intrinsics) -> np.ndarray:
+    """Of the lens model, (q,)."""
+    return model_parameters(result.camera, result.colmap_model)
+
+
+def halves(calibration: CameraCalibration, board: BoardDesign, draws: int) -> Iterator[list[float]]:
+    """χ² of the difference of random halves; a draw whose half does not determine the camera is left out."""
+    rng, views = np.random.default_rng(0), calibration.views
+    for _ in range(draws):
+        drawn = rng.permutation(len(views))
+        parts = [sorted(drawn[: len(views) // 2]), sorted(drawn[len(views) // 2 :])]
+        try:
+            one, two = (of_some_views(calibration.intrinsics, [views[i] for i in part], board) for part in parts)
+        except StcalError:
+            continue
+        yield squares(parameters(one) - parameters(two), one.covariance + two.covariance)
+
+
+def of_cameras(draws: int) -> None:
+    """Print the table of halves."""
+    print("| photographs | views | f | c | lens | all | ± | photographs differ, × σ | stretch, % |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for name, (folder, file) in CAMERAS.items():
+        if not (DATA / folder).is_dir():
+            continue
+        if file is None:
+            board = reference_board()
+            calibration = calibrate_camera(DATA / folder, target_of(None), board)
+        else:
+            flat = load_flat_board(DATA / file)
+            board, calibration = corner_grid(flat), calibrate_camera_by_corners(DATA / folder, flat)
+        result, table = calibration.intrinsics, list(halves(calibration, board, draws))
+        stretch = ", ".join(f"{100 * own[0]:.3f}" for own in result.prints().values())
+        name = f"{name} | {len(calibration.views)}"
+        print(row(name, table, f"{result.differ:.2f}", stretch), flush=True)
+
+
+def of_bodies() -> None:
+    """Print χ² of the poses that two cameras find of the faces of one cube."""
+    runs = []
+    for camera in ("cam0", "cam1"):
+        with tempfile.TemporaryDirectory() as scratch:
+            images = DATA / "real" / "pycamset_cube" / camera
+            runs.append(pipeline.run(images, None, Path(scratch) / "run", pycamset_cube()).target)
+    one, two = runs
+    apart = []
+    for face in one.target_from_face.keys() & two.target_from_face.keys() - {one.reference_face}:
+        off = two.target_from_face[face].difference(one.target_from_face[face])
+        covariance = one.face_covariance[face] + two.face_covariance[face]
+        apart.append(float(off @ np.linalg.solve(covariance, off) / 6))
+    print(f"\ncube of ChArUco faces, real, two cameras: {np.mean(apart):.2f} (faces {np.round(sorted(apart), 2)})")
+
+
+def simulated(rng: np.random.Generator, kind: str) -> list[ImageObservations]:
+    """Views of the reference board, held by hand 0.3 to 0.6 m away."""
+    board, views = reference_board(), []
+    count = 5 if "few" in kind else 14
+    places = np.column_stack([board.xy_mm(), np.zeros(63)]) + board.sigma_mm * rng.standard_normal((63, 3))
+    if "print" in kind:
+        modes = PrintModes.of(board.xy_mm())
+        places += (modes.modes @ (modes.spread_mm * rng.standard_normal(len(modes.spread_mm)))).reshape(63, 3)
+    size = np.array([TRUE.width, TRUE.height])
+    while len(views) < count:
+        angles = [rng.uniform(-180, 180), *rng.uniform(-35, 35, 2)]
+        depth = rng.uniform(300, 600)
+        middle = np.append(rng.uniform(-0.35, 0.35, 2) * size / TRUE.focal * depth, depth)
+        turned = (places - [120.0, 90.0, 0.0]) @ Rotation.from_euler("zxy", angles, degrees=True).as_matrix().T
+        xy = TRUE.project(turned + middle)
+        seen = ((xy > 20) & (xy < size - 20)).all(1)
+        if seen.sum() < 30:
+            continue
+        xy, n = xy[seen], int(seen.sum())
+        common = {"field": 2.0, "bad": 8.0 * (len(views) == 3)}.get(kind, 0.0) * NOISE_PX
+        apart = ((xy[:, None] - xy) ** 2).sum(2)
+        root = np.linalg.cholesky(np.exp(-apart / 2 / FIELD_PX**2) + 1e-9 * np.eye(n))
+        xy = xy + common * root @ rng.standard_normal((n, 2)) + NOISE_PX * rng.standard_normal((n, 2))
+        labels = tuple(label for label, s in zip(board.labels(), seen, strict=True) if s)
+        shape, covariance = np.tile(np.eye(2), (n, 1, 1)), np.tile(NOISE_PX**2 * np.eye(2), (n, 1, 1))
+        views.append(ImageObservations(f"{len(views)}.jpg", ".", labels, xy, np.zeros((n, 2)), shape, covariance))
+    return views
+
+
+def of_simulated(draws: int) -> None:
+    """Print χ² of errors, and σ over those of independent errors of pixels."""
+    print("\n| simulated | f | c | lens | all | ± | σ over those of independent pixels |")
+    print("|---|---|---|---|---|---|---|")
+    board = corner_grid(ChessboardDesign(7, 9, 30.0, 0.005))  # the places of the dots, without their extent
+    for kind in KINDS:
+        table, larger = [], []
+        for seed in range(draws):
+            result = adjust_intrinsics(simulated(np.random.default_rng(seed), kind), board, TRUE, "OPENCV")
+            off = parameters(result) - model_parameters(TRUE, "OPENCV")
+            table.append(squares(off, result.covariance))
+            larger.append(np.sqrt(np.diag(result.covariance) / np.diag(result.independent)).mean())
+        print(row(kind, table, f"{np.mean(larger):.2f}"), flush=True)
+
+
+def main() -> None:
+    """Print the tables."""
+    arguments = options_of(__doc__, part="all", draws=20)
+    if arguments.part in ("all", "cameras"):
+        of_cameras(arguments.draws)
+    if arguments.part in ("all", "bodies") and (DATA / "real" / "pycamset_cube").is_dir():
+        of_bodies()
+    if arguments.part in ("all", "simulated"):
+        of_simulated(arguments.draws)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Covariance by clusters: σ from how photographs, or other clusters of observations, differ from one another.
+
+Residuals of one photograph have much in common that a model of independent errors does not know: light, focus, the
+edges of its blur. Photographs are what is drawn anew; how their pulls on the answer scatter tells σ, whatever they have
+in common inside (Liang & Zeger 1986). With few of them that scatter is itself uncertain; it is corrected for the
+share that a photograph has in the answer (CR2, Bell & McCaffrey 2002), drawn towards one common factor as far as chance
+explains the difference (Ledoit & Wolf 2004), and what it adds is that of Student's distribution.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+MOST_SHARE = 1 - 1e-6
+"""Largest share of a direction's information in one cluster for which its pull is corrected."""
+LEAST_FREEDOM = 3.0
+"""Smallest number of degrees of freedom for which Student's variance is used, which is infinite for two."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ByClusters:
+    """Covariance (q, q) of the parameters, never below the ``independent`` one, of independent errors.
+
+    ``differ`` : by how much clusters differ more than independent errors explain, as a ratio of σ; ``freedom`` : (q,)
+    effective degrees of freedom of what they tell about each parameter.
+    """
+
+    covariance: np.ndarray
+    independent: np.ndarray
+    differ: float
+    freedom: np.ndarray
+
+
+def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -> ByClusters:
+    """Return the covariance of parameters at a minimum, from the n clusters of its observations.
+
+    Parameters
+    ----------
+    normal : (q, q) normal matrix, priors included
+    pull : (n, q) half the downhill gradient of each cluster's cost, other unknowns eliminated
+    information : (n, q, q) each cluster's part of ``normal``
+    """
+    inverse = np.linalg.inv(normal)
+    half = np.linalg.cholesky((inverse + inverse.T) / 2)
+    unit = half.T @ information @ half
+    share, axes = np.linalg.eigh((unit + np.swapaxes(unit, 1, 2)) / 2)
+    along = (np.swapaxes(axes, 1, 2) @ (pull @ half)[..., None])[..., 0]
+    rows = (axes @ (along / np.sqrt(1 - np.clip(share, 0, MOST_SHARE)))[..., None])[..., 0]
+    scatter, n = rows.T @ rows, len(rows)
+    told = unit.sum(0)
+    factor = float(np.trace(scatter) / max(np.trace(told), 1e-300))
+    common = max(1.0, factor) * told
+    by_chance = sum(((n * np.outer(row, row) - scatter) ** 2).sum() for row in rows) / n**2
+    drawn = min(1.0, by_chance / max(((scatter - common) ** 2).sum(), 1e-300))
+    value, vector = np.linalg.eigh(drawn * common + (1 - drawn) * scatter + np.eye(len(told)) - told)
+    more = half @ (vector * np.maximum(value - 1, 0)) @ vector.T @ half.T
+    of_cluster = np.einsum("pi,vij,jp->pv", inverse, information, inverse)
+    freedom = of_cluster.sum(1) ** 2 / np.maximum((of_cluster**2).sum(1), 1e-300) - 1
+    counted = np.maximum(freedom, LEAST_FREEDOM)
+    student = np.sqrt(counted / (counted - 2))
+    covariance = inverse + student[:, None] * more * student
+    return ByClusters((covariance + covariance.T) / 2, (inverse + inverse.T) / 2, float(np.sqrt(factor)), freedom)

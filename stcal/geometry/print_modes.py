@@ -1,0 +1,131 @@
+"""Smooth deviations of a printed plane from its drawing, as printers and paper have them, and how large they are.
+
+A printer feeds paper at another rate than it moves its head: a print is longer in one direction, sheared, and by less
+curved; a sheet bends. All points of the plane follow together, by far more than each deviates by itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+PRINT_SHARE = 0.003
+"""σ of a print's stretch, shear and curving at its edge, relative to its half extent: printers are 0.2 to 0.5 % off."""
+BEND_SHARE = 0.01
+"""σ of a sheet's bends out of its plane, likewise: 1 mm on 200 mm, more than that of any board in use."""
+LEAST_SHARE = 1e-3
+"""A mode that moves the points by less than this share of what it moves others by is not told by them."""
+AMPLITUDES = (1e-3, 10.0)
+"""Smallest and largest factor on these σ."""
+PRIOR_LOGS = np.log(10.0)
+"""σ of the logarithm of the factor before the data are seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrintModes:
+    """Smooth deviations of n points: ``modes`` (3n, m), orthonormal, and the σ of their coordinates, (m,) mm.
+
+    The size is not among them: it is stated, or the scale of all that is measured. ``within`` : (m,) True for modes in
+    the plane; ``amplitude`` : factor on the σ that printers and paper have.
+    """
+
+    modes: np.ndarray
+    spread_mm: np.ndarray
+    within: np.ndarray
+    amplitude: float = 1.0
+
+    @classmethod
+    def of(cls, xy: np.ndarray) -> "PrintModes":
+        """Return the modes of points (n, 2) of a plane: stretch, shear, six of second order within it, three bends."""
+        xy = xy - xy.mean(axis=0)
+        half = max(float(np.ptp(xy, axis=0).max()) / 2, 1e-9)
+        x, y = xy.T / half
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        motions = [(one, zero, zero), (zero, one, zero), (-y, x, zero), *((zero, zero, v) for v in (one, x, y))]
+        second = (x * x, x * y, y * y)
+        within = [(x, -y, zero), (y, x, zero), *((v, zero, zero) for v in second), *((zero, v, zero) for v in second)]
+        columns = [(mode, PRINT_SHARE) for mode in within] + [((zero, zero, v), BEND_SHARE) for v in second]
+        known = np.linalg.qr(np.column_stack([np.column_stack(mode).ravel() for mode in [*motions, (x, y, zero)]]))[0]
+        modes, spread = [], []
+        for mode, share in columns:
+            column = np.column_stack(mode).ravel()
+            for _ in range(2):  # twice, for rounding
+                column = column - known @ (known.T @ column)
+            size = float(np.linalg.norm(column))
+            if size > LEAST_SHARE * np.sqrt(len(x)):
+                known = np.column_stack([known, column / size])
+                modes.append(column / size)
+                spread.append(share * half * (size if share == PRINT_SHARE else np.sqrt(len(x))))
+        table = np.column_stack(modes) if modes else np.zeros((3 * len(x), 0))
+        return cls(table, np.array(spread), np.abs(table[2::3]).max(axis=0, initial=0.0) < 1e-9)
+
+    def stretch(self, off_mm: np.ndarray) -> tuple[float, float]:
+        """Return by how much more the print is stretched in x than in y, and its shear, from deviations (n, 3)."""
+        first = slice(0, 2)  # relative to the half extent, as their σ are
+        affine = self.modes[:, first].T @ off_mm.ravel() * PRINT_SHARE / self.spread_mm[first]
+        return (2 * float(affine[0]), 2 * float(affine[1])) if len(affine) == 2 else (0.0, 0.0)
+
+    def variances(self, sigma_mm: float) -> np.ndarray:
+        """Return the variances (m,) of the modes' coordinates, where each point also has its own ``sigma_mm``."""
+        return sigma_mm**2 + (self.amplitude * self.spread_mm) ** 2
+
+    def weight(self, sigma_mm: float) -> np.ndarray:
+        """Return the inverse covariance (3n, 3n) of the points' places."""
+        less = 1 / sigma_mm**2 - 1 / self.variances(sigma_mm)
+        return np.eye(len(self.modes)) / sigma_mm**2 - (self.modes * less) @ self.modes.T
+
+    def costs(self, off_mm: np.ndarray, sigma_mm: float) -> tuple[float, float]:
+        """Return the χ² of deviations (n, 3) from the drawing: of the points by themselves, and of the modes."""
+        flat = off_mm.ravel()
+        along = self.modes.T @ flat
+        of_modes = float((along**2 / self.variances(sigma_mm)).sum())
+        return float(flat @ flat - along @ along) / sigma_mm**2, of_modes
+
+    def as_found(self, off_mm: np.ndarray, covariance: np.ndarray, sigma_mm: float) -> "PrintModes":
+        """Return the modes with the amplitude that explains the deviations best.
+
+        ``off_mm`` : (n, 3) adjusted with this amplitude; ``covariance`` : (m, m) of the modes' coordinates after the
+        adjustment.
+        """
+        told = Told(
+            self.modes.T @ off_mm.ravel(), covariance, np.full(len(self.spread_mm), sigma_mm**2), self.spread_mm
+        )
+        return replace(self, amplitude=found_amplitude([told], self.amplitude))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """What an adjustment tells about the modes of one print: ``mean`` (m,) and ``covariance`` (m, m) of their
+    coordinates, the variance ``own`` (m,) that they have anyway, and ``spread`` (m,) at an amplitude of 1, mm."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    own: np.ndarray
+    spread: np.ndarray
+
+    def prior(self, amplitude: float) -> np.ndarray:
+        """Return the variances (m,) of the coordinates before the data."""
+        return self.own + (amplitude * self.spread) ** 2
+
+
+def found_amplitude(prints: Sequence[Told], amplitude: float) -> float:
+    """Return the amplitude that explains the modes of all prints best, by restricted maximum likelihood.
+
+    ``amplitude`` : the one of the adjustment. Where the data tell nothing, the answer stays near 1.
+    """
+    images = []
+    for each in prints:
+        known = np.linalg.inv(each.covariance)
+        images.append((each, known - np.diag(1 / each.prior(amplitude)), known @ each.mean))
+
+    def misfit(log: float) -> float:
+        total = (log / PRIOR_LOGS) ** 2
+        for each, told, right in images:
+            root = np.sqrt(each.prior(np.exp(log)))
+            inner, pull = np.eye(len(root)) + root[:, None] * told * root, root * right
+            total += float(np.linalg.slogdet(inner)[1] - pull @ np.linalg.solve(inner, pull))
+        return total
+
+    found = minimize_scalar(misfit, bounds=np.log(AMPLITUDES), method="bounded", options={"xatol": 1e-3})
+    return float(np.exp(found.x))
