@@ -58,6 +58,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     ),
     "bouguet_m": (Typed(values=camera(657.395, 657.763, 302.984, 242.617, -0.2559, 0.1276, -0.0002, 0.00003)),),
     "camodocal": (Typed(INPUT, "E-POSES-NOT-FOUND", ("no poses in keys frameCount, T1_0", "4×4 matrices in JSON")),),
+    "chess_stretched_5_views": (Typed(says=("printed 0.508 % longer across its rows than along",)),),
     "colmap_300_cameras": (Typed(values=camera(1503, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)),),
     "ehe_eye_on_base_forgotten": (
         Typed(says=("do not use: the camera is 1426 mm off the flange", "give --setup eye-to-hand")),
@@ -68,6 +69,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     ),
     "euroc_sensor": (Typed(values=camera(458.6, 457.2, 367.2, 248.3, -0.283, 0.0739, 0.000193, 1.76e-05)),),
     "exif": (Typed(INPUT, "E-CAMERA-EXIF", ("5.7 mm, but no size of its pixels", "give a camera file")),),
+    "he_repeated_4x": (Typed(says=("its errors there count once in σ",), never=("the board moved",)),),
     "interactive": (Typed(values=camera(*SAMPLES[0], *SAMPLES[1])),),
     "json_tabs": (Typed(values=camera(800, 801, 320.5, 240.5, -0.1, 0.02, 1e-4, -2e-4)),),
     "kitti": (Typed(INPUT, "E-CAMERA-CONTENT", ("COLMAP, OpenCV, ROS", "camera_matrix")),),
@@ -199,8 +201,8 @@ OPEN = set(
         r"\S+",
         """
     anamorphic_calibrate api_handeye_swapped api_limits_degrees api_masked board_pitch_3_percent check_raises
-    chess_stretched_5_views csv_formula drawing_y_down he_drift_1.7mm he_franka_column_major he_mobile_planar_4dof
-    he_repeated_4x he_scara_4dof_noise he_tcp_set_halfway isoluminant_circles keem_cube_folds live_rebinding
+    csv_formula drawing_y_down he_drift_1.7mm he_franka_column_major he_mobile_planar_4dof
+    he_scara_4dof_noise he_tcp_set_halfway isoluminant_circles keem_cube_folds live_rebinding
     loc_motion_blur_6px principal_point_outside pymp_left reg_million_pairs rob_orientation_by_controller
     rob_ur5_file_for_ur5e ros_coefficients scale_distance_wrong sqlite tag_twice_single tags_mirrored toml_dotted
     video_rotation_180

@@ -45,7 +45,7 @@ COLOURS = {
 }
 """Colour of each verdict's word."""
 VERDICTS = re.compile(
-    r"(?m)(?P<before>^ *|^(?:verdict|split-half check): |(?<=checks: )\d+ |(?<=, )\d+ )"
+    r"(?m)(?P<before>^ *|^verdict: |(?<=checks: )\d+ |(?<=, )\d+ )"
     rf"(?P<word>{'|'.join(COLOURS)})(?=[:;,]| *$)"
 )
 """Places of a verdict's word: before the judged item, after `verdict`, and in the counts of checks."""

@@ -24,7 +24,7 @@ from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, convex, solve_closed
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.joint import Adjusted, adjust_views, in_common, of_poses
 from stcal.handeye.methods.noise import Noise
-from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses
+from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses, by_places
 from stcal.handeye.methods.reprojection import CAMERA_GAIN, resected
 from stcal.handeye.result import HandEye
 from stcal.io.cameras.model import CameraPrior
@@ -291,6 +291,9 @@ def _by_poses(task: _Task) -> Solved:
     state, normal = solution.state, solution.normal
     x, z = state.mount_from_camera, state.stand_from_board
     notes, covariance = task.notes + contradicted, generalised_inverse(normal)
+    if not options.four_dof and (clusters := by_places(task.loop, solution)):
+        covariance = clusters.covariance
+        notes += (Aside("the robot stood several times at one place: its errors there count once in σ"),)
     sigma_scale = float(np.sqrt(covariance[12, 12])) if options.with_scale else None
     if sigma_scale is not None:
         require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, splits
+from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.solve import handeye
 from stcal.handeye.validate import better_setup
 from tests.levels import sampled
-from tests.support.handeye import simulated, simulated_views
+from tests.support.handeye import disturbed, error, simulated, simulated_views
 
 BAD = (8e-3, 3.0)
 """σ of a robot in need of repair: rad, mm."""
@@ -79,3 +81,20 @@ def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
     other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}[setup]
     assert better_setup(truth.pairs, setup, HandEyeOptions(), splits(5)) == ""
     assert f"give --setup {setup} if it is that" in better_setup(truth.pairs, other, HandEyeOptions(), splits(5))
+
+
+@pytest.mark.slow
+def test_poses_at_one_place_of_the_robot_count_once():
+    """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of the
+    squared error over the covariance is 18."""
+    squares = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        truth = simulated(rng, 6, robot=(1.7e-3, 0.6))
+        again = [pose for pose in truth.pairs.base_from_flange for _ in range(4)]
+        seen = [pose for pose in truth.pairs.camera_from_board for _ in range(4)]
+        found = handeye(HandEyePoses(Poses.of(again), disturbed(rng, Poses.of(seen), 1e-4, 0.05)))
+        off = error(found, truth)
+        squares.append(off @ np.linalg.solve(found.covariance, off) / 6)
+        assert any("several times at one place" in str(note) for note in found.notes)
+    assert np.mean(squares) < 2.5

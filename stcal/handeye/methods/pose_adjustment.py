@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
+from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise, perturbed
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
@@ -20,6 +22,8 @@ LEAST_POSES = 4
 ROUNDS = 30
 SEEN = 1e-6
 """Share of a pose's own variance below which this pose alone determined the solution and cannot contradict it."""
+SAME_RAD, SAME_MM = 2e-4, 0.05
+"""Largest difference of two poses of a robot that stands still: what its encoders resolve."""
 SETTLED = 1e-4
 """Relative change of the estimated σ between rounds below which the iteration has converged."""
 
@@ -111,6 +115,27 @@ def adjust_poses(
         scale_hint=_scale_hint(loop[used], state, residuals[used], covariance[used]),
         settled=settled,
     )
+
+
+def by_places(loop: Loop, solution: PoseSolution) -> ByClusters | None:
+    """Returns the covariance of X, Z (and the scale) where the robot stood several times at one place: what it errs
+    there is one error, not several. None if each pose has a place of its own."""
+    used = ~solution.outliers
+    own = loop[used]
+    robot, place = own.stand_from_mount, np.arange(len(own))
+    for i in range(len(own)):
+        turn = Rotation.from_matrix(robot.rotation[i].T @ robot.rotation[:i]).magnitude() if i else np.zeros(0)
+        away = np.linalg.norm(robot.translation[:i] - robot.translation[i], axis=1)
+        same = np.flatnonzero((turn < SAME_RAD) & (away < SAME_MM))
+        place[i] = place[same[0]] if len(same) else i
+    first, place = np.unique(place, return_inverse=True)
+    if len(first) == len(own) or len(first) < LEAST_POSES:
+        return None
+    jacobian = _jacobian(own, solution.state, len(solution.normal))
+    weighted, member = np.linalg.solve(solution.covariance[used], jacobian), np.eye(len(first))[place]
+    pull = -np.einsum("mai,ma->mi", weighted, solution.residuals[used])
+    information = np.einsum("mc,mai,maj->cij", member, weighted, jacobian)
+    return by_clusters(solution.normal, member.T @ pull, information)
 
 
 def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:

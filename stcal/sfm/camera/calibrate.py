@@ -24,6 +24,7 @@ from stcal.sfm.camera.checks import (
     choose_model,
     held_out,
     image_grid,
+    of_lens_model,
     projection_jacobian,
     projection_sigma,
 )
@@ -232,6 +233,7 @@ def judged(
     projection = projection_sigma(result)
     unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
     warnings = [*unseen, *_of_rounds(result, settled), *_warnings(result, projection, board)]
+    warnings += of_lens_model(result, views, board)
     try:
         of_held_out = held_out(result, views, board)
     except StcalError as error:
@@ -345,7 +347,7 @@ def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesig
     if result.factors.centres > SUSPICIOUS_FACTOR:
         warnings.append(
             f"residuals exceed the σ of the centres {result.factors.centres:.1f} times: σ are scaled by it, but images "
-            "are blurred or moved, or a --model with more parameters is needed"
+            "are blurred or moved"
         )
     if result.factors.dots > SUSPICIOUS_FACTOR:
         warnings.append(

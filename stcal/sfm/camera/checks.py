@@ -90,6 +90,55 @@ def _sigma_px(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("nip,pq,niq->n", jacobian, covariance, jacobian) / 2)
 
 
+CELLS = (12, 8)
+"""Number of cells of the image, in x and y, within which residuals are compared."""
+AGREEING, AGREEING_SIGMAS = 0.03, 4.0
+"""Correlation of residuals between photographs that is worth a larger lens model, and beyond chance."""
+LARGER = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
+    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"),
+    "OPENCV": "FULL_OPENCV",
+    "OPENCV_FISHEYE": "THIN_PRISM_FISHEYE",
+}
+"""The lens model to try where one is too small."""
+
+
+def mean_residuals(result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the weighted mean residual (v, cells, 2) of each photograph in each cell of the image, px, and the sum of
+    weights (v, cells)."""
+    camera, first = result.camera, np.cumsum([0, *(len(model.images) for model in result.models)])
+    image = np.concatenate([k + model.image_index for k, model in zip(first[:-1], result.models, strict=True)])
+    xy, weight = np.concatenate([model.measured_px for model in result.models]), np.concatenate(result.weights())
+    cell = np.clip((xy / (camera.width, camera.height) * CELLS).astype(int), 0, np.array(CELLS) - 1) @ [CELLS[1], 1]
+    mean, total = np.zeros((first[-1], CELLS[0] * CELLS[1], 2)), np.zeros((first[-1], CELLS[0] * CELLS[1]))
+    np.add.at(mean, (image, cell), weight[:, None] * result.residuals_px())
+    np.add.at(total, (image, cell), weight)
+    return mean / np.maximum(total, 1e-12)[..., None], total
+
+
+def agreement(result: Intrinsics) -> tuple[float, float]:
+    """Returns the correlation between photographs of residuals at the same place of the image, and its σ by chance.
+    What the lens model leaves is alike in all photographs; what light, focus and board leave is not."""
+    mean, total = mean_residuals(result)
+    square, count = (mean**2).sum(2), (total > 0).sum(0)
+    both = float(((mean.sum(0) ** 2).sum(1) - square.sum(0)).sum())
+    most, pairs = float(((count - 1) * square.sum(0)).sum()), float((count * (count - 1)).sum())
+    return (both / most, 1 / np.sqrt(pairs)) if most > 0 and pairs else (0.0, 1.0)
+
+
+def of_lens_model(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> list[str]:
+    """Returns a warning where residuals agree between photographs, with the larger lens model if that explains it."""
+    found, chance = agreement(result)
+    if found < max(AGREEING, AGREEING_SIGMAS * chance):
+        return []
+    said = f"residuals at one place of the image agree between photographs, correlation {found:.2f}"
+    larger = LARGER.get(result.colmap_model)
+    other = _fitted(views, board, result.camera, larger) if larger else None
+    if isinstance(other, Intrinsics) and (left := agreement(other)[0]) < found / 2:
+        return [f"{said}, {left:.2f} with {larger}: the lens model is too small; use --model {larger}"]
+    return [f"{said}, which is in no σ: look at the mean residuals, and at light that is alike in all photographs"]
+
+
 FOLDS = 5
 MIN_TRAINING = 3
 """Smallest number of views to calibrate with."""

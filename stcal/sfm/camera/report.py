@@ -7,12 +7,11 @@ from stcal.report.camera import distortion_figure
 from stcal.report.document import Document, Section, Table, alarms, page_only, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
+from stcal.sfm.adjust.calibration import NOTED
 from stcal.sfm.camera.calibrate import CameraCalibration
-from stcal.sfm.camera.checks import GRID
+from stcal.sfm.camera.checks import CELLS, GRID, mean_residuals
 from stcal.sfm.camera.file import CalibrationFile
 
-CELLS = (12, 8)
-"""Number of cells of the figure of residuals, in x and y."""
 MIN_IN_CELL = 3
 ARROW_SHARE = 0.7
 """Largest length of a drawn mean residual, as a share of the cell."""
@@ -43,7 +42,12 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
         f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
     )
-    differ = f"photographs differ {summary.photographs_differ:.2f} times as much as their pixels explain; σ include it"
+    times = summary.photographs_differ
+    differ = (
+        f"photographs differ {times:.1f} times more than their pixels explain; σ are larger by that"
+        if times > NOTED
+        else "photographs differ no more than their pixels explain"
+    )
     prints = [
         f"board{'' if each.folder == '.' else f' of {each.folder}'}: printed {100 * abs(each.stretch):.3f} % longer "
         f"{'along its rows than across' if each.stretch > 0 else 'across its rows than along'}, sheared by "
@@ -146,16 +150,10 @@ def residual_map(result: CameraCalibration) -> Drawing:
     """Returns a figure of mean residuals over cells of the image. Model errors are alike in neighbouring cells."""
     camera = result.intrinsics.camera
     axes = _image_axes(camera)
-    xy = np.concatenate([model.measured_px for model in result.intrinsics.models])
-    weight = np.concatenate(result.intrinsics.weights())
-    residuals = result.intrinsics.residuals_px()
-    size = np.array([camera.width, camera.height]) / CELLS
-    cell = np.clip((xy / size).astype(int), 0, np.array(CELLS) - 1)
-    index = cell[:, 0] * CELLS[1] + cell[:, 1]
-    count = np.bincount(index, weight, CELLS[0] * CELLS[1])
+    mean, weight = mean_residuals(result.intrinsics)
+    size, count = np.array([camera.width, camera.height]) / CELLS, weight.sum(0)
     enough = count >= MIN_IN_CELL
-    mean = np.stack([np.bincount(index, weight * residuals[:, i], len(count)) for i in range(2)], axis=1)
-    mean = mean[enough] / count[enough, None]
+    mean = (weight[..., None] * mean).sum(0)[enough] / count[enough, None]
     middle = (np.stack(np.divmod(np.flatnonzero(enough), CELLS[1]), axis=1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max()) if len(mean) else 0.0
     times = round_below(ARROW_SHARE * size.min() / longest) if longest else 1.0

@@ -143,18 +143,24 @@ def sigma_check(networks: Sequence[Network], factor: float) -> Check:
 
 
 def image_check(networks: Sequence[Network]) -> Check:
-    """Tests the squared residuals of every image against those of its group's other images (F test)."""
-    trials = []
+    """Tests the squared residuals of every image against those of its group's other images (F test). Residuals of one
+    image are not independent: where images scatter more than they would be, each counts as so many fewer."""
+    found: list[tuple[str, float, float, float]] = []  # name, ratio of squares, redundancy of the image and the others
     for network in networks:
         square, redundancy = network.square_by_image()
+        others = redundancy.sum() - redundancy
         for i, name in enumerate(network.model.images):
-            others = redundancy.sum() - redundancy[i]
-            if redundancy[i] < 1 or others < 1:
-                continue
-            ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / others, 1e-12)
-            trials.append(
-                Trial(name, float(np.sqrt(ratio)), "×", ratio * round(redundancy[i]), round(redundancy[i]), others)
-            )
+            if redundancy[i] >= 1 and others[i] >= 1:
+                ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / others[i], 1e-12)
+                found.append((name, float(ratio), float(redundancy[i]), float(others[i])))
+    logs = np.log([max(ratio, 1e-12) for _, ratio, _, _ in found])
+    by_chance = np.mean([2 / own + 2 / others for _, _, own, others in found]) if found else 1.0
+    scattered = robust_sigma(np.abs(logs - np.median(logs))) ** 2 if len(found) > 1 else 0.0
+    fewer = max(1.0, scattered / by_chance)
+    trials = []
+    for name, ratio, own, others in found:
+        freedom = max(round(own / fewer), 1)
+        trials.append(Trial(name, float(np.sqrt(ratio)), "×", ratio * freedom, freedom, others / fewer))
     check = judge("image-residuals", "Residuals of each image against its group", trials, "images", "")
     remedy = "a blurred image, or one in which something had moved: look at its overlay, leave it out, and run again"
     return _take_out(check, remedy)

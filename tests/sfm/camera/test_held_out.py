@@ -9,13 +9,13 @@ from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.sfm.camera import checks
 from stcal.sfm.camera.calibrate import judged, of_chosen_model, require_model
-from stcal.sfm.camera.checks import choose_model, held_out
+from stcal.sfm.camera.checks import choose_model, held_out, of_lens_model
 from stcal.sfm.camera.file import CalibrationFile
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
 from stcal.sfm.camera.report import calibration_report
 from tests.levels import sampled
 from tests.outcome import fails_with
-from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of
+from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of, with_a_field
 
 FISHEYE = Camera(2592, 1728, [1100.0, 1098.0], [1301.0, 859.0], [0.02, -0.01, 0, 0, 0.003, 0, 0, 0], True)
 RADIAL = Camera(2592, 1728, [2790.0, 2790.0], [1301.0, 859.0], [-0.06, 0, 0, 0, 0, 0, 0, 0])
@@ -181,5 +181,16 @@ def test_text_page_and_file_have_all_models(result):
     assert [each.model for each in summary.models] == ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"]
     assert summary.held_out.folds == 5
     assert page.count("data:image/svg+xml") == 3
-    for words in ("σ of a projection over the image", "as their pixels explain", "Lens models", "SIMPLE_RADIAL"):
+    for words in ("σ of a projection over the image", "their pixels explain", "Lens models", "SIMPLE_RADIAL"):
         assert words in page
+
+
+@pytest.mark.slow
+def test_a_lens_model_too_small_is_named_and_no_larger_one_for_other_errors():
+    bent = Camera(2592, 1728, TRUE.focal, TRUE.centre, [-0.06, 0.045, 0, 0, 0.3, 0, 0, 0])
+    views = views_of(np.random.default_rng(9), count=12, camera=bent)
+    (warning,) = of_lens_model(calibrated(views), views, BOARD)
+    assert "the lens model is too small; use --model FULL_OPENCV" in warning
+    rng = np.random.default_rng(10)
+    for other in (views_of(rng, 12), with_a_field(views_of(rng, 12), rng, 0.04)):
+        assert of_lens_model(calibrated(other), other, BOARD) == []
