@@ -85,8 +85,8 @@ def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
 
 @pytest.mark.slow
 def test_poses_at_one_place_of_the_robot_count_once():
-    """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of the
-    squared error over the covariance is 18."""
+    """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of
+    the squared error over the covariance is 18."""
     squares = []
     for seed in range(16):
         rng = np.random.default_rng(seed)
