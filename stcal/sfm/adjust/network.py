@@ -168,7 +168,8 @@ class ScoreTest:
 
 def solve_score(normal: np.ndarray, right: np.ndarray) -> ScoreTest:
     """Returns the test for the equations of :meth:`Network.score`, without directions that they do not determine."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    own = np.diag(normal)
+    scale = np.sqrt(np.where(own > 0, own, np.inf))  # a parameter that rounding alone determines counts for nothing
     value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
     held = value > MIN_SHARE
     half = vector[:, held] / np.sqrt(value[held])

@@ -109,7 +109,8 @@ def mean_residuals(result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     camera, first = result.camera, np.cumsum([0, *(len(model.images) for model in result.models)])
     image = np.concatenate([k + model.image_index for k, model in zip(first[:-1], result.models, strict=True)])
     xy, weight = np.concatenate([model.measured_px for model in result.models]), np.concatenate(result.weights())
-    cell = np.clip((xy / (camera.width, camera.height) * CELLS).astype(int), 0, np.array(CELLS) - 1) @ [CELLS[1], 1]
+    across, down = np.clip((xy / (camera.width, camera.height) * CELLS).astype(int), 0, np.array(CELLS) - 1).T
+    cell = across * CELLS[1] + down
     mean, total = np.zeros((first[-1], CELLS[0] * CELLS[1], 2)), np.zeros((first[-1], CELLS[0] * CELLS[1]))
     np.add.at(mean, (image, cell), weight[:, None] * result.residuals_px())
     np.add.at(total, (image, cell), weight)

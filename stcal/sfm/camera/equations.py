@@ -126,8 +126,8 @@ class _Rows:
         by_pose, by_point = projection_jacobians(model, state.camera)
         by_kept = model.by_parameters(state.camera) @ setting.basis
         root = np.sqrt(robust_weights(model, state.camera, setting.huber))[:, None]
-        weighted = (model.whiten(derivative) * root[..., None] for derivative in (by_pose, by_point, by_kept))
-        return cls(*weighted, normalised(model, state.camera) * root)
+        a, c, e = (model.whiten(derivative) * root[..., None] for derivative in (by_pose, by_point, by_kept))
+        return cls(a, c, e, normalised(model, state.camera) * root)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

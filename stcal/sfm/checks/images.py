@@ -154,7 +154,7 @@ def image_check(networks: Sequence[Network]) -> Check:
                 ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / others[i], 1e-12)
                 found.append((name, float(ratio), float(redundancy[i]), float(others[i])))
     logs = np.log([max(ratio, 1e-12) for _, ratio, _, _ in found])
-    by_chance = np.mean([2 / own + 2 / others for _, _, own, others in found]) if found else 1.0
+    by_chance = float(np.mean([2 / own + 2 / others for _, _, own, others in found])) if found else 1.0
     scattered = robust_sigma(np.abs(logs - np.median(logs))) ** 2 if len(found) > 1 else 0.0
     fewer = max(1.0, scattered / by_chance)
     trials = []

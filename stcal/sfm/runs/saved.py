@@ -330,7 +330,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     )
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
-    return AdjustedRun(with_differences(state, start, run.target_design, run.options.frame), start, prior)
+    return AdjustedRun(with_differences(state, start, run.target_design, run.faces.frame), start, prior)
 
 
 @dataclass(frozen=True, slots=True)
