@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.file import load_run_board
-from stcal.cli.main import main
+from stcal.cli.main import main, main_sfm
 from stcal.io.design import load_target
 from tests.io.reported_cameras import SAMPLES
 from tests.outcome import COMPUTATION, INPUT, ended, lines_of
@@ -169,7 +169,7 @@ def typed(monkeypatch, capsys, shared_case, tmp_path):
         outcomes = []
         for words in commands(case, (folder / "cmd").read_text()):
             monkeypatch.setattr(sys, "argv", shlex.split(f"{words}{more}"))
-            outcomes.append(ended(main, capsys))
+            outcomes.append(ended(main_sfm if words.startswith("stcal-sfm") else main, capsys))
         return outcomes
 
     return run
