@@ -28,6 +28,7 @@ from stcal.geometry.print_modes import PrintModes
 from stcal.io.design import target_of
 from stcal.sfm import pipeline
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
+from stcal.sfm.camera.equations import Normal
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
 from stcal.sfm.data.model import ImageObservations
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
@@ -154,7 +155,8 @@ def of_simulated(draws: int) -> None:
             result = adjust_intrinsics(simulated(np.random.default_rng(seed), kind), board, TRUE, "OPENCV")
             off = parameters(result) - model_parameters(TRUE, "OPENCV")
             table.append(squares(off, result.covariance))
-            larger.append(np.sqrt(np.diag(result.covariance) / np.diag(result.independent)).mean())
+            independent = np.linalg.inv(Normal.of(*result.solution).normal)
+            larger.append(np.sqrt(np.diag(result.covariance) / np.diag(independent)).mean())
         print(row(kind, table, f"{np.mean(larger):.2f}"), flush=True)
 
 

@@ -15,20 +15,31 @@ MOST_SHARE = 1 - 1e-6
 """Largest share of a direction's information in one cluster for which its pull is corrected."""
 LEAST_FREEDOM = 3.0
 """Smallest number of degrees of freedom for which Student's variance is used, which is infinite for two."""
+LEAST_TOLD = 1e-14
+"""Smallest eigenvalue of a normal matrix of unit diagonal: below it is rounding, and σ are enormous."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ByClusters:
-    """Covariance (q, q) of the parameters, never below the ``independent`` one, of independent errors.
+    """Covariance (q, q) of the parameters, never below that of independent errors.
 
     ``differ`` : by how much clusters differ more than independent errors explain, as a ratio of σ; ``freedom`` : (q,)
     effective degrees of freedom of what they tell about each parameter.
     """
 
     covariance: np.ndarray
-    independent: np.ndarray
     differ: float
     freedom: np.ndarray
+
+
+def released(values: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return what clusters would show, had they not taken part in the answer (CR2).
+
+    ``values`` : (…, k) what they show, of unit variance by itself; ``share`` : (…, k, k) part that the answer took
+    """
+    taken, axes = np.linalg.eigh((share + np.swapaxes(share, -1, -2)) / 2)
+    along = (np.swapaxes(axes, -1, -2) @ values[..., None])[..., 0] / np.sqrt(1 - np.clip(taken, 0, MOST_SHARE))
+    return (axes @ along[..., None])[..., 0]
 
 
 def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -> ByClusters:
@@ -40,14 +51,14 @@ def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -
     pull : (n, q) half the downhill gradient of each cluster's cost, other unknowns eliminated
     information : (n, q, q) each cluster's part of ``normal``
     """
-    inverse = np.linalg.inv(normal)
-    half = np.linalg.cholesky((inverse + inverse.T) / 2)
+    own = np.diag(normal)
+    scale = np.sqrt(np.where(own > 0, own, 1.0))
+    value, vector = np.linalg.eigh(normal / scale[:, None] / scale)
+    half = vector / np.sqrt(np.maximum(value, LEAST_TOLD)) / scale[:, None]
+    inverse = half @ half.T
     unit = half.T @ information @ half
-    share, axes = np.linalg.eigh((unit + np.swapaxes(unit, 1, 2)) / 2)
-    along = (np.swapaxes(axes, 1, 2) @ (pull @ half)[..., None])[..., 0]
-    rows = (axes @ (along / np.sqrt(1 - np.clip(share, 0, MOST_SHARE)))[..., None])[..., 0]
-    scatter, n = rows.T @ rows, len(rows)
-    told = unit.sum(0)
+    rows = released(pull @ half, unit)
+    scatter, told, n = rows.T @ rows, unit.sum(0), len(rows)
     factor = float(np.trace(scatter) / max(np.trace(told), 1e-300))
     common = max(1.0, factor) * told
     by_chance = sum(((n * np.outer(row, row) - scatter) ** 2).sum() for row in rows) / n**2
@@ -59,4 +70,4 @@ def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -
     counted = np.maximum(freedom, LEAST_FREEDOM)
     student = np.sqrt(counted / (counted - 2))
     covariance = inverse + student[:, None] * more * student
-    return ByClusters((covariance + covariance.T) / 2, (inverse + inverse.T) / 2, float(np.sqrt(factor)), freedom)
+    return ByClusters((covariance + covariance.T) / 2, float(np.sqrt(factor)), freedom)

@@ -26,13 +26,13 @@ PRIOR_LOGS = np.log(10.0)
 class PrintModes:
     """Smooth deviations of n points: ``modes`` (3n, m), orthonormal, and the σ of their coordinates, (m,) mm.
 
-    The size is not among them: it is stated, or the scale of all that is measured. ``within`` : (m,) True for modes in
-    the plane; ``amplitude`` : factor on the σ that printers and paper have.
+    The size is not among them: it is stated, or the scale of all that is measured. ``affine`` : whether stretch and
+    shear are the first two, as points on a line tell neither; ``amplitude`` : factor on the σ of printers and paper.
     """
 
     modes: np.ndarray
     spread_mm: np.ndarray
-    within: np.ndarray
+    affine: bool
     amplitude: float = 1.0
 
     @classmethod
@@ -47,8 +47,8 @@ class PrintModes:
         within = [(x, -y, zero), (y, x, zero), *((v, zero, zero) for v in second), *((zero, v, zero) for v in second)]
         columns = [(mode, PRINT_SHARE) for mode in within] + [((zero, zero, v), BEND_SHARE) for v in second]
         known = np.linalg.qr(np.column_stack([np.column_stack(mode).ravel() for mode in [*motions, (x, y, zero)]]))[0]
-        modes, spread = [], []
-        for mode, share in columns:
+        modes, spread, kept = [], [], []
+        for k, (mode, share) in enumerate(columns):
             column = np.column_stack(mode).ravel()
             for _ in range(2):  # twice, for rounding
                 column = column - known @ (known.T @ column)
@@ -56,15 +56,17 @@ class PrintModes:
             if size > LEAST_SHARE * np.sqrt(len(x)):
                 known = np.column_stack([known, column / size])
                 modes.append(column / size)
+                kept.append(k)
                 spread.append(share * half * (size if share == PRINT_SHARE else np.sqrt(len(x))))
         table = np.column_stack(modes) if modes else np.zeros((3 * len(x), 0))
-        return cls(table, np.array(spread), np.abs(table[2::3]).max(axis=0, initial=0.0) < 1e-9)
+        return cls(table, np.array(spread), kept[:2] == [0, 1])
 
     def stretch(self, off_mm: np.ndarray) -> tuple[float, float]:
         """Return by how much more the print is stretched in x than in y, and its shear, from deviations (n, 3)."""
-        first = slice(0, 2)  # relative to the half extent, as their σ are
-        affine = self.modes[:, first].T @ off_mm.ravel() * PRINT_SHARE / self.spread_mm[first]
-        return (2 * float(affine[0]), 2 * float(affine[1])) if len(affine) == 2 else (0.0, 0.0)
+        if not self.affine:
+            return 0.0, 0.0
+        relative = self.modes[:, :2].T @ off_mm.ravel() * PRINT_SHARE / self.spread_mm[:2]  # to the half extent
+        return 2 * float(relative[0]), 2 * float(relative[1])
 
     def variances(self, sigma_mm: float) -> np.ndarray:
         """Return the variances (m,) of the modes' coordinates, where each point also has its own ``sigma_mm``."""

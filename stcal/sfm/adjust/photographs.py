@@ -11,14 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.design import TargetDesign
+from stcal.geometry.clusters import released
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.equations import normalised, robust_weights, rows_of_view
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.joint import Adjusted, points_of, scale_of
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives
-
-MOST_SHARE = 1 - 1e-6
-"""Largest share of a direction of a photograph's residuals that the adjustment takes, up to which it is corrected."""
 
 
 def with_differences(state: Adjusted, start: CalibratedTarget, target: TargetDesign, kind: FrameKind) -> Adjusted:
@@ -40,9 +38,8 @@ def _differ(state: Adjusted, own: Derivatives) -> float:
             root = np.repeat(np.sqrt(robust_weights(view, camera, state.setting.huber)), 2)
             equations, across = rows_of_view(view, camera, basis, root)
             residual = across.T @ (root * normalised(view, camera).ravel())
-            share, axes = np.linalg.eigh(equations @ points @ equations.T)
-            grown = axes @ ((axes.T @ residual) / np.sqrt(1 - np.clip(share, 0, MOST_SHARE)))
-            pull, expected = to_faces.T @ equations.T @ grown, to_faces.T @ equations.T
+            expected = to_faces.T @ equations.T
+            pull = expected @ released(residual, equations @ points @ equations.T)
             scatter += np.outer(pull, pull)
             told += expected @ expected.T
     ratios = []

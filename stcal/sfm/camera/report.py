@@ -13,6 +13,8 @@ from stcal.sfm.camera.checks import CELLS, GRID, mean_residuals
 from stcal.sfm.camera.file import CalibrationFile
 
 MIN_IN_CELL = 3
+LEAST_SAID = 5e-4
+"""Smallest stretch or shear of a print that is worth a line: a quarter of what good printers do."""
 ARROW_SHARE = 0.7
 """Largest length of a drawn mean residual, as a share of the cell."""
 
@@ -49,10 +51,11 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         else "photographs differ no more than their pixels explain"
     )
     prints = [
-        f"board{'' if each.folder == '.' else f' of {each.folder}'}: printed {100 * abs(each.stretch):.3f} % longer "
-        f"{'along its rows than across' if each.stretch > 0 else 'across its rows than along'}, sheared by "
+        f"the board{'' if each.folder == '.' else f' of {each.folder}'} is printed {100 * abs(each.stretch):.3f} % "
+        f"longer {'along its rows than across' if each.stretch > 0 else 'across its rows than along'}, sheared by "
         f"{100 * abs(each.shear):.3f} %"
         for each in summary.prints
+        if max(abs(each.stretch), abs(each.shear)) > LEAST_SAID
     ]
     return Document(
         "Calibration of a camera",
