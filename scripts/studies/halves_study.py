@@ -25,10 +25,10 @@ from stcal.design import BoardDesign, reference_board
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.print_modes import PrintModes
+from stcal.geometry.rigid import Poses
 from stcal.io.design import target_of
 from stcal.sfm import pipeline
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
-from stcal.sfm.camera.equations import Normal
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
 from stcal.sfm.data.model import ImageObservations
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
@@ -109,7 +109,8 @@ def of_bodies() -> None:
     one, two = runs
     apart = []
     for face in one.target_from_face.keys() & two.target_from_face.keys() - {one.reference_face}:
-        off = two.target_from_face[face].difference(one.target_from_face[face])
+        first, second = (Poses.of([target.target_from_face[face]]) for target in runs)
+        (off,) = second.difference(first)
         covariance = one.face_covariance[face] + two.face_covariance[face]
         apart.append(float(off @ np.linalg.solve(covariance, off) / 6))
     print(f"\ncube of ChArUco faces, real, two cameras: {np.mean(apart):.2f} (faces {np.round(sorted(apart), 2)})")
@@ -155,8 +156,7 @@ def of_simulated(draws: int) -> None:
             result = adjust_intrinsics(simulated(np.random.default_rng(seed), kind), board, TRUE, "OPENCV")
             off = parameters(result) - model_parameters(TRUE, "OPENCV")
             table.append(squares(off, result.covariance))
-            independent = np.linalg.inv(Normal.of(*result.solution).normal)
-            larger.append(np.sqrt(np.diag(result.covariance) / np.diag(independent)).mean())
+            larger.append(np.sqrt(np.diag(result.covariance) / np.diag(result.independent)).mean())
         print(row(kind, table, f"{np.mean(larger):.2f}"), flush=True)
 
 

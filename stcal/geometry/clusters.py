@@ -21,13 +21,14 @@ LEAST_TOLD = 1e-14
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ByClusters:
-    """Covariance (q, q) of the parameters, never below that of independent errors.
+    """Covariance (q, q) of the parameters, never below the ``independent`` one, of independent errors.
 
     ``differ`` : by how much clusters differ more than independent errors explain, as a ratio of σ; ``freedom`` : (q,)
     effective degrees of freedom of what they tell about each parameter.
     """
 
     covariance: np.ndarray
+    independent: np.ndarray
     differ: float
     freedom: np.ndarray
 
@@ -70,4 +71,4 @@ def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -
     counted = np.maximum(freedom, LEAST_FREEDOM)
     student = np.sqrt(counted / (counted - 2))
     covariance = inverse + student[:, None] * more * student
-    return ByClusters((covariance + covariance.T) / 2, float(np.sqrt(factor)), freedom)
+    return ByClusters((covariance + covariance.T) / 2, inverse, float(np.sqrt(factor)), freedom)

@@ -282,7 +282,8 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
             f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
             "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom",
         )
-    relative = float((result.sigma()[0] / result.camera.focal[0]).max())
+    # By the views' geometry: how much photographs differ is in the σ that are stated, and not mended by tilts.
+    relative = float(np.sqrt(result.independent[0, 0]) / result.camera.focal[0])
     if relative > MAX_FOCAL_SIGMA:
         raise DegenerateError(
             "E-CALIBRATE-UNDETERMINED",

@@ -180,7 +180,7 @@ class Normal:
         """Returns the covariance of the kept unknowns by how the photographs differ."""
         pulls, informations, q = [], [], self.setting.kept
         if not q:
-            return ByClusters(np.zeros((0, 0)), 1.0, np.zeros(0))
+            return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
         for model, dots in zip(self.state.models, self.boards, strict=True):
             rows, m = _Rows.of(model, self.state, self.setting), len(model.images)
             by_dot = dots.from_kept[0].reshape(-1, 3, q)[model.point_index]

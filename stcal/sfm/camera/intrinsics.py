@@ -168,6 +168,7 @@ class Intrinsics:
     camera: Camera
     colmap_model: str
     covariance: np.ndarray  # (q, q) of the parameters of ``colmap_model``, by how the photographs differ
+    independent: np.ndarray  # (q, q) by independent errors of pixels: what the views' geometry determines
     differ: float  # by how much photographs differ more than their pixels explain, as a ratio of σ
     freedom: np.ndarray  # (q,) effective degrees of freedom of what the photographs tell
     models: tuple[MetricModel, ...]  # of one folder's board each, mm, board frame
@@ -253,6 +254,7 @@ def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled:
         camera=state.camera,
         colmap_model=colmap_model,
         covariance=by_photographs.covariance,
+        independent=by_photographs.independent,
         differ=by_photographs.differ,
         freedom=by_photographs.freedom,
         models=state.models,
