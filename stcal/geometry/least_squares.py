@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -212,6 +212,7 @@ class PoseStack:
     Unlike :class:`~stcal.geometry.rigid.Poses` it is not checked.
     """
 
+    dim: ClassVar[int] = 6
     rotation: np.ndarray
     translation: np.ndarray
 

@@ -28,7 +28,7 @@ from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
-from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
+from stcal.sfm.camera.calibrate import camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
@@ -65,6 +65,8 @@ from stcal.sfm.runs.solve import (
 )
 from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
+VAGUE = 0.01
+"""Relative σ of a camera file's focal length above which the boards tell it better."""
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
 FOUND_BY_DOTS = "no --camera: found by the dots of the board, f {:.0f} px"
@@ -274,7 +276,7 @@ def is_vague(model: CameraModel) -> bool:
     """Returns whether a camera file states its focal length less well than the boards tell it."""
     if model.covariance is None or model.colmap_model != LENS:
         return False
-    return _focal_sigma(model) > MAX_FOCAL_SIGMA * model.focal[0]
+    return _focal_sigma(model) > VAGUE * model.focal[0]
 
 
 def _focal_sigma(model: CameraModel) -> float:

@@ -1,0 +1,521 @@
+"""One adjustment by least squares: blocks of unknowns, factors that tie them, elimination, σ, and influence.
+
+An unknown is a member of a block: a pose of all poses, a point of all points. A factor states residuals row by row;
+each row depends on one member of each block that the factor is on, or on a block of a single member. Blocks of many
+members that no row ties to one another are eliminated (Schur complement), so that a step costs as little as one of the
+others alone.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from stcal.errors import InputError
+from stcal.geometry.clusters import ByClusters, by_clusters
+from stcal.geometry.least_squares import SETTLED, Minimum, minimise
+from stcal.geometry.normal_equations import Reduction, blocks_of, generalised_inverse, reduce
+from stcal.geometry.robust import huber_cost, huber_weights
+
+STEP = 1e-6
+"""Step of numerical derivatives, as a share of 1, or of the unknown's size where that is more."""
+TINY = 1e-300
+
+
+class Values(Protocol):
+    """The members of a block, such as a :class:`Vector` or a :class:`~stcal.geometry.least_squares.PoseStack`."""
+
+    dim: int  # number of unknowns of a member
+
+    def __len__(self) -> int:
+        """Return the number of members."""
+        ...
+
+    def moved(self, step: np.ndarray) -> Any:
+        """Return the members after steps (n, dim)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vector:
+    """Members without curvature: ``array`` (n, dim)."""
+
+    array: np.ndarray
+
+    @property
+    def dim(self) -> int:  # type: ignore[override]
+        """Number of unknowns of a member."""
+        return self.array.shape[1]
+
+    def __len__(self) -> int:
+        return len(self.array)
+
+    def moved(self, step: np.ndarray) -> "Vector":
+        """Return the members after steps (n, dim)."""
+        return Vector(self.array + step)
+
+
+@dataclass(frozen=True, slots=True)
+class Huber:
+    """Huber's loss of the lengths of whitened rows beyond ``limit``; constant beyond ``gross``, with no weight."""
+
+    limit: float = np.inf
+    gross: float = np.inf
+
+    def cost(self, length: np.ndarray) -> np.ndarray:
+        """Return the loss of lengths (r,)."""
+        return huber_cost(np.minimum(length, self.gross), self.limit)
+
+    def weight(self, length: np.ndarray) -> np.ndarray:
+        """Return the weights of lengths (r,)."""
+        return np.where(length > self.gross, 0.0, huber_weights(length, self.limit))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A block of unknowns; to be had from :meth:`Adjustment.block`.
+
+    ``start`` : its members at the start; ``eliminate`` : whether it is eliminated; ``fixed`` : (n,) members that stay.
+    """
+
+    name: str
+    start: Values
+    eliminate: bool
+    fixed: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Factor:
+    """Rows of residuals; see :meth:`Adjustment.factor`."""
+
+    residuals: Callable[..., np.ndarray]
+    derivatives: Callable[..., Sequence[np.ndarray]] | None
+    on: tuple[tuple[Block, np.ndarray | None], ...]
+    root: np.ndarray
+    kind: str
+    cluster: np.ndarray | None
+    loss: Huber
+
+    def white(self, values: Mapping[str, Any], sigma: float) -> np.ndarray:
+        """Return the residuals (r, w) over their σ."""
+        raw = np.asarray(self.residuals(*(values[block.name] for block, _ in self.on)))
+        return self._whitened(raw, sigma)
+
+    def slopes(self, values: Mapping[str, Any], sigma: float) -> list[np.ndarray]:
+        """Return the derivatives (r, w, dim) of the residuals over σ, by each block."""
+        own = [values[block.name] for block, _ in self.on]
+        raw = self.derivatives(*own) if self.derivatives else self._numerical(own)
+        return [self._whitened(np.asarray(each), sigma) for each in raw]
+
+    def _whitened(self, raw: np.ndarray, sigma: float) -> np.ndarray:
+        if self.root.ndim < 3:
+            return raw * (self.root / sigma).reshape(*self.root.shape, *[1] * (raw.ndim - self.root.ndim))
+        return (self.root @ (raw if raw.ndim == 3 else raw[..., None])).reshape(raw.shape) / sigma
+
+    def _numerical(self, own: list[Any]) -> list[np.ndarray]:
+        """Return central differences: a row depends on one member, so that all members are moved at once."""
+        found = []
+        for i, values in enumerate(own):
+            columns = []
+            size = np.abs(values.array).max(initial=1.0) if isinstance(values, Vector) else 1.0
+            for k in range(values.dim):
+                step = np.zeros((len(values), values.dim))
+                step[:, k] = STEP * size
+                ends = [self.residuals(*own[:i], values.moved(s), *own[i + 1 :]) for s in (step, -step)]
+                columns.append((ends[0] - ends[1]) / (2 * STEP * size))
+            found.append(np.stack(columns, axis=-1))
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Knowledge of the members of a :class:`Vector` block: ``mean`` (n, dim), and inverse covariance (n·dim, n·dim)."""
+
+    block: Block
+    mean: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(eq=False)
+class Adjustment:
+    """A problem of least squares.
+
+    >>> a = Adjustment()
+    >>> line = a.block("line", Vector(np.zeros((1, 2))))
+    >>> x, y = np.arange(4.0), np.array([1.0, 3.1, 4.9, 7.0])
+    >>> a.factor(lambda v: (v.array[:, :1] + v.array[:, 1:] * x[:, None]) - y[:, None], [(line, None)], sigma=0.1)
+    >>> print(a.solve().values["line"].array.round(2))
+    [[1.03 1.98]]
+    """
+
+    blocks: list[Block] = field(default_factory=list)
+    factors: list[Factor] = field(default_factory=list)
+    priors: list[Prior] = field(default_factory=list)
+    sigma: dict[str, float] = field(default_factory=dict)
+
+    def block(self, name: str, start: Values, eliminate: bool = False, fixed: Sequence[int] | np.ndarray = ()) -> Block:
+        """Add a block of unknowns.
+
+        Parameters
+        ----------
+        name : its name, by which :attr:`Solution.values` has it
+        start : its members at the start of the descent
+        eliminate : whether it is eliminated first; one block at most, of whose members no row has two
+        fixed : numbers of the members that stay at their start
+        """
+        if any(name == block.name or (eliminate and block.eliminate) for block in self.blocks):
+            raise InputError(
+                "E-OPTION-COMBINATION", f"block {name}: another one has this name, or is eliminated; one of a kind"
+            )
+        held = np.zeros(len(start), bool)
+        held[np.asarray(fixed, int)] = True
+        self.blocks.append(Block(name, start, eliminate, held))
+        return self.blocks[-1]
+
+    def factor(
+        self,
+        residuals: Callable[..., np.ndarray],
+        on: Sequence[tuple[Block, np.ndarray | None]],
+        sigma: float | np.ndarray = 1.0,
+        derivatives: Callable[..., Sequence[np.ndarray]] | None = None,
+        root: np.ndarray | None = None,
+        kind: str = "",
+        cluster: np.ndarray | None = None,
+        loss: Huber | None = None,
+    ) -> None:
+        """Add rows of residuals.
+
+        Parameters
+        ----------
+        residuals : returns (r, w) of the members of the blocks of ``on``, in their order
+        on : blocks, each with the number (r,) of the member on which each row depends, None for a block of one member
+        sigma : σ of the rows, a number, (r,) or (r, w)
+        derivatives : returns the derivatives (r, w, dim) of the residuals by each block; numerical ones if None
+        root : (r, w, w) matrices that whiten the rows, in place of ``sigma``
+        kind : name of the σ that the rows share, which :meth:`Solution.component` tells; it is multiplied by
+            ``self.sigma[kind]``, 1 where that has none
+        cluster : (r,) number of the photograph, or other unit, whose errors may be common
+        loss : loss of the rows' lengths over σ; squares if None
+        """
+        whiten = 1 / np.asarray(sigma, float) if root is None else root
+        ends = tuple((block, None if rows is None else np.asarray(rows)) for block, rows in on)
+        self.factors.append(Factor(residuals, derivatives, ends, whiten, kind, cluster, loss or Huber()))
+
+    def prior(self, block: Block, mean: np.ndarray, weight: np.ndarray) -> None:
+        """Add knowledge of a :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
+        self.priors.append(Prior(block, np.asarray(mean), np.asarray(weight)))
+
+    def solve(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Solution":
+        """Return the solution of least cost, from the start or from ``values``.
+
+        ``options`` : of :func:`stcal.geometry.least_squares.minimise`. Raises ConvergenceError: no minimum is reached.
+        """
+        minimum = self.minimum(values, **options).required("adjustment", "give a better start, or fewer unknowns")
+        return minimum.linear
+
+    def minimum(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Minimum[dict[str, Any], Solution]":
+        """Return where the descent ended, with the solution there as ``linear``."""
+        begin = {block.name: block.start for block in self.blocks} if values is None else dict(values)
+        if not np.isfinite(self.cost(begin)):
+            raise InputError("E-OPTION-RANGE", "adjustment: a residual is not finite at the start; start elsewhere")
+        return minimise(begin, self.at, self.moved, cost=self.cost, **{"settled": SETTLED} | options)
+
+    def cost(self, values: Mapping[str, Any]) -> float:
+        """Return the cost of a state, in σ²; infinite where a residual is not finite."""
+        total = 0.0
+        for factor in self.factors:
+            with np.errstate(all="ignore"):
+                white = factor.white(values, self.sigma.get(factor.kind, 1.0))
+            if not np.isfinite(white).all():
+                return np.inf
+            total += float(factor.loss.cost(np.sqrt((white**2).sum(1))).sum())
+        for prior in self.priors:
+            away = (values[prior.block.name].array - prior.mean).ravel()
+            total += float(away @ prior.weight @ away)
+        return total
+
+    def moved(self, values: Mapping[str, Any], step: np.ndarray) -> dict[str, Any]:
+        """Return the state after a step of all unknowns, those of kept blocks first."""
+        found, at = dict(values), 0
+        for block in sorted(self.blocks, key=lambda each: each.eliminate):
+            own = values[block.name]
+            size = len(own) * own.dim
+            found[block.name] = own.moved(step[at : at + size].reshape(len(own), own.dim))
+            at += size
+        return found
+
+    def at(self, values: Mapping[str, Any]) -> "Solution":
+        """Return the problem linearised about a state."""
+        return Solution(self, dict(values))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """An adjustment linearised about ``values`` of its blocks, by name."""
+
+    problem: Adjustment
+    values: dict[str, Any]
+
+    @cached_property
+    def cost(self) -> float:
+        """Cost of the state, in σ²."""
+        return self.problem.cost(self.values)
+
+    @cached_property
+    def places(self) -> dict[str, slice]:
+        """Place of each kept block among the kept unknowns."""
+        found, at = {}, 0
+        for block in self.problem.blocks:
+            if not block.eliminate:
+                size = len(block.start) * block.start.dim
+                found[block.name] = slice(at, at + size)
+                at += size
+        return found
+
+    @property
+    def kept(self) -> int:
+        """Number of kept unknowns."""
+        return max((at.stop for at in self.places.values()), default=0)
+
+    @cached_property
+    def dropped(self) -> Block | None:
+        """The block that is eliminated."""
+        return next((block for block in self.problem.blocks if block.eliminate), None)
+
+    @cached_property
+    def rows(self) -> "list[Rows]":
+        """Whitened and weighted rows of all factors."""
+        return [Rows.of(factor, self) for factor in self.problem.factors]
+
+    @cached_property
+    def _equations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Normal matrix and right side of kept unknowns; blocks, right sides and mixed parts of the eliminated ones."""
+        k, dropped = self.kept, self.dropped
+        m, a = (len(dropped.start), dropped.start.dim) if dropped else (0, 1)
+        normal, right = np.zeros((k, k)), np.zeros(k)
+        block, block_right, cross = np.zeros((m, a, a)), np.zeros((m, a)), np.zeros((m, a, k))
+        for rows in self.rows:
+            rows.add(normal, right, (block, block_right, cross))
+        for prior in self.problem.priors:
+            at = self.places[prior.block.name]
+            normal[at, at] += prior.weight
+            right[at] -= prior.weight @ (self.values[prior.block.name].array - prior.mean).ravel()
+        held = np.concatenate(
+            [np.repeat(b.fixed, b.start.dim) for b in self.problem.blocks if not b.eliminate] or [np.zeros(0, bool)]
+        )
+        normal[held], normal[:, held], right[held] = 0.0, 0.0, 0.0  # of priors
+        normal[held, held] = 1.0
+        block[~block.any(axis=(1, 2))] = np.eye(a)  # members that are fixed, or without rows
+        return normal, right, block, block_right, cross
+
+    @cached_property
+    def reduction(self) -> Reduction:
+        """Elimination of the block that is not kept."""
+        _, _, block, block_right, cross = self._equations
+        return reduce(block, block_right, cross)
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Normal matrix (k, k) of the kept unknowns, the others eliminated."""
+        return self._equations[0] - self.reduction.normal
+
+    @cached_property
+    def right(self) -> np.ndarray:
+        """Right side (k,) of the kept unknowns: minus half the gradient of the cost."""
+        return self._equations[1] - self.reduction.right
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the step of kept, then eliminated unknowns, damped for the kept ones, and its predicted gain."""
+        scale = np.sqrt(np.maximum(np.diag(self.normal), TINY))
+        unit = self.normal / scale[:, None] / scale + damping * np.eye(self.kept)
+        try:
+            kept = cho_solve(cho_factor(unit), self.right / scale) / scale
+        except LinAlgError:
+            kept = np.linalg.lstsq(unit, self.right / scale, rcond=1e-12)[0] / scale
+        gain = 2 * float(kept @ self.right) - float(kept @ self.normal @ kept) + self.reduction.gain
+        return np.concatenate([kept, self.reduction.back(kept).ravel()]), gain
+
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        """Covariance (k, k) of the kept unknowns, of independent errors; directions that nothing determines are 0."""
+        try:
+            found = np.linalg.inv(self.normal)
+        except LinAlgError:
+            found = generalised_inverse(self.normal)
+        for block in self.problem.blocks:
+            if not block.eliminate and block.fixed.any():
+                held = np.flatnonzero(np.repeat(block.fixed, block.start.dim)) + self.places[block.name].start
+                found[held, held] = 0.0
+        return found
+
+    def covariance(self, block: Block) -> np.ndarray:
+        """Return the covariance (n·dim, n·dim) of a kept block, or (n, dim, dim) of each eliminated member."""
+        if not block.eliminate:
+            return self.inverse[self.places[block.name], self.places[block.name]]
+        by = self.reduction.from_kept
+        return self.reduction.inverse + by @ self.inverse @ np.swapaxes(by, 1, 2)
+
+    def by_clusters(self, block: Block) -> ByClusters:
+        """Return the covariance of a kept block by how the clusters of observations differ."""
+        at = self.places[block.name]
+        own = self.inverse[at, at]
+        along = self.inverse[:, at] @ np.linalg.inv(own)  # how all kept unknowns go with those of the block
+        numbers, slopes, residuals = [], [], []
+        for rows in self.rows:
+            if rows.factor.cluster is not None:
+                numbers.append(rows.factor.cluster)
+                slopes.append(self._total(rows, along))
+                residuals.append(rows.residual)
+        if not numbers:
+            raise InputError("E-OPTION-NEEDS", f"block {block.name}: no factor has clusters; state them")
+        names = np.unique(np.concatenate(numbers))
+        pulls, informations = np.zeros((len(names), len(own))), np.zeros((len(names), *own.shape))
+        for number, slope, residual in zip(numbers, slopes, residuals, strict=True):
+            square, pull = blocks_of(slope, -residual, np.searchsorted(names, number), len(names))
+            pulls, informations = pulls + pull, informations + square
+        return by_clusters(np.linalg.inv(own), pulls, informations)
+
+    def _total(self, rows: "Rows", along: np.ndarray) -> np.ndarray:
+        """Return the derivatives (r, w, q) of rows by changes ``along`` (k, q), eliminated members going with them."""
+        total = np.zeros((*rows.residual.shape, along.shape[1]))
+        for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+            if block.eliminate:
+                by = -(self.reduction.from_kept @ along)
+                total += slope @ by[_numbers(index, slope)]
+            else:
+                by = along[self.places[block.name]].reshape(len(block.start), block.start.dim, -1)
+                total += slope @ (by[0] if index is None else by[index])
+        return total
+
+    def without(self, cluster: int) -> dict[str, Any]:
+        """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""
+        normal, right = self.normal.copy(), self.right.copy()
+        for rows in self.rows:
+            if rows.factor.cluster is None:
+                continue
+            own = rows.factor.cluster == cluster
+            total = self._total(rows, np.eye(self.kept))[own].reshape(-1, self.kept)
+            normal -= total.T @ total
+            right += total.T @ rows.residual[own].ravel()
+        kept = generalised_inverse(normal) @ right
+        return self.problem.moved(self.values, np.concatenate([kept, self.reduction.back(kept).ravel()]))
+
+    def redundancy(self, kind: str | None = None) -> float:
+        """Return the redundancy of the rows of one kind, or of all."""
+        left = 0.0
+        for rows in self.rows:
+            if kind in (None, rows.factor.kind):
+                total = self._total(rows, np.eye(self.kept))
+                taken = float(((total @ self.inverse) * total).sum())
+                for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+                    if block.eliminate:
+                        inverse = self.reduction.inverse[_numbers(index, slope)]
+                        taken += float(((slope @ inverse) * slope).sum())
+                left += rows.residual.shape[1] * np.count_nonzero(rows.weight) - taken
+        return left
+
+    def component(self, kind: str) -> float:
+        """Return the factor on the σ of a kind that its residuals ask for (Förstner 1979)."""
+        own = [rows for rows in self.rows if rows.factor.kind == kind]
+        square = sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in own)
+        return float(np.sqrt(square / max(self.redundancy(kind), 1.0)))
+
+    def score(self, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return normal matrix (p, p) and right side (p,) of further unknowns, all others adjusted.
+
+        ``columns`` : derivatives (r, w, p) of the residuals of each factor by them, over σ as the factors state it.
+        ``right @ inv(normal) @ right`` is χ² of p degrees of freedom if they are not needed (Rao 1948).
+        """
+        p = columns[0].shape[2]
+        normal, right, mixed = np.zeros((p, p)), np.zeros(p), np.zeros((p, self.kept))
+        dropped = self.reduction.step.shape
+        by_dropped, inverse = np.zeros((*dropped, p)), self.reduction.inverse
+        for rows, raw in zip(self.rows, columns, strict=True):
+            sigma = self.problem.sigma.get(rows.factor.kind, 1.0)
+            own = raw / sigma * np.sqrt(rows.weight)[:, None, None]
+            normal += np.einsum("rwp,rwq->pq", own, own)
+            right -= np.einsum("rwp,rw->p", own, rows.residual)
+            mixed += np.einsum("rwp,rwk->pk", own, self._total(rows, np.eye(self.kept)))
+            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+                if block.eliminate:
+                    np.add.at(by_dropped, _numbers(index, slope), np.swapaxes(slope, 1, 2) @ own)
+        normal -= np.einsum("map,mab,mbq->pq", by_dropped, inverse, by_dropped)
+        return normal - mixed @ self.inverse @ mixed.T, right - mixed @ (self.inverse @ self.right)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Rows of a factor about a state: ``slopes`` (r, w, dim) by block and ``residual`` (r, w), over σ and weighted;
+    ``length`` and ``weight`` (r,)."""
+
+    factor: Factor
+    places: tuple[slice | None, ...]
+    slopes: list[np.ndarray]
+    residual: np.ndarray
+    length: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def of(cls, factor: Factor, solution: Solution) -> "Rows":
+        """Return the rows of a factor."""
+        sigma = solution.problem.sigma.get(factor.kind, 1.0)
+        white = factor.white(solution.values, sigma)
+        length = np.sqrt((white**2).sum(1))
+        weight = factor.loss.weight(length)
+        root = np.sqrt(weight)
+        slopes = [each * root[:, None, None] for each in factor.slopes(solution.values, sigma)]
+        for (block, members), slope in zip(factor.on, slopes, strict=True):
+            if block.fixed.any():
+                slope[block.fixed[_numbers(members, slope)]] = 0.0
+        places = tuple(solution.places.get(block.name) for block, _ in factor.on)
+        return cls(factor, places, slopes, white * root[:, None], length, weight)
+
+    def add(self, normal: np.ndarray, right: np.ndarray, dropped: "tuple[np.ndarray, np.ndarray, np.ndarray]") -> None:
+        """Add the rows to the equations of kept unknowns, and to blocks, right sides, mixed parts of dropped ones."""
+        block, block_right, cross = dropped
+        ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
+        for i, ((own, members), place, slope) in enumerate(ends):
+            if place is None:
+                square, pull = blocks_of(slope, -self.residual, _numbers(members, slope), len(block))
+                block += square
+                block_right += pull
+            else:
+                pull = np.einsum("rwd,rw->rd", slope, self.residual)
+                np.add.at(right[place].reshape(len(own.start), -1), _numbers(members, slope), -pull)
+                _add(normal, (place, members, slope), (place, members, slope))
+            for (_, others), at, other in ends[:i]:
+                one, two = (place, members, slope), (at, others, other)
+                if place is None or at is None:
+                    _add(cross.reshape(-1, cross.shape[2]), *((one, two) if place is None else (two, one)))
+                else:
+                    _add(normal, one, two)
+                    _add(normal, two, one)
+
+
+End = tuple[slice | None, np.ndarray | None, np.ndarray]
+
+
+def _numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
+    """Return the member (r,) of each row."""
+    return np.zeros(len(slope), int) if members is None else members
+
+
+def _add(matrix: np.ndarray, one: End, two: End) -> None:
+    """Add to a matrix, at the places of members, the products of two derivatives (r, w, a) and (r, w, b) of rows."""
+    first, second = (0 if place is None else place.start for place, _, _ in (one, two))
+    a, b = one[2].shape[2], two[2].shape[2]
+    if one[1] is None and two[1] is None:
+        matrix[first : first + a, second : second + b] += one[2].reshape(-1, a).T @ two[2].reshape(-1, b)
+        return
+    products = np.swapaxes(one[2], 1, 2) @ two[2]
+    i, j = _numbers(one[1], one[2]), _numbers(two[1], two[2])
+    pair = i * (j.max(initial=0) + 1) + j
+    order = np.argsort(pair, kind="stable")
+    starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
+    sums = np.add.reduceat(products[order], starts, axis=0) if len(order) else products
+    i, j = (each[order[starts]] for each in (i, j))
+    rows = first + a * i[:, None, None] + np.arange(a)[:, None]
+    matrix[rows, second + b * j[:, None, None] + np.arange(b)] += sums

@@ -1,0 +1,176 @@
+"""The engine of least squares, against dense algebra and solutions made again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.adjust import Adjustment, Huber, Vector
+from stcal.errors import InputError
+from stcal.geometry.least_squares import PoseStack
+
+SIGMA, IMAGES, POINTS = 0.002, 6, 12
+
+
+def problem(eliminate: bool, rng, loss: Huber | None = None, numerical: bool = False) -> Adjustment:
+    """Poses of a camera of unknown focal length that see points, of which three are fixed."""
+    xyz = np.column_stack([rng.uniform(-1, 1, (POINTS, 3))])
+    turn = [np.linalg.qr(np.eye(3) + 0.3 * rng.standard_normal((3, 3)))[0] for _ in range(IMAGES)]
+    turn = np.array([each * np.sign(np.diag(each)) for each in turn])
+    turn[:, :, 2] = np.cross(turn[:, :, 0], turn[:, :, 1])
+    poses = PoseStack(turn, np.tile([0, 0, 4.0], (IMAGES, 1)))
+    image, point = (index.ravel() for index in np.indices((IMAGES, POINTS)))
+
+    def at(poses, points):
+        return (poses.rotation[image] @ points.array[point, :, None])[..., 0] + poses.translation[image]
+
+    def seen(poses, points, focal):
+        xyz = at(poses, points)
+        return focal.array * xyz[:, :2] / xyz[:, 2:]
+
+    truth = seen(poses, Vector(xyz), Vector(np.ones((1, 1))))
+    noisy = truth + SIGMA * rng.standard_normal(truth.shape)
+
+    def slopes(poses, points, focal):
+        xyz = at(poses, points)
+        ideal = xyz[:, :2] / xyz[:, 2:]
+        by_xyz = focal.array[0] / xyz[:, 2, None, None] * np.concatenate([np.tile(np.eye(2), (len(xyz), 1, 1)),
+                                                                           -ideal[:, :, None]], axis=2)  # fmt: skip
+        turned = (poses.rotation[image] @ points.array[point, :, None])[..., 0]
+        cross = np.stack([np.cross(axis, turned) for axis in np.eye(3)], axis=2)
+        by_pose = np.concatenate([by_xyz @ cross, by_xyz], axis=2)
+        return by_pose, by_xyz @ poses.rotation[image], ideal[:, :, None]
+
+    a = Adjustment()
+    pose = a.block("pose", poses, eliminate=eliminate)
+    points = a.block("point", Vector(xyz + 0.001 * rng.standard_normal(xyz.shape)), fixed=[0, 1, 2])
+    focal = a.block("focal", Vector(np.ones((1, 1))))
+    on = [(pose, image), (points, point), (focal, None)]
+    by = None if numerical else slopes
+    a.factor(lambda *v: seen(*v) - noisy, on, SIGMA, by, kind="centres", cluster=image, loss=loss)
+    a.prior(points, xyz, np.eye(3 * POINTS) / 0.05**2)
+    return a
+
+
+def dense(solution) -> np.ndarray:
+    """The Jacobian of all rows by kept and eliminated unknowns, from the rows' derivatives."""
+    (rows,) = solution.rows
+    blocks = sorted(solution.problem.blocks, key=lambda each: each.eliminate)
+    starts = dict(
+        zip((b.name for b in blocks), np.cumsum([0, *(len(b.start) * b.start.dim for b in blocks)]), strict=False)
+    )
+    full = np.zeros((*rows.residual.shape, sum(len(b.start) * b.start.dim for b in blocks)))
+    for (block, members), slope in zip(rows.factor.on, rows.slopes, strict=True):
+        first = starts[block.name] + block.start.dim * (np.zeros(len(slope), int) if members is None else members)
+        for r in range(len(slope)):
+            if not (members is not None and block.fixed[members[r]]):
+                full[r, :, first[r] : first[r] + block.start.dim] += slope[r]
+    return full
+
+
+@pytest.fixture(params=[False, True], ids=["kept", "eliminated"])
+def solution(request):
+    return problem(request.param, np.random.default_rng(1)).solve()
+
+
+def test_the_answer_does_not_depend_on_what_is_eliminated():
+    one, two = (problem(eliminate, np.random.default_rng(1)).solve() for eliminate in (False, True))
+    for name in ("point", "focal"):
+        assert one.values[name].array == pytest.approx(two.values[name].array, abs=1e-5 * SIGMA)
+    focal = [next(b for b in s.problem.blocks if b.name == "focal") for s in (one, two)]
+    assert one.covariance(focal[0]) == pytest.approx(two.covariance(focal[1]), rel=1e-6)
+
+
+def test_numerical_derivatives_lead_to_the_same_answer():
+    one, two = (problem(True, np.random.default_rng(1), numerical=n).solve() for n in (False, True))
+    assert one.values["point"].array == pytest.approx(two.values["point"].array, abs=1e-4 * SIGMA)
+
+
+def test_covariance_redundancy_and_score_are_those_of_dense_algebra(solution):
+    jacobian = dense(solution)
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    normal = flat.T @ flat
+    points = solution.places["point"]
+    normal[points, points] += np.eye(3 * POINTS) / 0.05**2
+    held = points.start + np.arange(9)
+    normal[held], normal[:, held] = 0.0, 0.0
+    normal[held, held] = 1.0
+    inverse = np.linalg.inv(normal)
+    inverse[held, held] = 0.0
+    k = solution.kept
+    assert solution.inverse == pytest.approx(inverse[:k, :k], rel=1e-6, abs=1e-12)
+    assert solution.redundancy("centres") == pytest.approx(len(flat) - np.trace(flat @ inverse @ flat.T), rel=1e-6)
+    extra = np.random.default_rng(2).standard_normal((*jacobian.shape[:2], 2)) / SIGMA
+    own = extra.reshape(-1, 2)
+    left = own - flat @ inverse @ flat.T @ own
+    found, right = solution.score([extra])
+    assert found == pytest.approx(own.T @ left, rel=1e-6)
+    residual = solution.rows[0].residual.ravel()
+    assert right == pytest.approx(-own.T @ residual, rel=1e-3, abs=1e-3 * np.sqrt(found.max()))
+    pose = next(block for block in solution.problem.blocks if block.name == "pose")
+    if pose.eliminate:
+        own = inverse[k:, k:].reshape(IMAGES, 6, IMAGES, 6)[np.arange(IMAGES), :, np.arange(IMAGES)]
+        assert solution.covariance(pose) == pytest.approx(own, rel=1e-5, abs=1e-12)
+
+
+def test_without_a_cluster_it_is_as_if_that_had_not_been_there():
+    whole = problem(True, np.random.default_rng(1))
+    stepped = whole.solve().without(3)
+    (factor,) = whole.factors
+    keep_weight = np.where(factor.cluster == 3, 1e-9, 1.0)
+    whole.factors[0] = replace(factor, root=factor.root * keep_weight)
+    again = whole.solve()
+    sigma = np.sqrt(np.diag(again.inverse))[again.places["focal"]]
+    assert stepped["focal"].array == pytest.approx(again.values["focal"].array, abs=0.05 * sigma[0])
+
+
+def test_clusters_with_independent_errors_have_the_sigma_of_independent_errors():
+    ratios, squares = [], []
+    for seed in range(40):
+        solution = problem(True, np.random.default_rng(seed)).solve()
+        focal = next(block for block in solution.problem.blocks if block.name == "focal")
+        found = solution.by_clusters(focal)
+        ratios.append(float(np.sqrt(found.covariance[0, 0] / solution.covariance(focal)[0, 0])))
+        squares.append(float((solution.values["focal"].array[0, 0] - 1) ** 2 / found.covariance[0, 0]))
+    assert min(ratios) >= 1 - 1e-9
+    assert np.mean(ratios) < 1.3  # six clusters: Student's excess
+    assert 0.4 < np.mean(squares) < 1.5  # of 40: 1 ± 0.22, less by the excess
+
+
+def test_a_gross_row_has_no_weight():
+    rng = np.random.default_rng(1)
+    sound = problem(True, rng, Huber(3.0, 20.0))
+    (factor,) = sound.factors
+    before = factor.residuals
+    gross = np.zeros((IMAGES * POINTS, 2))
+    gross[7] = 0.5
+    sound.factors[0] = replace(factor, residuals=lambda *v: before(*v) + gross)
+    spoiled = sound.solve()
+    clean = problem(True, np.random.default_rng(1), Huber(3.0, 20.0)).solve()
+    assert spoiled.rows[0].weight[7] == 0
+    assert spoiled.values["focal"].array == pytest.approx(clean.values["focal"].array, abs=clean.inverse[-1, -1] ** 0.5)
+
+
+def test_the_sigma_of_a_kind_is_found():
+    a = problem(True, np.random.default_rng(1))
+    a.sigma["centres"] = 0.2
+    solution = a.solve()
+    # 144 coordinates less 64 unknowns: σ of a σ is 8 %
+    assert 0.2 * solution.component("centres") == pytest.approx(1.0, abs=0.25)
+
+
+def test_mistakes_are_named():
+    a = Adjustment()
+    x = a.block("x", Vector(np.zeros((1, 1))), eliminate=True)
+    with pytest.raises(InputError, match="block x: another one has this name"):
+        a.block("x", Vector(np.zeros((1, 1))))
+    with pytest.raises(InputError, match="eliminated"):
+        a.block("y", Vector(np.zeros((1, 1))), eliminate=True)
+    a.factor(lambda v: 1 / v.array, [(x, None)])
+    with pytest.raises(InputError, match="not finite at the start"):
+        a.solve()
+    b = Adjustment()
+    y = b.block("y", Vector(np.zeros((1, 1))))
+    b.factor(lambda v: v.array - 1, [(y, None)])
+    with pytest.raises(InputError, match="no factor has clusters"):
+        b.solve().by_clusters(y)
