@@ -1,25 +1,26 @@
 """Calibration of a target of tags: poses of the board in all images, and corners of the tags in the board's plane."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import root_scalar
 
+from stcal.adjust.engine import Adjustment, Huber, Solution, Vector
 from stcal.boards.design import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import minimise
-from stcal.geometry.normal_equations import Reduction, reduce
+from stcal.geometry.least_squares import PoseStack, block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
-from stcal.geometry.rigid import Poses, Rigid
-from stcal.geometry.robust import huber_cost, huber_weights, length_limit, robust_sigma
+from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.geometry.variances import sigma_factor
-from stcal.locate.estimate import PlanarProblem, project
 from stcal.locate.layout import LayoutPlan, TargetLayout, obj_from_plane
 from stcal.parallel import one_thread
 
@@ -36,6 +37,9 @@ TOGETHER = np.tile(np.eye(2), (4, 1))
 APART = null_space(TOGETHER.T)
 """Basis (8, 6) of all other displacements of a tag's corners."""
 NEAR_PX = 0.005
+NEAR_DEPTH = 1e-9
+TINY_MM2 = 1e-12
+"""Variance of a mode of the print at an amplitude of 0, for an inverse."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,179 +97,192 @@ class AdjustedLayout:
     settled: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Board points (c = 1) or tags (c = 4 corners) of all images: ``image`` (r,), ``seen`` (r, c, 2), ``noise``
+    (r, 2c, 2c) and ``focal_px`` (r,)."""
+
+    image: np.ndarray
+    seen: np.ndarray
+    noise: np.ndarray
+    focal_px: np.ndarray
+
+    @classmethod
+    def of(cls, images: Sequence[ImageCorners], seen: list[np.ndarray], noise: list[np.ndarray]) -> "_Rows":
+        counts = [len(each) for each in noise]
+        focal = np.repeat([image.focal_px for image in images], counts)
+        stacked = np.concatenate(seen).reshape(len(focal), -1, 2)
+        return cls(np.repeat(np.arange(len(images)), counts), stacked, np.concatenate(noise), focal)
+
+    def off(self, poses: PoseStack, xyz: np.ndarray) -> np.ndarray:
+        """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board."""
+        return (self._projected(poses, xyz)[2] - self.seen).reshape(len(xyz), -1)
+
+    def slopes(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns its derivatives by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
+        turned, depth, uv = self._projected(poses, xyz)
+        by_point = np.zeros((*uv.shape, 3))
+        by_point[..., 0, 0] = by_point[..., 1, 1] = 1
+        by_point[..., 2] = -uv
+        by_point /= depth[..., None, None]
+        by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+        return by_pose.reshape(len(xyz), -1, 6), by_point @ poses.rotation[self.image][:, None]
+
+    def _projected(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        turned = xyz @ np.swapaxes(poses.rotation[self.image], 1, 2)
+        placed = turned + poses.translation[self.image][:, None]
+        depth = np.where(np.abs(placed[..., 2]) > NEAR_DEPTH, placed[..., 2], NEAR_DEPTH)
+        return turned, depth, placed[..., :2] / depth[..., None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    """All observations: board points, drawn at ``xyz`` (r, 1, 3), and tags, of which ``tag`` (r,) are the numbers.
+
+    ``modes`` : (r, 3, m) smooth deviations of the board's print at its points; ``spread_mm`` : (m,) their σ.
+    """
+
+    board: _Rows
+    xyz: np.ndarray
+    tags: _Rows
+    tag: np.ndarray
+    modes: np.ndarray
+    spread_mm: np.ndarray
+
+    @classmethod
+    def of(cls, images: Sequence[ImageCorners]) -> "_Layout":
+        board = _Rows.of(images, [i.board_seen for i in images], [i.board_noise for i in images])
+        tags = _Rows.of(images, [i.seen for i in images], [i.noise for i in images])
+        xyz = np.concatenate([image.board_xyz for image in images])
+        places, place = np.unique(xyz.round(6), axis=0, return_inverse=True)
+        prints = PrintModes.of(places[:, :2])
+        modes = prints.modes.reshape(len(places), 3, -1)[place.ravel()]
+        tag = np.concatenate([image.rows for image in images])
+        return cls(board, xyz[:, None], tags, tag, modes, prints.spread_mm)
+
+    def problem(self, start: Mapping[str, Any], noise: "_Noise") -> Adjustment:
+        """Returns the adjustment from poses, corners (n, 8) and modes of the print (1, m), with σ of ``noise``."""
+        a, board, tags = Adjustment(), self.board, self.tags
+        pose, places = a.block("pose", start["pose"], eliminate=True), a.block("corners", start["corners"])
+        prints = a.block("print", start["print"])
+        covariance = tags.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
+
+        def by_board(poses: PoseStack, prints: Vector) -> tuple[np.ndarray, np.ndarray]:
+            by_pose, by_place = board.slopes(poses, self.printed(prints))
+            return by_pose, by_place[:, 0] @ self.modes
+
+        def by_tags(poses: PoseStack, corners: Vector) -> tuple[np.ndarray, np.ndarray]:
+            by_pose, by_place = tags.slopes(poses, self.placed(corners))
+            return by_pose, block_diagonal(by_place[..., :2])
+
+        a.factor(
+            lambda poses, prints: board.off(poses, self.printed(prints)),
+            [(pose, board.image), (prints, None)],
+            derivatives=by_board,
+            root=_root(noise.board**2 * board.noise),
+            kind="board",
+            cluster=board.image,
+            loss=_loss(2),
+        )
+        a.factor(
+            lambda poses, corners: tags.off(poses, self.placed(corners)),
+            [(pose, tags.image), (places, self.tag)],
+            derivatives=by_tags,
+            root=_root(covariance / tags.focal_px[:, None, None] ** 2),
+            kind="tags",
+            cluster=tags.image,
+            loss=_loss(8),
+        )
+        a.prior(prints, np.zeros((1, len(self.spread_mm))), np.diag((noise.amplitude * self.spread_mm) ** -2.0))
+        return a
+
+    def printed(self, prints: Vector) -> np.ndarray:
+        """Returns the places (r, 1, 3) of the board's points."""
+        return self.xyz + (self.modes @ prints.array[0])[:, None]
+
+    def placed(self, corners: Vector) -> np.ndarray:
+        """Returns the places (r, 4, 3) of the tags of each row."""
+        return np.pad(corners.array[self.tag].reshape(-1, 4, 2), ((0, 0), (0, 0), (0, 1)))
+
+    def px(self, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the residuals of board (r, 2) and tags (r, 8), px."""
+        pose, prints, corners = (solution.values[name] for name in ("pose", "print", "corners"))
+        board, tags = self.board.off(pose, self.printed(prints)), self.tags.off(pose, self.placed(corners))
+        return self.board.focal_px[:, None] * board, self.tags.focal_px[:, None] * tags
+
+    def first_noise(self, start: Mapping[str, Any]) -> "_Noise":
+        """Returns first σ from the medians of the residuals."""
+        solution = self.problem(start, _Noise(1.0, 0.0, 0.0, 1.0)).at(start)
+        tags = np.linalg.norm(self.px(solution)[1].reshape(-1, 2), axis=1)
+        return _Noise(max(robust_sigma(solution.rows[0].length, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0, 1.0)
+
+    def noise(self, solution: Solution, noise: "_Noise") -> "_Noise":
+        """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
+        board, tags = solution.rows
+        redundancy = [max(solution.redundancy(kind), 1.0) for kind in ("board", "tags")]
+        square, px = float((board.residual**2).sum()), self.px(solution)[1]
+        corner = _added(self.tags.noise, px, tags.weight, APART, 6 / 8 * redundancy[1])
+        whole_tag = _added(self.tags.noise, px, tags.weight, TOGETHER / 2, 2 / 8 * redundancy[1])
+        # Twice the mean of four corners: its variance holds that of the tag's shift four times, of a corner once.
+        tag = np.sqrt(max(whole_tag**2 - corner**2, 0.0) / 4)
+        at, nothing = solution.places["print"], np.full(len(self.spread_mm), TINY_MM2)
+        told = Told(solution.values["print"].array[0], solution.inverse[at, at], nothing, self.spread_mm)
+        factor = max(noise.board * sigma_factor(square, redundancy[0]), LEAST_FACTOR)
+        return _Noise(factor, corner, float(tag), found_amplitude([told], noise.amplitude))
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def _loss(coordinates: int) -> Huber:
+    limit = length_limit(coordinates, HUBER_TAIL)
+    return Huber(limit, GROSS * limit)
+
+
 @dataclass(frozen=True, slots=True)
 class _Noise:
     """Noise model: ``board``, factor on the σ of the board's points; ``corner_px``, ``tag_px``, additional σ of single
-    corners, and of the four corners of a tag together."""
+    corners, and of the four corners of a tag together; ``amplitude`` of the smooth deviations of the board's print."""
 
     board: float
     corner_px: float
     tag_px: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Group:
-    """Residuals of p points of the board (d = 2) or tags (d = 8).
-
-    ``residual`` : (p, d) whitened residuals; ``by_pose`` : (p, d, 6) and ``by_point`` : (p, d, d) their derivatives by
-    pose and points; ``weight`` : (p,) Huber's weights; ``px`` : (p, d) residuals in pixels; ``cost`` : Huber's loss,
-    constant beyond gross residuals.
-    """
-
-    residual: np.ndarray
-    by_pose: np.ndarray
-    by_point: np.ndarray
-    weight: np.ndarray
-    px: np.ndarray
-    cost: float
+    amplitude: float
 
 
 def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
-    """Minimises Huber's loss over 6m + 8n unknowns, poses eliminated; the board is the datum and exact. Variance
-    components (Förstner 1979) give a factor on its points' σ, and additional σ of tags. Raises ConvergenceError."""
-    corners = start.reshape(-1, 2).copy()
-    poses = Poses.of([image.pose for image in images])
-    noise = _first_noise(images, poses, corners)
+    """Minimises Huber's loss over 6m + 8n unknowns, poses eliminated. The board is the datum, exact but for how
+    printers stretch and bend. Variance components (Förstner 1979) give a factor on its points' σ, and additional σ of
+    tags. Raises ConvergenceError."""
+    layout, poses = _Layout.of(images), PoseStack.of(*(image.pose for image in images))
+    prints = Vector(np.zeros((1, len(layout.spread_mm))))
+    values = {"pose": poses, "corners": Vector(start.reshape(-1, 8)), "print": prints}
+    noise = layout.first_noise(values)
     settled = False
     for round_ in range(VARIANCE_ROUNDS):
-        poses, corners = _settled(images, poses, corners, noise)
-        linear = _Linear.of(images, poses, corners, noise)
-        covariance = np.linalg.inv(linear.normal)
-        previous, noise = noise, _variances(images, linear, covariance, noise)
+        minimum = layout.problem(values, noise).minimum(max_steps=MAX_STEPS)
+        solution = minimum.required("layout", "check board file and camera file").linear
+        values = solution.values
+        previous, noise = noise, layout.noise(solution, noise)
         change = max(abs(noise.corner_px - previous.corner_px), abs(noise.tag_px - previous.tag_px))
         settled = round_ > 0 and abs(noise.board / previous.board - 1) < 0.01 and change < NEAR_PX
         if settled:
             break
-    board, tags = ([block[side] for block in linear.blocks] for side in (0, 1))
+    board, tags = layout.px(solution)
     return AdjustedLayout(
-        corners_mm=corners.reshape(-1, 4, 2),
-        covariance_mm2=covariance,
-        poses=poses,
+        corners_mm=values["corners"].array.reshape(-1, 4, 2),
+        covariance_mm2=solution.inverse[solution.places["corners"], solution.places["corners"]],
+        poses=Poses(values["pose"].rotation, values["pose"].translation),
         board_factor=noise.board,
         sigma_px=noise.corner_px,
         tag_sigma_px=noise.tag_px,
-        board_rms_px=rms(np.concatenate([g.px.ravel() for g in board])),
-        tag_rms_px=rms(np.concatenate([g.px.ravel() for g in tags])),
-        image_rms_px=np.array([rms(g.px) for g in tags]),
-        downweighted=float((np.concatenate([g.weight for g in tags]) < 1).mean()),
+        board_rms_px=rms(board.ravel()),
+        tag_rms_px=rms(tags.ravel()),
+        image_rms_px=np.array([rms(tags[layout.tags.image == i]) for i in range(len(images))]),
+        downweighted=float((solution.rows[1].weight < 1).mean()),
         settled=settled,
     )
-
-
-def _first_noise(images, poses: Poses, corners: np.ndarray) -> "_Noise":
-    """Returns first σ from the medians of the residuals."""
-    blocks = [_blocks(image, poses[[i]], corners, _Noise(1.0, 0.0, 0.0)) for i, image in enumerate(images)]
-    board = np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks])
-    tags = np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks])
-    return _Noise(max(robust_sigma(board, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0)
-
-
-def _settled(images, poses: Poses, corners: np.ndarray, noise: _Noise) -> tuple[Poses, np.ndarray]:
-    def moved(at: tuple[Poses, np.ndarray], step: np.ndarray) -> tuple[Poses, np.ndarray]:
-        by_corner, by_pose = np.split(step, [corners.size])
-        return at[0].moved(by_pose.reshape(-1, 6)), at[1] + by_corner.reshape(-1, 2)
-
-    minimum = minimise((poses, corners), lambda at: _Linear.of(images, *at, noise), moved, max_steps=MAX_STEPS)
-    return minimum.required("layout", "check board file and camera file").state
-
-
-def _blocks(image: ImageCorners, pose: Poses, corners: np.ndarray, noise: _Noise) -> tuple[_Group, _Group]:
-    """Returns the residuals of board and tags in one image."""
-    points = (4 * image.rows[:, None] + np.arange(4)).ravel()
-    board = _group(image, pose, image.board_xyz[:, :2], image.board_seen, noise.board**2 * image.board_noise)
-    covariance = image.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
-    return board, _group(image, pose, corners[points], image.seen, covariance / image.focal_px**2)
-
-
-def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, noise: np.ndarray) -> _Group:
-    p, d = noise.shape[:2]
-    empty = np.zeros((0, 0))
-    view = project(PlanarProblem(xy, seen, empty, empty, empty, empty, empty), pose)
-    raw = view.residual[0].reshape(p, d)
-    by_point = np.zeros((p, d // 2, 2, d // 2, 2))
-    k = np.arange(d // 2)
-    by_point[:, k, :, k] = np.moveaxis(view.by_corner[0].reshape(p, d // 2, 2, 2), 1, 0)
-    root = np.linalg.inv(np.linalg.cholesky(noise))
-    residual = (root @ raw[..., None])[..., 0]
-    limit = length_limit(d, HUBER_TAIL)
-    length = np.linalg.norm(residual, axis=1)
-    return _Group(
-        residual=residual,
-        by_pose=root @ view.by_pose[0].reshape(p, d, 6),
-        by_point=root @ by_point.reshape(p, d, d),
-        weight=np.where(length > GROSS * limit, 0.0, huber_weights(length, limit)),
-        px=image.focal_px * raw,
-        cost=float(huber_cost(np.minimum(length, GROSS * limit), limit).sum()),
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linear:
-    """``cost`` : Huber's; ``blocks`` : board and tags by image; ``normal``, ``right`` : (8n, 8n), (8n,) without the
-    ``poses``."""
-
-    cost: float
-    blocks: list[tuple[_Group, _Group]]
-    normal: np.ndarray
-    right: np.ndarray
-    poses: Reduction
-
-    @classmethod
-    def of(cls, images, poses: Poses, corners: np.ndarray, noise: _Noise) -> "_Linear":
-        blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
-        m, k = len(blocks), corners.size
-        pose_normal, pose_right, cross = np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, 6, k))
-        normal, right = np.zeros((k, k)), np.zeros(k)
-        for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
-            for group in block:
-                weighted = group.weight[:, None, None] * group.by_pose
-                pose_normal[i] += np.einsum("pij,pik->jk", weighted, group.by_pose)
-                pose_right[i] += np.einsum("pij,pi->j", weighted, group.residual)
-            tags, place = block[1], _place(image)
-            weighted = tags.weight[:, None, None] * tags.by_point
-            cross[i][:, place.ravel()] = np.einsum("pij,pik->jpk", tags.by_pose, weighted).reshape(6, -1)
-            normal[place[:, :, None], place[:, None, :]] += np.einsum("pij,pik->pjk", weighted, tags.by_point)
-            right[place] += np.einsum("pij,pi->pj", weighted, tags.residual)
-        reduction = reduce(pose_normal, pose_right, cross)
-        cost = sum(group.cost for block in blocks for group in block)
-        return cls(cost, blocks, normal - reduction.normal, right - reduction.right, reduction)
-
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step and its predicted gain: damped for the corners, then the best poses given that step."""
-        corner_step = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
-        gain = 2 * float(corner_step @ self.right) - float(corner_step @ self.normal @ corner_step) + self.poses.gain
-        return np.concatenate([corner_step, self.poses.back(corner_step).ravel()]), gain
-
-
-def _place(image: ImageCorners) -> np.ndarray:
-    """Returns the numbers of the unknowns of each tag's coordinates, (k, 8)."""
-    return 8 * image.rows[:, None] + np.arange(8)
-
-
-def _variances(images, linear: _Linear, covariance: np.ndarray, noise: _Noise) -> _Noise:
-    """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
-    squared_sum, redundancy, taken_by_poses, blocks = 0.0, np.zeros(2), 0.0, linear.blocks
-    inverse = linear.poses.inverse
-    for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
-        unknowns_of_tags = _place(image).ravel()
-        by_corners = linear.poses.from_kept[i][:, unknowns_of_tags]
-        of_pose = inverse[i] + by_corners @ covariance[np.ix_(unknowns_of_tags, unknowns_of_tags)] @ by_corners.T
-        board = block[0]
-        by_board = np.einsum("p,pij,pik->jk", board.weight, board.by_pose, board.by_pose)
-        taken_by_poses += float(np.trace(of_pose @ by_board))
-        squared_sum += float((board.weight * (board.residual**2).sum(1)).sum())
-        redundancy += [group.residual.shape[1] * np.count_nonzero(group.weight) for group in block]
-    unknowns = 6 * len(blocks) + len(covariance)
-    redundancy = np.maximum(redundancy - [taken_by_poses, unknowns - taken_by_poses], 1.0)
-    tag_noise = np.concatenate([image.noise for image in images])
-    px = np.concatenate([block[1].px for block in blocks])
-    weight = np.concatenate([block[1].weight for block in blocks])
-
-    corner = _added(tag_noise, px, weight, APART, 6 / 8 * redundancy[1])
-    whole_tag = _added(tag_noise, px, weight, TOGETHER / 2, 2 / 8 * redundancy[1])
-    # Twice the mean of four corners: its variance holds that of the tag's shift four times, that of a corner once.
-    tag = np.sqrt(max(whole_tag**2 - corner**2, 0.0) / 4)
-    return _Noise(max(noise.board * sigma_factor(squared_sum, redundancy[0]), LEAST_FACTOR), corner, float(tag))
 
 
 def _added(own: np.ndarray, px: np.ndarray, weight: np.ndarray, part: np.ndarray, free: float) -> float:
