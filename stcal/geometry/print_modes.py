@@ -96,6 +96,18 @@ class PrintModes:
         return replace(self, amplitude=found_amplitude([told], self.amplitude))
 
 
+LEAST_SAID = 5e-4
+"""Smallest stretch or shear of a print that is worth a line: a quarter of what good printers do."""
+
+
+def stretch_in_words(what: str, stretch: float, shear: float) -> list[str]:
+    """Return a line on the print of ``what``, or none where it is as drawn; see :meth:`PrintModes.stretch`."""
+    if max(abs(stretch), abs(shear)) < LEAST_SAID:
+        return []
+    way = "along its rows than across" if stretch > 0 else "across its rows than along"
+    return [f"{what} is printed {100 * abs(stretch):.3f} % longer {way}, sheared by {100 * abs(shear):.3f} %"]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
     """What an adjustment tells about the modes of one print: ``mean`` (m,) and ``covariance`` (m, m) of their

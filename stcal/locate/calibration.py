@@ -76,7 +76,8 @@ class ImageCorners:
 class AdjustedLayout:
     """Result of the adjustment: corners of the tags, and poses of the board.
 
-    ``corners_mm`` : (n, 4, 2) corners in the frame of the board; ``covariance_mm2`` : (8n, 8n); ``poses`` :
+    ``corners_mm`` : (n, 4, 2) corners in the frame of the board; ``stretch``, ``shear`` : how much longer the board is
+    printed along its rows than across, and its shear, relative; ``covariance_mm2`` : (8n, 8n); ``poses`` :
     camera_from_board; ``board_factor`` : estimated factor on the stated σ of the board's points; ``sigma_px``,
     ``tag_sigma_px`` : estimated σ due to print, lens and flatness, of single corners and of the four of a tag together;
     ``board_rms_px``, ``tag_rms_px`` : RMS residuals per coordinate; ``image_rms_px`` : (m,) RMS of the tags by image;
@@ -95,6 +96,8 @@ class AdjustedLayout:
     image_rms_px: np.ndarray
     downweighted: float
     settled: bool
+    stretch: float
+    shear: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +142,7 @@ class _Rows:
 class _Layout:
     """All observations: board points, drawn at ``xyz`` (r, 1, 3), and tags, of which ``tag`` (r,) are the numbers.
 
-    ``modes`` : (r, 3, m) smooth deviations of the board's print at its points; ``spread_mm`` : (m,) their σ.
+    ``modes`` : (r, 3, m) smooth deviations of the board's ``print`` at its points.
     """
 
     board: _Rows
@@ -147,7 +150,7 @@ class _Layout:
     tags: _Rows
     tag: np.ndarray
     modes: np.ndarray
-    spread_mm: np.ndarray
+    print: PrintModes
 
     @classmethod
     def of(cls, images: Sequence[ImageCorners]) -> "_Layout":
@@ -158,7 +161,7 @@ class _Layout:
         prints = PrintModes.of(places[:, :2])
         modes = prints.modes.reshape(len(places), 3, -1)[place.ravel()]
         tag = np.concatenate([image.rows for image in images])
-        return cls(board, xyz[:, None], tags, tag, modes, prints.spread_mm)
+        return cls(board, xyz[:, None], tags, tag, modes, prints)
 
     def problem(self, start: Mapping[str, Any], noise: "_Noise") -> Adjustment:
         """Returns the adjustment from poses, corners (n, 8) and modes of the print (1, m), with σ of ``noise``."""
@@ -193,7 +196,9 @@ class _Layout:
             cluster=tags.image,
             loss=_loss(8),
         )
-        a.prior(prints, np.zeros((1, len(self.spread_mm))), np.diag((noise.amplitude * self.spread_mm) ** -2.0))
+        a.prior(
+            prints, np.zeros((1, len(self.print.spread_mm))), np.diag((noise.amplitude * self.print.spread_mm) ** -2.0)
+        )
         return a
 
     def printed(self, prints: Vector) -> np.ndarray:
@@ -225,8 +230,8 @@ class _Layout:
         whole_tag = _added(self.tags.noise, px, tags.weight, TOGETHER / 2, 2 / 8 * redundancy[1])
         # Twice the mean of four corners: its variance holds that of the tag's shift four times, of a corner once.
         tag = np.sqrt(max(whole_tag**2 - corner**2, 0.0) / 4)
-        at, nothing = solution.places["print"], np.full(len(self.spread_mm), TINY_MM2)
-        told = Told(solution.values["print"].array[0], solution.inverse[at, at], nothing, self.spread_mm)
+        at, nothing = solution.places["print"], np.full(len(self.print.spread_mm), TINY_MM2)
+        told = Told(solution.values["print"].array[0], solution.inverse[at, at], nothing, self.print.spread_mm)
         factor = max(noise.board * sigma_factor(square, redundancy[0]), LEAST_FACTOR)
         return _Noise(factor, corner, float(tag), found_amplitude([told], noise.amplitude))
 
@@ -256,7 +261,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     printers stretch and bend. Variance components (Förstner 1979) give a factor on its points' σ, and additional σ of
     tags. Raises ConvergenceError."""
     layout, poses = _Layout.of(images), PoseStack.of(*(image.pose for image in images))
-    prints = Vector(np.zeros((1, len(layout.spread_mm))))
+    prints = Vector(np.zeros((1, len(layout.print.spread_mm))))
     values = {"pose": poses, "corners": Vector(start.reshape(-1, 8)), "print": prints}
     noise = layout.first_noise(values)
     settled = False
@@ -270,6 +275,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
         if settled:
             break
     board, tags = layout.px(solution)
+    stretch, shear = layout.print.stretch(layout.print.modes @ values["print"].array[0])
     return AdjustedLayout(
         corners_mm=values["corners"].array.reshape(-1, 4, 2),
         covariance_mm2=solution.inverse[solution.places["corners"], solution.places["corners"]],
@@ -282,6 +288,8 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
         image_rms_px=np.array([rms(tags[layout.tags.image == i]) for i in range(len(images))]),
         downweighted=float((solution.rows[1].weight < 1).mean()),
         settled=settled,
+        stretch=stretch,
+        shear=shear,
     )
 
 

@@ -11,6 +11,7 @@ from pydantic import Field, StringConstraints
 
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
+from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.io.json import Finite, Matrix, Matrix6, Pair, Part, Pose, ResultFile
@@ -438,6 +439,8 @@ class CalibratedLayoutFile(ResultFile):
     board_from_obj: Pose = Field(description="where {obj} lies on the board")
     board_rms_px: float = Field(description="residuals of the board's points per coordinate")
     tag_rms_px: float = Field(description="residuals of the tags' corners per coordinate")
+    board_stretch: float = Field(description="how much longer the board is along its rows than across, relative")
+    board_shear: float = Field(description="its shear, relative")
     sigma_px: float = Field(description="as in the layout file")
     tag_sigma_px: float = Field(description="as in the layout file")
     tags: list[TagRow] = Field(
@@ -457,6 +460,7 @@ def calibrated_text(result: CalibratedLayout) -> str:
         f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
         f"{adjusted.tag_rms_px:.3f} px of the tags",
         f"beside the corners' own σ: {adjusted.sigma_px:.3f} px each, {adjusted.tag_sigma_px:.3f} px a tag as a whole",
+        *stretch_in_words("the board", adjusted.stretch, adjusted.shear),
         f"{'id':>5}  {'dictionary':<24} images   side_mm  sigma_um  adjusted by_um  from nominal_mm",
     ]
     moved = np.linalg.norm(layout.corners_mm - result.published, axis=2).max(1)
@@ -510,6 +514,8 @@ def calibrated_file(result: CalibratedLayout) -> CalibratedLayoutFile:
             "board_from_obj": result.board_from_obj,
             "board_rms_px": adjusted.board_rms_px,
             "tag_rms_px": adjusted.tag_rms_px,
+            "board_stretch": adjusted.stretch,
+            "board_shear": adjusted.shear,
             "sigma_px": adjusted.sigma_px,
             "tag_sigma_px": adjusted.tag_sigma_px,
             "tags": [

@@ -85,6 +85,7 @@ def test_a_board_that_is_printed_too_long_does_not_bend_the_layout(count):
     """Mean over 8 calibrations of 45 squares each: σ 0.08; with the board as drawn it is 1.9 and 3.4."""
     results = [calibrate(PLAN, *views(count, seed, stretch=0.005), CAMERA) for seed in range(8)]
     assert 0.75 < np.mean([squared(result) for result in results]) < 1.3
+    assert np.mean([result.adjusted.stretch for result in results]) == pytest.approx(0.005, rel=0.2)
 
 
 @pytest.mark.slow

@@ -44,14 +44,16 @@ def half_calibrated(images: CalibrationImages, plan: LayoutPlan, chosen: Sequenc
 
 
 def true_pose(images: CalibrationImages, i: int, calibrated: CalibratedLayout) -> Rigid:
-    """camera_from_obj of image i, by its board."""
+    """camera_from_obj of image i, by its board, printed as the other images tell."""
     view = images.views[i]
     if view is None:
         raise DegenerateError(
             "E-LOCATE-NO-BOARD", f"{images.names[i]}: the board is not seen; a pose to compare with needs it"
         )
     seen = images.camera.normalised_from_pixel(view.xy_px)
+    longer = calibrated.adjusted.stretch / 2 * np.array([1, -1])
     xy = view.xyz_board[:, :2]
+    xy = xy + longer * (xy - xy.mean(0))
     pose = refine_planar_pose(camera_from_plane(fit_homography(xy, seen)), xy, seen)
     return pose @ calibrated.board_from_obj
 

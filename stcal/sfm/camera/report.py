@@ -3,6 +3,7 @@
 import numpy as np
 
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.geometry.print_modes import stretch_in_words
 from stcal.report.camera import distortion_figure
 from stcal.report.document import Document, Section, Table, alarms, page_only, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
@@ -13,8 +14,6 @@ from stcal.sfm.camera.checks import CELLS, GRID, mean_residuals
 from stcal.sfm.camera.file import CalibrationFile
 
 MIN_IN_CELL = 3
-LEAST_SAID = 5e-4
-"""Smallest stretch or shear of a print that is worth a line: a quarter of what good printers do."""
 ARROW_SHARE = 0.7
 """Largest length of a drawn mean residual, as a share of the cell."""
 
@@ -51,11 +50,11 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         else "photographs differ no more than their pixels explain"
     )
     prints = [
-        f"the board{'' if each.folder == '.' else f' of {each.folder}'} is printed {100 * abs(each.stretch):.3f} % "
-        f"longer {'along its rows than across' if each.stretch > 0 else 'across its rows than along'}, sheared by "
-        f"{100 * abs(each.shear):.3f} %"
+        line
         for each in summary.prints
-        if max(abs(each.stretch), abs(each.shear)) > LEAST_SAID
+        for line in stretch_in_words(
+            f"the board{'' if each.folder == '.' else f' of {each.folder}'}", each.stretch, each.shear
+        )
     ]
     return Document(
         "Calibration of a camera",
