@@ -6,7 +6,7 @@ members that no row ties to one another are eliminated (Schur complement), so th
 others alone.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -98,6 +98,7 @@ class Factor:
     kind: str
     cluster: np.ndarray | None
     loss: Huber
+    order: dict[tuple[int, int], Any] = field(default_factory=dict)  # in which products are summed, by pair of blocks
 
     def white(self, values: Mapping[str, Any], sigma: float) -> np.ndarray:
         """Return the residuals (r, w) over their σ."""
@@ -137,6 +138,15 @@ class Prior:
     block: Block
     mean: np.ndarray
     weight: np.ndarray
+
+    def away(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Return the members minus their mean, (n·dim,)."""
+        return (values[self.block.name].array - self.mean).ravel()
+
+    def cost(self, values: Mapping[str, Any]) -> float:
+        """Return the cost, in σ²."""
+        away = self.away(values)
+        return float(away @ self.weight @ away)
 
 
 @dataclass(eq=False)
@@ -232,10 +242,7 @@ class Adjustment:
             if not np.isfinite(white).all():
                 return np.inf
             total += float(factor.loss.cost(np.sqrt((white**2).sum(1))).sum())
-        for prior in self.priors:
-            away = (values[prior.block.name].array - prior.mean).ravel()
-            total += float(away @ prior.weight @ away)
-        return total
+        return total + sum(prior.cost(values) for prior in self.priors)
 
     def moved(self, values: Mapping[str, Any], step: np.ndarray) -> dict[str, Any]:
         """Return the state after a step of all unknowns, those of kept blocks first."""
@@ -262,7 +269,9 @@ class Solution:
     @cached_property
     def cost(self) -> float:
         """Cost of the state, in σ²."""
-        return self.problem.cost(self.values)
+        return sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in self.rows) + sum(
+            prior.cost(self.values) for prior in self.problem.priors
+        )
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -302,7 +311,7 @@ class Solution:
         for prior in self.problem.priors:
             at = self.places[prior.block.name]
             normal[at, at] += prior.weight
-            right[at] -= prior.weight @ (self.values[prior.block.name].array - prior.mean).ravel()
+            right[at] -= prior.weight @ prior.away(self.values)
         held = np.concatenate(
             [np.repeat(b.fixed, b.start.dim) for b in self.problem.blocks if not b.eliminate] or [np.zeros(0, bool)]
         )
@@ -360,23 +369,15 @@ class Solution:
 
     def by_clusters(self, block: Block) -> ByClusters:
         """Return the covariance of a kept block by how the clusters of observations differ."""
-        at = self.places[block.name]
-        own = self.inverse[at, at]
-        along = self.inverse[:, at] @ np.linalg.inv(own)  # how all kept unknowns go with those of the block
-        numbers, slopes, residuals = [], [], []
+        normal, along = _alone(self.normal, self.places[block.name])
+        return _by_clusters(normal, self.told(along))
+
+    def told(self, along: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Yield of each factor with clusters their numbers (r,), the derivatives (r, w, q) of the rows by changes
+        ``along`` (k, q) of the kept unknowns, and the residuals (r, w)."""
         for rows in self.rows:
             if rows.factor.cluster is not None:
-                numbers.append(rows.factor.cluster)
-                slopes.append(self._total(rows, along))
-                residuals.append(rows.residual)
-        if not numbers:
-            raise InputError("E-OPTION-NEEDS", f"block {block.name}: no factor has clusters; state them")
-        names = np.unique(np.concatenate(numbers))
-        pulls, informations = np.zeros((len(names), len(own))), np.zeros((len(names), *own.shape))
-        for number, slope, residual in zip(numbers, slopes, residuals, strict=True):
-            square, pull = blocks_of(slope, -residual, np.searchsorted(names, number), len(names))
-            pulls, informations = pulls + pull, informations + square
-        return by_clusters(np.linalg.inv(own), pulls, informations)
+                yield rows.factor.cluster, self._total(rows, along), rows.residual
 
     def _total(self, rows: "Rows", along: np.ndarray) -> np.ndarray:
         """Return the derivatives (r, w, q) of rows by changes ``along`` (k, q), eliminated members going with them."""
@@ -446,6 +447,140 @@ class Solution:
         return normal - mixed @ self.inverse @ mixed.T, right - mixed @ (self.inverse @ self.right)
 
 
+def _alone(normal: np.ndarray, at: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal matrix (q, q) of some unknowns alone, and how all (k, q) go with them."""
+    others = np.setdiff1d(np.arange(len(normal)), np.arange(len(normal))[at])
+    rest = reduce(normal[None, others[:, None], others], np.zeros((1, len(others))), normal[None, others, at])
+    along = np.empty((len(normal), rest.normal.shape[0]))
+    along[at], along[others] = np.eye(len(rest.normal)), -rest.from_kept[0]
+    return normal[at, at] - rest.normal, along
+
+
+def _by_clusters(normal: np.ndarray, told: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> ByClusters:
+    each = list(told)
+    if not each:
+        raise InputError("E-OPTION-NEEDS", "adjustment: no factor has clusters; state them")
+    names = np.unique(np.concatenate([number for number, _, _ in each]))
+    pulls, informations = np.zeros((len(names), len(normal))), np.zeros((len(names), *normal.shape))
+    for number, slope, residual in each:
+        square, pull = blocks_of(slope, -residual, np.searchsorted(names, number), len(names))
+        pulls, informations = pulls + pull, informations + square
+    return by_clusters(normal, pulls, informations)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joined:
+    """Adjustments that have blocks in common, such as those of groups of photographs by one camera.
+
+    ``parts`` : the adjustments; ``shared`` : names of the blocks in common, the first ones of each part. What is known
+    of them stands in one part only. All other unknowns are eliminated. The names of the other blocks differ from part
+    to part, as do the numbers of their clusters.
+    """
+
+    parts: Sequence[Adjustment]
+    shared: tuple[str, ...]
+
+    def cost(self, values: Mapping[str, Any]) -> float:
+        """Return the cost of a state, in σ²."""
+        return sum(part.cost(values) for part in self.parts)
+
+    def start(self) -> dict[str, Any]:
+        """Return the state at the start of all blocks."""
+        return {block.name: block.start for part in self.parts for block in part.blocks}
+
+    def moved(self, values: Mapping[str, Any], step: np.ndarray) -> dict[str, Any]:
+        """Return the state after the steps of all parts, one after the other; shared blocks stand in each."""
+        found, at = {}, 0
+        for part in self.parts:
+            own = {block.name: values[block.name] for block in part.blocks}
+            size = sum(len(each) * each.dim for each in own.values())
+            found |= part.moved(own, step[at : at + size])
+            at += size
+        return found
+
+    def at(self, values: Mapping[str, Any]) -> "JoinedSolution":
+        """Return the problem linearised about a state."""
+        return JoinedSolution(self, dict(values))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedSolution:
+    """Adjustments in common, linearised about ``values``."""
+
+    problem: Joined
+    values: dict[str, Any]
+
+    @cached_property
+    def cost(self) -> float:
+        """Cost of the state, in σ²."""
+        return sum(part.cost for part in self.parts)
+
+    @cached_property
+    def parts(self) -> tuple[Solution, ...]:
+        """The parts, each as if it were alone."""
+        return tuple(part.at(self.values) for part in self.problem.parts)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of shared unknowns, the first ones of each part."""
+        return max((self.parts[0].places[name].stop for name in self.problem.shared), default=0)
+
+    @cached_property
+    def reductions(self) -> tuple[Reduction, ...]:
+        """Elimination of each part's own kept unknowns."""
+        s = self.count
+        return tuple(reduce(p.normal[None, s:, s:], p.right[None, s:], p.normal[None, s:, :s]) for p in self.parts)
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Normal matrix of the shared unknowns, all others eliminated."""
+        s, each = self.count, zip(self.parts, self.reductions, strict=True)
+        return np.sum([part.normal[:s, :s] - own.normal for part, own in each], axis=0)
+
+    @cached_property
+    def right(self) -> np.ndarray:
+        """Right side of the shared unknowns."""
+        each = zip(self.parts, self.reductions, strict=True)
+        return np.sum([part.right[: self.count] - own.right for part, own in each], axis=0)
+
+    @cached_property
+    def inverse(self) -> np.ndarray:
+        """Covariance of the shared unknowns, of independent errors."""
+        return np.linalg.inv(self.normal)
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the steps of all parts, damped for the shared unknowns alone, and their predicted gain."""
+        shared = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        gain = 2 * float(shared @ self.right) - float(shared @ self.normal @ shared)
+        steps = []
+        for part, reduction in zip(self.parts, self.reductions, strict=True):
+            kept = np.concatenate([shared, reduction.back(shared)[0]])
+            gain += reduction.gain + part.reduction.gain
+            steps += [kept, part.reduction.back(kept).ravel()]
+        return np.concatenate(steps), gain
+
+    @cached_property
+    def whole(self) -> tuple[Solution, ...]:
+        """The parts, each with the covariance of its unknowns that all parts together leave."""
+        found = []
+        for part, reduction in zip(self.parts, self.reductions, strict=True):
+            by = reduction.from_kept[0]
+            mixed = -by @ self.inverse
+            covariance = np.block([[self.inverse, mixed.T], [mixed, reduction.inverse[0] - mixed @ by.T]])
+            solution = Solution(part.problem, part.values)
+            vars(solution).update(rows=part.rows, _equations=part._equations, reduction=part.reduction)
+            vars(solution)["inverse"] = covariance
+            found.append(solution)
+        return tuple(found)
+
+    def by_clusters(self, block: Block) -> ByClusters:
+        """Return the covariance of a shared block by how the clusters of observations differ."""
+        normal, along = _alone(self.normal, self.parts[0].places[block.name])
+        each = zip(self.parts, self.reductions, strict=True)
+        ways = [(part, np.concatenate([along, -own.from_kept[0] @ along])) for part, own in each]
+        return _by_clusters(normal, (told for part, way in ways for told in part.told(way)))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
     """Rows of a factor about a state: ``slopes`` (r, w, dim) by block and ``residual`` (r, w), over σ and weighted;
@@ -476,26 +611,48 @@ class Rows:
     def add(self, normal: np.ndarray, right: np.ndarray, dropped: "tuple[np.ndarray, np.ndarray, np.ndarray]") -> None:
         """Add the rows to the equations of kept unknowns, and to blocks, right sides, mixed parts of dropped ones."""
         block, block_right, cross = dropped
+        mixed = cross.reshape(-1, cross.shape[2])
         ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
         for i, ((own, members), place, slope) in enumerate(ends):
+            square, pull = blocks_of(slope, -self.residual, _numbers(members, slope), len(own.start))
             if place is None:
-                square, pull = blocks_of(slope, -self.residual, _numbers(members, slope), len(block))
                 block += square
                 block_right += pull
             else:
-                pull = np.einsum("rwd,rw->rd", slope, self.residual)
-                np.add.at(right[place].reshape(len(own.start), -1), _numbers(members, slope), -pull)
-                _add(normal, (place, members, slope), (place, members, slope))
-            for (_, others), at, other in ends[:i]:
-                one, two = (place, members, slope), (at, others, other)
-                if place is None or at is None:
-                    _add(cross.reshape(-1, cross.shape[2]), *((one, two) if place is None else (two, one)))
+                at = _unknowns(place, np.arange(len(own.start)), slope)
+                normal[at[:, :, None], at[:, None]] += square
+                right[place] += pull.ravel()
+            for j, (_, other_place, other) in enumerate(ends[:i]):
+                members_of_sums, sums = self._sums(i, j)
+                one, two = (
+                    _unknowns(which, number, each)
+                    for which, number, each in zip((place, other_place), members_of_sums, (slope, other), strict=True)
+                )
+                back = np.swapaxes(sums, 1, 2)
+                if place is None:
+                    mixed[one[:, :, None], two[:, None]] += sums
+                elif other_place is None:
+                    mixed[two[:, :, None], one[:, None]] += back
                 else:
-                    _add(normal, one, two)
-                    _add(normal, two, one)
+                    normal[one[:, :, None], two[:, None]] += sums
+                    normal[two[:, :, None], one[:, None]] += back
 
-
-End = tuple[slice | None, np.ndarray | None, np.ndarray]
+    def _sums(self, i: int, j: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+        """Return the pairs of members that rows tie, and the sums (u, a, b) of the products of their derivatives."""
+        one, two = self.slopes[i], self.slopes[j]
+        members, others = (self.factor.on[k][1] for k in (i, j))
+        if members is None and others is None:
+            none = np.zeros(1, int)
+            return (none, none), np.tensordot(one, two, ((0, 1), (0, 1)))[None]
+        if (i, j) not in self.factor.order:
+            first, second = _numbers(members, one), _numbers(others, two)
+            pair = first * (second.max(initial=0) + 1) + second
+            order = np.argsort(pair, kind="stable")
+            starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
+            self.factor.order[i, j] = order, starts, (first[order[starts]], second[order[starts]])
+        order, starts, pairs = self.factor.order[i, j]
+        products = np.swapaxes(one, 1, 2) @ two
+        return pairs, np.add.reduceat(products[order], starts, axis=0) if len(order) else products
 
 
 def _numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
@@ -503,19 +660,7 @@ def _numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
     return np.zeros(len(slope), int) if members is None else members
 
 
-def _add(matrix: np.ndarray, one: End, two: End) -> None:
-    """Add to a matrix, at the places of members, the products of two derivatives (r, w, a) and (r, w, b) of rows."""
-    first, second = (0 if place is None else place.start for place, _, _ in (one, two))
-    a, b = one[2].shape[2], two[2].shape[2]
-    if one[1] is None and two[1] is None:
-        matrix[first : first + a, second : second + b] += one[2].reshape(-1, a).T @ two[2].reshape(-1, b)
-        return
-    products = np.swapaxes(one[2], 1, 2) @ two[2]
-    i, j = _numbers(one[1], one[2]), _numbers(two[1], two[2])
-    pair = i * (j.max(initial=0) + 1) + j
-    order = np.argsort(pair, kind="stable")
-    starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
-    sums = np.add.reduceat(products[order], starts, axis=0) if len(order) else products
-    i, j = (each[order[starts]] for each in (i, j))
-    rows = first + a * i[:, None, None] + np.arange(a)[:, None]
-    matrix[rows, second + b * j[:, None, None] + np.arange(b)] += sums
+def _unknowns(place: slice | None, members: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return the numbers (u, dim) of the unknowns of members (u,)."""
+    width = slope.shape[2]
+    return (place.start if place else 0) + width * members[:, None] + np.arange(width)

@@ -1,17 +1,20 @@
 """Normal equations of a camera calibration, with the places of the board's dots as unknowns."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
+from stcal.adjust.engine import Adjustment, Block, Huber, Joined, JoinedSolution, Vector
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
-from stcal.geometry.clusters import ByClusters, by_clusters
-from stcal.geometry.least_squares import minimise
-from stcal.geometry.normal_equations import Reduction, blocks_of, reduce
+from stcal.geometry.clusters import ByClusters
+from stcal.geometry.least_squares import PoseStack, minimise
 from stcal.geometry.print_modes import PrintModes
-from stcal.sfm.adjust.equations import equations_of_poses, image_cost, normalised, robust_weights
-from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
+from stcal.sfm.adjust.equations import image_cost, normalised
+from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.data.model import MetricModel
 
 MAX_STEPS = 200
@@ -90,6 +93,10 @@ class Setting:
         """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
         return np.linalg.pinv(self.basis) @ (camera.parameters() - self.start.parameters())
 
+    def camera(self, away: np.ndarray) -> Camera:
+        """Returns the camera with these parameters of the COLMAP model minus those at the start, (q,)."""
+        return self.start.with_parameters(_positive(self.start.parameters() + self.basis @ away))
+
     @property
     def kept(self) -> int:
         """Number of kept unknowns."""
@@ -106,121 +113,134 @@ def dots_costs(state: State, setting: Setting) -> np.ndarray:
     return np.sum(each, axis=0)
 
 
-def _cost(state: State, setting: Setting) -> float:
-    away = setting.away(state.camera)
-    return float(dots_costs(state, setting).sum() + away @ setting.weight @ away) + state.cost(setting.huber)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """Derivatives of a model's observations by pose (n, 2, 6), dot (n, 2, 3) and kept unknowns (n, 2, q), and their
-    residuals (n, 2), all over σ and with robust weights."""
-
-    by_pose: np.ndarray
-    by_point: np.ndarray
-    by_kept: np.ndarray
-    residual: np.ndarray
-
-    @classmethod
-    def of(cls, model: MetricModel, state: State, setting: Setting) -> "_Rows":
-        by_pose, by_point = projection_jacobians(model, state.camera)
-        by_kept = model.by_parameters(state.camera) @ setting.basis
-        root = np.sqrt(robust_weights(model, state.camera, setting.huber))[:, None]
-        a, c, e = (model.whiten(derivative) * root[..., None] for derivative in (by_pose, by_point, by_kept))
-        return cls(a, c, e, normalised(model, state.camera) * root)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of the kept unknowns, after elimination of the poses and then of each board's dots."""
+    """The adjustment linearised about a state; only the lens is damped, as dots and poses are optimal for each step."""
 
-    cost: float
-    state: State
+    models: tuple[MetricModel, ...]  # at any state
     setting: Setting
-    normal: np.ndarray
-    right: np.ndarray
-    boards: tuple[Reduction, ...]
-    poses: tuple[Reduction, ...]
+    solution: JoinedSolution
 
     @classmethod
     def of(cls, state: State, setting: Setting) -> "Normal":
-        normal, right = setting.weight.copy(), -setting.weight @ setting.away(state.camera)
-        boards, poses = [], []
-        for model in state.models:
-            board, rows, p = setting.boards[model.group], _Rows.of(model, state, setting), model.xyz_model.size
-            equations = equations_of_poses(model, rows.by_pose, rows.by_point, rows.by_kept, rows.residual)
-            away = reduce(equations.block, equations.block_right, equations.cross)
-            full, full_right = equations.normal - away.normal, equations.right - away.right
-            own = board.modes.weight(setting.sigma_mm)
-            full[:p, :p] += own
-            full_right[:p] -= own @ (model.xyz_model - board.places).ravel()
-            dots = reduce(full[None, :p, :p], full_right[None, :p], full[None, :p, p:])
-            normal += full[p:, p:] - dots.normal
-            right += full_right[p:] - dots.right
-            boards.append(dots)
-            poses.append(away)
-        return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses))
+        """Returns the equations at a state."""
+        joined, values = _problem(state, setting)
+        return cls(state.models, setting, joined.at(values))
+
+    @cached_property
+    def state(self) -> State:
+        """The state."""
+        return self._state(self.solution.values)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the state, in σ²."""
+        return float(self.solution.cost)
+
+    @property
+    def lens(self) -> Block:
+        """The parameters of the lens model, minus those at the start."""
+        return self.solution.problem.parts[0].blocks[LENS]
+
+    def by_photographs(self) -> ByClusters:
+        """Returns the covariance of the lens model's parameters by how the photographs differ."""
+        if not self.setting.kept:
+            return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
+        return self.solution.by_clusters(self.lens)
 
     def with_found_prints(self) -> tuple[float, dict[str, Board]]:
         """Returns the redundancy of the observations of the dots by themselves, and the boards with the amplitudes of
         their modes that explain the dots best."""
-        covariance, setting = np.linalg.inv(self.normal), self.setting
-        boards, left = {}, 0.0
-        for model, dots in zip(self.state.models, self.boards, strict=True):
-            board, inverse, from_kept = setting.boards[model.group], dots.inverse[0], dots.from_kept[0]
-            modes, to_kept = board.modes.modes, from_kept.T @ board.modes.modes
-            of_modes = modes.T @ inverse @ modes + to_kept.T @ covariance @ to_kept
-            taken = np.trace(inverse) + np.sum((from_kept @ covariance) * from_kept) - np.trace(of_modes)
-            left += dots.step.size - modes.shape[1] - float(taken) / setting.sigma_mm**2
-            found = board.modes.as_found(model.xyz_model - board.places, of_modes, setting.sigma_mm)
+        boards, left, sigma_mm = {}, 0.0, self.setting.sigma_mm
+        for model, part in zip(self.state.models, self.solution.whole, strict=True):
+            board, covariance = self.setting.boards[model.group], part.covariance(part.problem.blocks[DOTS])
+            modes = board.modes.modes
+            of_modes = modes.T @ covariance @ modes
+            left += len(covariance) - len(of_modes) - float(np.trace(covariance) - np.trace(of_modes)) / sigma_mm**2
+            found = board.modes.as_found(model.xyz_model - board.places, of_modes, sigma_mm)
             boards[model.group] = replace(board, modes=found)
         return left, boards
 
-    def by_photographs(self) -> ByClusters:
-        """Returns the covariance of the kept unknowns by how the photographs differ."""
-        pulls, informations, q = [], [], self.setting.kept
-        if not q:
-            return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
-        for model, dots in zip(self.state.models, self.boards, strict=True):
-            rows, m = _Rows.of(model, self.state, self.setting), len(model.images)
-            by_dot = dots.from_kept[0].reshape(-1, 3, q)[model.point_index]
-            by_kept = np.concatenate([rows.by_kept - rows.by_point @ by_dot, rows.residual[..., None]], axis=2)
-            both = np.concatenate([rows.by_pose, by_kept], axis=2)
-            square, _ = blocks_of(both, np.zeros(both.shape[:2]), model.image_index, m)
-            inner, cross = square[:, :6, :6], square[:, :6, 6:]
-            square = square[:, 6:, 6:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)
-            informations.append(square[:, :q, :q])
-            pulls.append(square[:, :q, q])
-        return by_clusters(self.normal, np.concatenate(pulls), np.concatenate(informations))
-
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step of the kept unknowns, the boards' dots, and their poses; and the predicted gain."""
-        kept_step = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
-        gain = 2 * float(kept_step @ self.right) - float(kept_step @ self.normal @ kept_step)
-        gain += sum(each.gain for each in (*self.boards, *self.poses))
-        dots = [board.back(kept_step).ravel() for board in self.boards]
-        poses = [
-            each.back(np.concatenate([moved, kept_step])).ravel() for each, moved in zip(self.poses, dots, strict=True)
-        ]
-        step = np.concatenate([kept_step, *dots, *poses])
+        """Returns the step of all unknowns, and the predicted gain: none where no projection moves visibly."""
+        step, gain = self.solution.step(damping)
         return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
 
     def largest_move(self, step: np.ndarray) -> float:
         """Returns the largest move of a projection by a step, px."""
-        new = moved(self.state, self.setting, step)
+        new = self.moved(step)
         before, after = (
             np.concatenate([model.residuals_px(state.camera) for model in state.models]) for state in (self.state, new)
         )
         return float(np.abs(after - before).max())
 
+    def moved(self, step: np.ndarray) -> State:
+        """Returns the state after a step of all unknowns."""
+        return self._state(self.solution.problem.moved(self.solution.values, step))
+
+    def _state(self, values: Mapping[str, Any]) -> State:
+        names = [model.group for model in self.models]
+        placed = [_placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
+        return State(tuple(placed), self.setting.camera(values["lens"].array[0]))
+
+
+POSES, DOTS_OF = "poses of ", "dots of "
+LENS, DOTS = 0, 1
+
+
+def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
+    """Returns the adjustment of all boards from a state, and its unknowns there."""
+    parts, values, first = [], {"lens": Vector(setting.away(state.camera)[None])}, 0
+    for model in state.models:
+        a, board = Adjustment(), setting.boards[model.group]
+        values[POSES + model.group] = PoseStack.of(*model.camera_from_model)
+        values[DOTS_OF + model.group] = Vector(model.xyz_model)
+        lens = a.block("lens", values["lens"])
+        dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
+        poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
+        a.factor(
+            partial(_off, model, setting),
+            [(lens, None), (dots, model.point_index), (poses, model.image_index)],
+            derivatives=partial(_slopes, model, setting),
+            root=model.whiten(np.tile(np.eye(2), (len(model.image_index), 1, 1))),
+            cluster=first + model.image_index,
+            loss=Huber(setting.huber),
+        )
+        a.prior(dots, board.places, board.modes.weight(setting.sigma_mm))
+        if not parts:
+            a.prior(lens, np.zeros((1, setting.kept)), setting.weight)
+        parts.append(a)
+        first += len(model.images)
+    return Joined(parts, ("lens",)), values
+
+
+def _placed(model: MetricModel, poses: PoseStack, dots: Vector) -> MetricModel:
+    rigid = tuple(poses.rigid(i) for i in range(len(poses)))
+    return replace(model, camera_from_model=rigid, xyz_model=dots.array)
+
+
+def _off(model: MetricModel, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> np.ndarray:
+    """Returns projected minus measured dots (n, 2), px; infinite behind a camera, and for a lens that is none."""
+    moved, camera = _placed(model, poses, dots), setting.camera(lens.array[0])
+    if (moved.xyz_camera()[:, 2] <= 0).any():
+        return np.full((len(model.image_index), 2), np.inf)
+    return -moved.residuals_px(camera)
+
+
+def _slopes(model: MetricModel, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> list[np.ndarray]:
+    moved, camera = _placed(model, poses, dots), setting.camera(lens.array[0])
+    by_pose, by_point = projection_jacobians(moved, camera)
+    return [moved.by_parameters(camera) @ setting.basis, by_point, by_pose]
+
 
 def minimum(state: State, setting: Setting) -> State:
-    """Returns the state of least cost. Only the kept unknowns are damped; dots and poses are optimal for each step."""
+    """Returns the state of least cost."""
+    joined, values = _problem(state, setting)
     solution = minimise(
-        state,
-        lambda at: Normal.of(at, setting),
-        lambda at, step: moved(at, setting, step),
-        cost=lambda at: _cost(at, setting),
+        values,
+        lambda at: Normal(state.models, setting, joined.at(at)),
+        joined.moved,
+        cost=joined.cost,
         damping=START_DAMPING,
         settled=EXACTLY,
         max_steps=MAX_STEPS,
@@ -233,23 +253,7 @@ def minimum(state: State, setting: Setting) -> State:
                 f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
                 "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
             )
-    return solution.state
-
-
-def moved(state: State, setting: Setting, step: np.ndarray) -> State:
-    """Returns the state after a step of :meth:`Normal.step`."""
-    sizes = [3 * len(model.labels) for model in state.models] + [6 * len(model.images) for model in state.models]
-    kept_step, *parts = np.split(step, setting.kept + np.cumsum([0, *sizes[:-1]]))
-    models = tuple(
-        replace(
-            model,
-            xyz_model=model.xyz_model + dots.reshape(-1, 3),
-            camera_from_model=moved_poses(model.camera_from_model, poses.reshape(-1, 6)),
-        )
-        for model, dots, poses in zip(state.models, parts, parts[len(state.models) :], strict=False)
-    )
-    parameters = _positive(state.camera.parameters() + setting.basis @ kept_step)
-    return State(models, state.camera.with_parameters(parameters))
+    return solution.linear.state
 
 
 def _positive(parameters: np.ndarray) -> np.ndarray:

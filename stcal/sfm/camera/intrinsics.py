@@ -16,7 +16,7 @@ from stcal.geometry.variances import sigma_factor
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.equations import Board, Normal, Setting, State, dots_costs, minimum, moved
+from stcal.sfm.camera.equations import Board, Normal, Setting, State, dots_costs, minimum
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectedImage
 
@@ -289,7 +289,7 @@ def _stepped(state: State, setting: Setting) -> Normal | None:
         step, gain = normal.step(0.0)
         if gain < NO_GAIN:
             return normal
-        state = moved(state, setting, step)
+        state = normal.moved(step)
         if not np.isfinite(state.cost(setting.huber)):
             return None
     return None
