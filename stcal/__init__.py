@@ -1,6 +1,6 @@
 """stcal: calibration of stereo targets from photographs of a single camera, and the use of them.
 
-See :func:`stcal.sfm.run` for the main job, ``docs/howto/python.md`` for ten tasks, and
+See :func:`stcal.sfm.run` for the main job, ``docs/howto/python.md`` for eleven tasks, and
 ``docs/explanation/conventions.md`` for conventions. Names are loaded when they are first used.
 """
 

@@ -1,3 +1,4 @@
+from . import adjust as adjust
 from . import errors as errors
 from . import handeye as handeye
 from . import locate as locate

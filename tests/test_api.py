@@ -31,7 +31,7 @@ from stcal.robot import DesignOptions, DHRow, IdentifyOptions, Joint, Robot
 from stcal.sfm import RunOptions, Trial
 from tests.outcome import fails_with
 
-SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "synthetic", "workflows")
+SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "adjust", "synthetic", "workflows")
 
 
 def public() -> dict[str, object]:

@@ -17,6 +17,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, minimise
+from stcal.geometry.least_squares import PoseStack as PoseStack
 from stcal.geometry.normal_equations import Reduction, blocks_of, generalised_inverse, reduce
 from stcal.geometry.robust import huber_cost, huber_weights
 
@@ -41,7 +42,13 @@ class Values(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vector:
-    """Members without curvature: ``array`` (n, dim)."""
+    """Members without curvature.
+
+    Parameters
+    ----------
+    array : (n, dim) array
+        The members.
+    """
 
     array: np.ndarray
 
@@ -60,7 +67,15 @@ class Vector:
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """Huber's loss of the lengths of whitened rows beyond ``limit``; constant beyond ``gross``, with no weight."""
+    """Huber's loss of the lengths of rows over their σ.
+
+    Parameters
+    ----------
+    limit : float
+        Length up to which it is the square.
+    gross : float
+        Length beyond which it is constant, and the row has no weight.
+    """
 
     limit: float = np.inf
     gross: float = np.inf
@@ -78,7 +93,16 @@ class Huber:
 class Block:
     """A block of unknowns; to be had from :meth:`Adjustment.block`.
 
-    ``start`` : its members at the start; ``eliminate`` : whether it is eliminated; ``fixed`` : (n,) members that stay.
+    Parameters
+    ----------
+    name : str
+        Its name.
+    start : Vector or PoseStack
+        Its n members at the start.
+    eliminate : bool
+        Whether it is eliminated.
+    fixed : (n,) bool array
+        Members that stay.
     """
 
     name: str
@@ -153,6 +177,15 @@ class Prior:
 class Adjustment:
     """A problem of least squares.
 
+    Parameters
+    ----------
+    blocks, factors, priors : lists
+        What :meth:`block`, :meth:`factor` and :meth:`prior` have added.
+    sigma : dict of str to float
+        Factor on the σ of a kind of rows, 1 where it is not stated.
+
+    Examples
+    --------
     >>> a = Adjustment()
     >>> line = a.block("line", Vector(np.zeros((1, 2))))
     >>> x, y = np.arange(4.0), np.array([1.0, 3.1, 4.9, 7.0])
@@ -261,7 +294,15 @@ class Adjustment:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An adjustment linearised about ``values`` of its blocks, by name."""
+    """An adjustment linearised about a state.
+
+    Parameters
+    ----------
+    problem : Adjustment
+        The adjustment.
+    values : dict of str to Vector or PoseStack
+        The members of each block, by its name.
+    """
 
     problem: Adjustment
     values: dict[str, Any]
@@ -472,9 +513,14 @@ def _by_clusters(normal: np.ndarray, told: Iterable[tuple[np.ndarray, np.ndarray
 class Joined:
     """Adjustments that have blocks in common, such as those of groups of photographs by one camera.
 
-    ``parts`` : the adjustments; ``shared`` : names of the blocks in common, the first ones of each part. What is known
-    of them stands in one part only. All other unknowns are eliminated. The names of the other blocks differ from part
-    to part, as do the numbers of their clusters.
+    Parameters
+    ----------
+    parts : sequence of Adjustment
+        The adjustments. The names of blocks that are not shared differ from part to part, as do the numbers of their
+        clusters.
+    shared : tuple of str
+        Names of the blocks in common, the first ones of each part. What is known of them stands in one part only. All
+        other unknowns are eliminated.
     """
 
     parts: Sequence[Adjustment]

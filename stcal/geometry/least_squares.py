@@ -207,9 +207,14 @@ are many and short."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseStack:
-    """A stack of h poses, ``rotation`` (h, 3, 3) and ``translation`` (h, 3), for inner loops.
+    """A stack of h poses for inner loops; unlike :class:`~stcal.geometry.rigid.Poses` it is not checked.
 
-    Unlike :class:`~stcal.geometry.rigid.Poses` it is not checked.
+    Parameters
+    ----------
+    rotation : (h, 3, 3) array
+        Rotation matrices.
+    translation : (h, 3) array
+        Translations.
     """
 
     dim: ClassVar[int] = 6
@@ -237,6 +242,7 @@ class PoseStack:
         return PoseStack(self.rotation[rows], self.translation[rows])
 
     def plus(self, other: "PoseStack") -> "PoseStack":
+        """Return these poses, then those of ``other``."""
         return PoseStack(
             np.concatenate([self.rotation, other.rotation]), np.vstack([self.translation, other.translation])
         )

@@ -8,11 +8,11 @@ import numpy as np
 
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset
-from stcal.geometry.plane_bundle import PlaneBundle
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import Pattern
+from stcal.sfm.detect.plane_bundle import PlaneBundle
 from stcal.sfm.detect.sightings import PlaneView, Readings
 
 MAX_SHIFT_PITCHES = 0.3
