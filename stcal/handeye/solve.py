@@ -24,7 +24,7 @@ from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, convex, solve_closed
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.joint import Adjusted, adjust_views, in_common, of_poses
 from stcal.handeye.methods.noise import Noise
-from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses, by_places
+from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses, by_places, places
 from stcal.handeye.methods.reprojection import CAMERA_GAIN, resected
 from stcal.handeye.result import HandEye
 from stcal.io.cameras.model import CameraPrior
@@ -53,6 +53,7 @@ chance may exceed the ratio that is required."""
 REST_WORSE = 1.2
 """Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
 ROBOT = ("robot_rad", "robot_mm")
+AT_ONE_PLACE = "the robot stood several times at one place: its errors there count once in σ"
 IN_COMMON = "σ contain the errors that the board's poses have in common (columns common…)"
 HELD_MM = 1e-6
 """σ that holds X along the one axis of rotation of a four-axis robot, where the poses do not determine it, in mm."""
@@ -293,7 +294,7 @@ def _by_poses(task: _Task) -> Solved:
     notes, covariance = task.notes + contradicted, generalised_inverse(normal)
     if not options.four_dof and (clusters := by_places(task.loop, solution)):
         covariance = clusters.covariance
-        notes += (Aside("the robot stood several times at one place: its errors there count once in σ"),)
+        notes += (Aside(AT_ONE_PLACE),)
     sigma_scale = float(np.sqrt(covariance[12, 12])) if options.with_scale else None
     if sigma_scale is not None:
         require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
@@ -348,8 +349,9 @@ def _by_views(task: _Task, views: Views) -> Solved:
 
     solution, contradicted = _by_true_robot(task, adjusted_by)
     state, outliers, reprojection = solution.state, ~solution.used, solution.found
-    if solution.sigma_scale is not None:
-        require_scale(state.scale, solution.sigma_scale, task.loop, task.pairs.where)
+    sigma_scale = solution.sigma_scale
+    if sigma_scale is not None:
+        require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
     x, z = state.mount_from_camera, state.stand_from_board
     notes, covariance = task.notes + contradicted, solution.covariance
     if options.four_dof:
@@ -358,6 +360,14 @@ def _by_views(task: _Task, views: Views) -> Solved:
         covariance = solution.camera_error.covariance(covariance)
     adjusted = replace(solution.loop, camera_from_board=resected(names, views, reprojection))
     residuals = adjusted.residuals(x, z)
+    if not options.four_dof and places(adjusted[~outliers]) is not None:
+        # What the places add to the covariance of the board's poses, they add to that of the corners.
+        by_poses = adjust_poses(adjusted[~outliers], LoopState(x, z, state.scale), Noise(), options.with_scale, False)
+        if clusters := by_places(adjusted[~outliers], by_poses):
+            added = clusters.covariance - clusters.independent
+            covariance, notes = covariance + added[:12, :12], (*notes, Aside(AT_ONE_PLACE))
+            if sigma_scale is not None:
+                sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
     notes += _of_camera_file(solution.camera_gain, solution.sigma)
     result = HandEye(
@@ -371,7 +381,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         covariance=covariance[:6, :6],
         stand_covariance=covariance[6:12, 6:12],
         scale=state.scale,
-        sigma_scale=solution.sigma_scale,
+        sigma_scale=sigma_scale,
         sigma=solution.sigma,
         estimated=solution.estimated,
         reprojection=reprojection,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, Noise, splits
+from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views, splits
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.solve import handeye
 from stcal.handeye.validate import better_setup
@@ -84,16 +84,25 @@ def test_the_other_setup_is_named_where_it_predicts_better(setup, seed):
 
 
 @pytest.mark.slow
-def test_poses_at_one_place_of_the_robot_count_once():
+@pytest.mark.parametrize("method", ["pose", "reprojection"])
+def test_poses_at_one_place_of_the_robot_count_once(method):
     """Six places, four detections at each, in which the robot's error is the same; taken for independent, the mean of
-    the squared error over the covariance is 18."""
+    the squared error over the covariance is 18 by poses, and 5.9 by corners."""
     squares = []
     for seed in range(16):
         rng = np.random.default_rng(seed)
-        truth = simulated(rng, 6, robot=(1.7e-3, 0.6))
-        again = [pose for pose in truth.pairs.base_from_flange for _ in range(4)]
-        seen = [pose for pose in truth.pairs.camera_from_board for _ in range(4)]
-        found = handeye(HandEyePoses(Poses.of(again), disturbed(rng, Poses.of(seen), 1e-4, 0.05)))
+        make = {"pose": simulated, "reprojection": simulated_views}[method]
+        truth = make(rng, 6, "eye-in-hand", (1.7e-3, 0.6), **({"corner_px": 0.1} if method == "reprojection" else {}))
+        flange, views = Poses.of([pose for pose in truth.pairs.base_from_flange for _ in range(4)]), None
+        if truth.views is None:
+            seen = Poses.of([pose for pose in truth.pairs.camera_from_board for _ in range(4)])
+            pairs = HandEyePoses(flange, disturbed(rng, seen, 1e-4, 0.05))
+        else:
+            again = [view for view in truth.views.views for _ in range(4)]
+            moved = [View(v.xyz_board, v.xy_px + rng.normal(0, 0.1, v.xy_px.shape)) for v in again]
+            views = Views(truth.views.camera, tuple(moved))
+            pairs = pairs_of_views(flange, views)
+        found = handeye(pairs, views=views)
         off = error(found, truth)
         squares.append(off @ np.linalg.solve(found.covariance, off) / 6)
         assert any("several times at one place" in str(note) for note in found.notes)

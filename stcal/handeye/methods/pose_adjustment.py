@@ -117,22 +117,28 @@ def adjust_poses(
     )
 
 
+def places(loop: Loop) -> np.ndarray | None:
+    """Returns the number (m,) of the place at which the robot stood for each pose; None if each has one of its own."""
+    robot, place = loop.stand_from_mount, np.arange(len(loop))
+    for i in range(1, len(loop)):
+        turn = Rotation.from_matrix(robot.rotation[i].T @ robot.rotation[:i]).magnitude()
+        away = np.linalg.norm(robot.translation[:i] - robot.translation[i], axis=1)
+        same = np.flatnonzero((turn < SAME_RAD) & (away < SAME_MM))
+        place[i] = place[same[0]] if len(same) else i
+    first, place = np.unique(place, return_inverse=True)
+    return place if LEAST_POSES <= len(first) < len(loop) else None
+
+
 def by_places(loop: Loop, solution: PoseSolution) -> ByClusters | None:
     """Returns the covariance of X, Z (and the scale) where the robot stood several times at one place: what it errs
     there is one error, not several. None if each pose has a place of its own."""
     used = ~solution.outliers
     own = loop[used]
-    robot, place = own.stand_from_mount, np.arange(len(own))
-    for i in range(len(own)):
-        turn = Rotation.from_matrix(robot.rotation[i].T @ robot.rotation[:i]).magnitude() if i else np.zeros(0)
-        away = np.linalg.norm(robot.translation[:i] - robot.translation[i], axis=1)
-        same = np.flatnonzero((turn < SAME_RAD) & (away < SAME_MM))
-        place[i] = place[same[0]] if len(same) else i
-    first, place = np.unique(place, return_inverse=True)
-    if len(first) == len(own) or len(first) < LEAST_POSES:
+    place = places(own)
+    if place is None:
         return None
     jacobian = _jacobian(own, solution.state, len(solution.normal))
-    weighted, member = np.linalg.solve(solution.covariance[used], jacobian), np.eye(len(first))[place]
+    weighted, member = np.linalg.solve(solution.covariance[used], jacobian), np.eye(place.max() + 1)[place]
     pull = -np.einsum("mai,ma->mi", weighted, solution.residuals[used])
     information = np.einsum("mc,mai,maj->cij", member, weighted, jacobian)
     return by_clusters(solution.normal, member.T @ pull, information)
