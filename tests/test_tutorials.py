@@ -13,8 +13,8 @@ from tests.levels import FULL, SLOW
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 BLOCK = re.compile(r"^```(bash|python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-LONG = ("hand-eye", "robot")
-"""Tutorials of more than twenty seconds whose commands other slow tests call too."""
+LONG = ("cube-of-tags", "hand-eye", "robot", "tags")
+"""Tutorials of more than twenty seconds whose chains other slow tests make too; `test_documents` parses their calls."""
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 """Of what a page shows; another processor rounds otherwise."""
 
