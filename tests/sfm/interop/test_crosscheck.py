@@ -276,7 +276,13 @@ def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     pids = tmp_path / "pids"
     path = program(tmp_path, f'sleep 61 & echo $$ $! > "{pids}"; wait')
     start = time.monotonic()
-    refused(path, COMPUTATION, "mapper` is still running after 1 s; raise --timeout", more=("--timeout", 1))
+    refused(
+        path,
+        COMPUTATION,
+        "E-COLMAP-TIMEOUT",
+        "mapper` is still running after 1 s; raise --timeout",
+        more=("--timeout", 1),
+    )
     assert 1 < time.monotonic() - start < 30
     assert_all_ended(pids, 2)
 
