@@ -119,8 +119,8 @@ def test_a_mistake_is_told(stock, case, name):
     assert {kind for kind, _ in found} <= {"no program could tell"}, found
 
 
-ELSEWHERE = {"sfm demo", "sfm detect", "sfm advise", "robot from-photos"}
-"""Commands whose good call another test of `.ci/run` makes: from the wheel, in tutorials, in `test_from_photos`."""
+ELSEWHERE = {"sfm demo", "sfm detect", "sfm advise"}
+"""Commands whose good call is made elsewhere in `.ci/run`: from the wheel, and in tutorials."""
 FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.command for before in CALLS[:n]} | ELSEWHERE]
 
 
