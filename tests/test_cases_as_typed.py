@@ -21,6 +21,7 @@ from stcal.boards.file import load_run_board
 from stcal.cli.main import main, main_sfm
 from stcal.io.design import load_target
 from tests.io.reported_cameras import SAMPLES
+from tests.levels import FULL
 from tests.outcome import COMPUTATION, INPUT, Outcome, ended, lines_of
 from tests.test_shared_cases import apart, truth
 
@@ -233,7 +234,9 @@ def test_every_case_is_here(shared_case):
     assert {path.name for path in shared_case("").iterdir() if path.is_dir()} == set(TYPED) | OPEN
 
 
-@pytest.mark.parametrize("case", [case for case in TYPED if TYPED[case]])
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=FULL if case.startswith("elastic") else ()) for case in TYPED if TYPED[case]]
+)
 def test_a_case_as_typed(typed, shared_case, case):
     """And what it writes is the truth, where that stands beside it."""
     outcomes = typed(case, " --out h.json" if case in HAND_EYE else "")
@@ -254,6 +257,17 @@ def test_a_case_as_typed(typed, shared_case, case):
             assert found, f"no {name} in {out}"
             assert abs(float(found[1]) - value) <= off, f"{name} {found[1]}, {value} needed"
     TRUE.get(case, lambda _: None)(shared_case(case))
+
+
+def test_an_elastic_file_predicts_what_was_identified(copied, called):
+    """Of every fifth row of the case that takes a minute as it was typed."""
+    folder = copied("elastic_file_differs")
+    head, *rows = (folder / "data.csv").read_text().splitlines(keepends=True)
+    (folder / "data.csv").write_text("".join([head, *rows[::5]]))
+    identified, evaluated = (called(words)[1] for words in commands(folder.name, (folder / "cmd").read_text()))
+    figures = re.search(r"identified, the same rows +([\d.]+) +([\d.]+)", identified)
+    assert figures
+    assert in_order(figures.groups(), evaluated)
 
 
 def comes_to(folder: Path, found: np.ndarray, degrees: float, mm: float) -> None:

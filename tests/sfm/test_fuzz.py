@@ -16,14 +16,14 @@ from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_pro
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, perform, went_through
-from tests.levels import sampled
+from tests.levels import FULL, sampled
 
 pytestmark = pytest.mark.slow
 KNOWN_SEED = 20
 SEED = int(os.environ.get("STCAL_SEED", KNOWN_SEED))
 """`scripts/full` draws another one each time."""
 CASES, PARTS = 360, 30
-IN_SAMPLE = range(0, PARTS, 4)
+IN_SAMPLE = range(0, PARTS, 8)
 """Parts that `.ci/run` judges."""
 
 
@@ -104,16 +104,15 @@ def test_a_cache_that_is_believed_is_seen(stock, case, monkeypatch):
     assert [kind for kind, _ in kept.of_kept(stock, case, KNOWN_SEED, 1).failures] == ["silent wrong"]
 
 
-BRIEF = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2]
-"""Those of calls that take together less than a minute of processor time; `scripts/full` makes all mistakes."""
 OF_ROBOTS = ("identify", "axes", "compensate", "verify", "locate", "register")
-SLOW = sampled(
-    [name for name in MISTAKES if name not in BRIEF and name.startswith(OF_ROBOTS)], kept=range(0, len(MISTAKES), 4)
-)
-"""Mistakes with robots, instruments and located targets, which no other test tells; `.ci/run` makes every fourth."""
+"""Mistakes with robots, instruments and located targets, which no other test tells."""
+TOLD = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2 or name.startswith(OF_ROBOTS)]
+LONG = {f"identify: {name}" for name in ("metres as mm", "inches as mm", "rows shuffled", "alpha in rad")}
+LONG |= {"identify: nominal robot 4.1 m off", "handeye, poses: robot in inches"}
+"""Mistakes that are told after ten seconds or more; `scripts/full` makes them, and those with photographs."""
 
 
-@pytest.mark.parametrize("name", [*BRIEF, *SLOW])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=FULL if name in LONG else ()) for name in TOLD])
 def test_a_mistake_is_told(stock, case, name):
     found = mistaken(stock, case, name).failures
     assert {kind for kind, _ in found} <= {"no program could tell"}, found
