@@ -179,7 +179,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
 
 
-@pytest.mark.parametrize(("sets", "least"), [(3, 2), pytest.param(10, 7, marks=FULL)])
+@pytest.mark.parametrize(("sets", "least"), [(5, 3), pytest.param(10, 7, marks=FULL)])
 def test_corners_behind_a_finger_are_named_and_no_others(sets, least):
     """A corner in few images hides some of its error in its tag's pose: not each is named, but none that is right."""
     named = []
@@ -308,9 +308,9 @@ def test_faces_that_are_hardly_seen_are_named():
 def test_what_is_forecast_is_what_is_simulated():
     """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
     target, near = tag_cube(60), 145.0
-    plan = PlanOptions(images=4, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    plan = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
     forecast, _, _ = planned_photographs(plan, target)
-    simulated = make_body_scene(target, body_camera(900), BodyOptions(4, near, seed=3, print_errors=1.0))
+    simulated = make_body_scene(target, body_camera(900), BodyOptions(8, near, seed=3, print_errors=1.0))
     pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
     assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
     assert not np.array_equal(forecast.target_from_face["2"].matrix(), simulated.target_from_face["2"].matrix())
@@ -424,16 +424,16 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
 @pytest.mark.slow
 def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
     """As many as one takes first: what they do not determine is an error, what they do not test is "not possible"."""
-    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=8, distance_mm=300, seed=5))
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=6, distance_mm=300, seed=5))
     write_body(tmp_path / "set", scene)
     solved, refusals = 0, []
-    for count, camera in ((2, None), (4, None), (6, None), (6, tmp_path / "set/cameras.txt")):
+    for count in (2, 4, 6):
         taken = tmp_path / f"{count}"
-        taken.mkdir(exist_ok=True)
+        taken.mkdir()
         for path in sorted((tmp_path / "set/images").iterdir())[:count]:
             shutil.copy(path, taken)
         try:
-            result = pipeline.run(taken, camera, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
+            result = pipeline.run(taken, None, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
         except StcalError as error:
             refusals.append(str(error))
         else:
@@ -442,7 +442,7 @@ def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
             assert tested or result.judgement.verdict != "yes"
             named = {name for s in result.solutions for name in (*s.left_out, *s.model.images)}
             assert named == {image.observations.name for image in result.labelled}
-    assert 0 < solved < 4
+    assert 0 < solved < 3
     assert all("; add " in line or "take " in line for line in refusals), refusals
 
 
