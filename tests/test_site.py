@@ -1,7 +1,5 @@
 """The site of the documents: what is made for it, and its links. `.ci/run` builds all of it."""
 
-import sys
-
 import pytest
 
 from tests.scripts import load_script
@@ -36,10 +34,3 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
         site.build(tmp_path / "site")
     assert 'pip install ".[docs]"' in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-def test_the_picture_is_drawn_from_the_sample(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["pictures.py", "found", "--out", str(tmp_path)])
-    load_script("pictures").main()
-    assert [path.name for path in tmp_path.iterdir()] == ["found.jpg"]
