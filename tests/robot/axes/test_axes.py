@@ -17,6 +17,7 @@ from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
+from tests.levels import SLOW, sampled
 from tests.outcome import fails_with, refuses
 from tests.support.arms import two_arms
 
@@ -45,7 +46,7 @@ def coupled() -> Robot:
 
 
 NOMINALS = {"MH80": mh80, "Craig": craig, "SCARA": scara, "coupled": coupled}
-QUICK_AND_SLOW = ["SCARA", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Craig", "MH80", "coupled"))]
+QUICK_AND_SLOW = ["SCARA", pytest.param("coupled", marks=SLOW), *sampled(["Craig", "MH80"], kept=())]
 
 
 def arm(nominal: Robot) -> Robot:
@@ -201,7 +202,7 @@ def test_leaving_out_a_row_is_fitting_without_it():
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_influence_is_leaving_out(monkeypatch):
     """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
     nominal = mh80()
@@ -252,8 +253,7 @@ def test_a_row_without_a_target_is_named():
     assert any(f"line {data.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("off_mm", [0.5, 20.0, 300.0, 2000.0])
+@pytest.mark.parametrize("off_mm", sampled([0.5, 20.0, 300.0, 2000.0]))
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 7)
