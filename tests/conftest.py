@@ -12,6 +12,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a suite in the backg
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import multiprocessing.util
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -53,9 +54,16 @@ typer.main.get_command = cache(typer.main.get_command)  # of hundreds of calls h
 
 
 def pytest_configure(config):
-    """Fewer examples of each property but in `scripts/full`."""
+    """Fewer examples of each property but in `scripts/full`; and programs that tests start keep what they compile.
+
+    Where Python is told to keep nothing, each would compile its libraries anew, which takes longer than most calls.
+    """
     if "not full" in config.option.markexpr:
         settings.load_profile("quick")
+    if os.environ.pop("PYTHONDONTWRITEBYTECODE", "") and "PYTHONPYCACHEPREFIX" not in os.environ:
+        kept = tempfile.TemporaryDirectory(prefix="stcal-tests-", ignore_cleanup_errors=True)
+        os.environ["PYTHONPYCACHEPREFIX"] = kept.name
+        config.add_cleanup(kept.cleanup)
 
 
 def pytest_collection_modifyitems(items):

@@ -187,51 +187,6 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
         assert chdtrc(6, mahalanobis) > 1e-3
 
 
-@pytest.mark.full
-def test_photographs_to_joint_values_in_one_command(cell):
-    """Photographs of sweeps and of other poses, one of them without joint values: 0.5 mm and 1 mrad of every axis are
-    found, and targets are reached to what rows held out say."""
-    root = cell.root
-    (root / "robot.toml").write_text(robot_toml(mh80()))
-    sweeps = np.array([REST + REACH[j] * np.eye(6)[j] * t for j in range(6) for t in np.linspace(-1, 1, 7)])
-    q = np.concatenate([sweeps, cell.about(30)])
-    names = cell.photographed("views", q)
-    rows = [[n, *each] for n, each in zip(names, np.degrees(q), strict=True)]
-    cell.write("joints.csv", ["image", *JOINTS], rows[:-1])
-    wanted = cell.about(5)
-    cell.write("targets.csv", JOINTS, np.degrees(wanted).tolist())
-    words = "stcal robot from-photos {0}/views/images --camera {0}/views/cameras.txt --faces {0}/run/faces.json "
-    words += "--target {0}/views/target.toml --board {0}/views/board.toml --joints {0}/joints.csv "
-    words += "--robot {0}/robot.toml --targets {0}/targets.csv --out {0}/done"
-    faces = json.loads((root / "run/faces.json").read_text())
-    for centre in faces["circles"].values():
-        centre[0] *= 1.3
-    (root / "other.json").write_text(json.dumps(faces))
-    refused = cell.call(words.replace("run/faces.json", "other.json"), 2)
-    assert "off that of target" in refused
-    assert "0.5 mm allowed; give the target.toml of that run" in refused
-    assert not (root / "done").exists()
-    said = cell.call(words)
-    assert "1 rows of the photographs have no partner" in said
-    assert "every joint is swept by itself" in said
-    out = root / "done"
-    for step in ("poses", "axes", "identified", "compensated"):
-        assert {path.suffix for path in out.glob(f"{step}.*")} >= {".json", ".html"}
-    page = (out / "report.html").read_text()
-    assert all(f'href="{path.name}"' in page for path in out.glob("*.html") if path.name != "report.html")
-    held = json.loads((out / "identified.json").read_text())["held_out"]
-    assert held["rms_mm"] < 0.03  # σ of up to 20 µm in depth; as drawn it is off by BUILT_MM and more
-    identified = load_robot(out / "identified.toml")
-    sent = read_table(out / "compensated.csv", "joint values")
-    reached = np.column_stack([sent.quantity(f"q{i}", {"deg": np.pi / 180}) for i in range(1, 7)])
-    seen = cell.camera_from_base @ (forward(cell.real, reached) @ cell.flange_from_target)
-    drawn = replace(mh80(), tools=identified.tools)
-    off = seen.difference(identified.world_from_base @ forward(drawn, wanted))
-    assert np.abs(off[:, 3:]).max() < 0.05
-    with_files = sorted(path.name for path in out.iterdir())
-    assert not [name for name in with_files if "partial" in name]
-
-
 def _joints(path):
     table = read_table(path, "joints")
     return np.column_stack([table.numbers(name) for name in JOINTS])

@@ -13,18 +13,16 @@ import pytest
 from PIL import Image
 
 import stcal
-from stcal import robot, sfm, synthetic
+from stcal import robot
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.model import mh80
-from stcal.synthetic.dataset import write_dataset
-from tests.levels import SLOW
+from tests.levels import FULL, SLOW
 from tests.locate.test_arrays import CAMERA, LAYOUT, TRUTH
 from tests.support.areas import homography, rendered
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^## (\d+)\. .*?^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SCRIPTS = dict(BLOCK.findall((ROOT / "docs" / "howto" / "python.md").read_text(encoding="utf-8")))
-SMALL = synthetic.SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 FLANGE_FROM_CAMERA = Rigid.exp([0.1, 0.2, -0.3, 30.0, -20.0, 90.0])
 B_FROM_A = Rigid.exp([0.3, -0.2, 0.5, 1000.0, 50.0, -200.0])
 WRONG = [4, 11]
@@ -63,12 +61,9 @@ def test_names_are_public(number):
 
 
 def write_inputs(folder: Path) -> None:
-    """Writes the files that the page names, small ones."""
+    """Writes the files that the page names, small ones, but for its ``demo``."""
     rng = np.random.default_rng(5)
-    scene = synthetic.make_scene(SMALL)
-    write_dataset(folder / "demo" / "data", scene)
-    sfm.run(folder / "demo/data/images", scene.camera, folder / "demo" / "run")
-    stcal.save_camera(folder / "camchain.yaml", scene.camera, "kalibr", "cam0")
+    stcal.save_camera(folder / "camchain.yaml", CAMERA, "kalibr", "cam0")
     stcal.save_camera(folder / "scene-camera.txt", CAMERA)
     place = homography(np.array([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]]), TRUTH.rotation, TRUTH.translation)
     Image.fromarray(rendered(LAYOUT, place, (320, 240), rng)).save(folder / "scene.png")
@@ -93,9 +88,12 @@ def write_inputs(folder: Path) -> None:
 
 @SLOW
 @pytest.mark.parametrize("number", SCRIPTS)
-def test_a_script_runs(number, once, tmp_path, monkeypatch):
+def test_a_script_runs(number, once, small_dataset, small_run, tmp_path, monkeypatch):
     for entry in once.folder("howto-python", write_inputs).iterdir():
         (tmp_path / entry.name).symlink_to(entry)
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo/data").symlink_to(small_dataset)
+    (tmp_path / "demo/run").symlink_to(small_run)
     monkeypatch.chdir(tmp_path)
     before = {entry.name for entry in tmp_path.iterdir()}
     found = {"__name__": f"task_{number}"}
@@ -105,20 +103,14 @@ def test_a_script_runs(number, once, tmp_path, monkeypatch):
     assert {entry.name for entry in tmp_path.iterdir()} - before == made
 
 
-@SLOW
+@FULL
 def test_a_type_checker_knows_what_the_scripts_use(tmp_path):
     for number, code in SCRIPTS.items():
         (tmp_path / f"task_{number}.py").write_text(code, encoding="utf-8")
     settings = {"typeCheckingMode": "standard", "extraPaths": [str(ROOT)]}
     (tmp_path / "pyrightconfig.json").write_text(json.dumps(settings), encoding="utf-8")
-    words = [
-        Path(sys.executable).parent / "basedpyright",
-        "--outputjson",
-        "--pythonpath",
-        sys.executable,
-        "-p",
-        tmp_path,
-    ]
+    program = Path(sys.executable).parent / "basedpyright"
+    words = [program, "--outputjson", "--pythonpath", sys.executable, "-p", tmp_path]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     found = json.loads(ended.stdout)["generalDiagnostics"]
     assert [each["message"] for each in found if each["severity"] == "error"] == []

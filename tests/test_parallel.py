@@ -282,14 +282,3 @@ with one_thread():
 """
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=20, check=True)
     assert done.stdout == "(300, 300) (300, 300)\n"
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no sockets with names")
-def test_a_long_name_of_the_folder_for_temporary_files_is_no_harm(tmp_path):
-    """A socket's name has a hundred characters; processes are then started without the server."""
-    folder = tmp_path / ("x" * 110)
-    folder.mkdir()
-    code = "from stcal.parallel import run_parallel; print(sorted(run_parallel(abs, [(-1,), (-2,)], 2)))"
-    words = [sys.executable, "-P", "-c", f"if __name__ == '__main__':\n    {code}"]
-    done = subprocess.run(words, capture_output=True, text=True, check=True, env={**os.environ, "TMPDIR": str(folder)})
-    assert done.stdout == "[(0, 1), (1, 2)]\n"

@@ -1,7 +1,6 @@
 """Figures of the documents are those that their scripts printed, cell by cell, and the scripts print them still."""
 
 import shlex
-import tempfile
 
 import pytest
 
@@ -85,20 +84,3 @@ def test_runs_are_compared_by_the_digits_shown():
     assert differing(["a 1.25 of 30"], ["a 1.27 of 30"]) != []
     assert differing(["a 1.25"], ["b 1.25"]) != []
     assert differing(["a"], ["a", "b"]) != []
-
-
-def test_a_stored_file_says_command_and_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(printed, "PRINTED", tmp_path)
-    path = tmp_path / "some_only_one.txt"
-    path.write_text("# scripts/some.py --only one, at commit 5a02514\n1 2\n")
-    assert printed.stored("scripts/some.py --only one")[1] == ["1 2"]
-    path.write_text("# scripts/some.py --only two, at commit 5a02514\n1 2\n")
-    with pytest.raises(ValueError, match="needed"):
-        printed.stored("scripts/some.py --only one")
-
-
-def test_a_program_is_run_and_its_temporary_folder_is_not_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(printed, "ROOT", tmp_path)
-    (tmp_path / "some").write_text(f'#!/bin/sh\necho "faces:  {tempfile.gettempdir()}/demo-x1/run/$1.json"\n')
-    (tmp_path / "some").chmod(0o755)
-    assert printed.run("some faces") == ["faces:  …/run/faces.json"]

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from typer.models import OptionInfo, ParameterInfo
+from typer.models import OptionInfo
 from typer.testing import CliRunner
 
 import stcal
 from stcal.cli import options, terminal
 from stcal.cli.help import PANELS
 from stcal.cli.main import app, main
-from stcal.cli.sfm import app as sfm
 from stcal.errors import lacks_memory
 from tests.commands import COMMANDS
 from tests.outcome import INPUT, assert_error, ended, fails_with
@@ -193,16 +192,6 @@ def test_json_goes_to_standard_output_alone(program, tmp_path, monkeypatch):
     ]
 
 
-def test_every_json_option_says_so():
-    """``--json`` means the same wherever it stands."""
-    for name, command in COMMANDS.items():
-        for parameter in inspect.signature(command, eval_str=True).parameters.values():
-            info = next(each for each in get_args(parameter.annotation) if isinstance(each, ParameterInfo))
-            if "--json" in (info.default, *(info.param_decls or ())):
-                assert "to standard output with `-`" in (info.help or ""), name
-                assert parameter.name in command.outputs  # type: ignore[attr-defined]
-
-
 @pytest.mark.parametrize(
     ("encoding", "shown"), [("utf-8", "12 µm \\u202e\\u009b"), ("ascii", "12 \\u00b5m \\u202e\\u009b")]
 )
@@ -214,24 +203,6 @@ def test_json_on_a_terminal_is_printable_and_the_same(monkeypatch, encoding, sho
     text = raw.getvalue().decode(encoding)
     assert json.loads(text) == {"note": "12 µm \u202e\x9b"}
     assert shown in text
-
-
-def test_a_shell_asks_what_may_stand_next():
-    """Nothing more than words is printed, and no run begins."""
-    code = "from stcal.cli.entry import main_sfm; main_sfm()"
-    asked = {"_STCAL_SFM_COMPLETE": "complete_bash", "COMP_WORDS": "stcal-sfm run --ref", "COMP_CWORD": "2"}
-    words = [sys.executable, "-P", "-c", code]
-    ended = subprocess.run(words, capture_output=True, text=True, env=os.environ | asked, check=False)
-    assert (ended.returncode, ended.stdout.split()) == (0, ["--reference-face", "--refine-camera"])
-    asked = {"_STCAL_SFM_COMPLETE": "source_bash"}
-    ended = subprocess.run(words, capture_output=True, text=True, env=os.environ | asked, check=False)
-    assert "complete -o default -F _stcal_sfm_completion stcal-sfm" in ended.stdout
-
-
-def test_a_stage_that_takes_long_says_what_is_left():
-    assert terminal.time_left(10.0, 2, 8) == ", about 30 s left"
-    assert terminal.time_left(60.0, 1, 6) == ", about 5 min left"
-    assert terminal.time_left(10.0, 8, 8) == terminal.time_left(1.0, 7, 8) == terminal.time_left(0.0, 0, 8) == ""
 
 
 def progress_of(capsys, monkeypatch, quiet: bool, verbose: bool) -> list[str]:
@@ -284,55 +255,6 @@ def test_a_quiet_command_says_a_verdict_that_is_not_good(capsys, rule, failed, v
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_quiet_command_without_a_sentence_says_what_failed(capsys):
-    with terminal.manner(True, False):
-        for rule in RULES:
-            rule(False, ["χ² of a.jpg"])
-    assert capsys.readouterr() == ("", "warning: failed: χ² of a.jpg\nwarning: χ² of a.jpg\n")
-
-
 def test_every_command_can_be_quiet_or_say_more():
     for command in COMMANDS.values():
         assert {"quiet", "verbose"} <= set(inspect.signature(command).parameters)
-
-
-SAID = """checks: 1 failed, 2 suspicious, 14 passed, 2 not possible
-  failed: Residuals: 12/failed.jpg at 3 px, not passed
-verdict: use with care: few poses
-warning: focus"""
-
-
-@pytest.mark.parametrize(
-    ("variables", "terminal_there", "coloured"),
-    [
-        ({"TERM": "xterm"}, True, True),
-        ({"TERM": "xterm", "NO_COLOR": ""}, True, True),
-        ({"TERM": "xterm", "NO_COLOR": "1"}, True, False),
-        ({"TERM": "dumb"}, True, False),
-        ({"TERM": "xterm"}, False, False),
-    ],
-)
-def test_words_of_verdicts_have_colours_on_a_terminal(monkeypatch, variables, terminal_there, coloured):
-    class Stream(io.StringIO):
-        def isatty(self):
-            return terminal_there
-
-    monkeypatch.delenv("NO_COLOR", raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
-    stream = Stream()
-    monkeypatch.setattr("sys.stdout", stream)
-    terminal.say(SAID)
-    text = stream.getvalue()
-    assert re.sub(r"\x1b\[\d+m", "", text) == SAID + "\n"
-    words = re.findall(r"\x1b\[(\d+)m([^\x1b]+)\x1b\[0m", text)
-    red, yellow, green = "31", "33", "32"
-    wanted = [(red, "failed"), (yellow, "suspicious"), (green, "passed"), (red, "failed"), (yellow, "use with care")]
-    assert words == ([*wanted, (yellow, "warning")] if coloured else [])
-
-
-def test_help_tells_of_completion():
-    """Both programs; no command has an option more for it."""
-    for application in (app, sfm):
-        assert "--install-completion" in CliRunner().invoke(application, ["-h"]).output
-    assert "completion" not in CliRunner().invoke(app, ["register", "-h"]).output

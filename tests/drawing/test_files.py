@@ -1,7 +1,6 @@
 """Lengths in files are exact, sheets of a paper cover what is split over them, and what cannot be drawn is refused."""
 
 import re
-from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
 
@@ -12,24 +11,19 @@ import stcal
 from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
-from stcal.drawing.draw import POINT_MM, SUFFIXES, draw, pdf
-from stcal.drawing.parts import Disc, Line, Text, board_parts, extent, target_parts
+from stcal.drawing.draw import POINT_MM, draw
+from stcal.drawing.parts import Disc, Line, Text, board_parts
 from stcal.drawing.sheets import (
     EDGE,
     FOOT,
-    FURNITURE,
     OVERLAP,
     PAPERS,
-    PLAN_LETTERS,
     SIDE,
     framed,
-    one_sheet,
     paper_sheets,
     seams_between,
-    table,
 )
 from stcal.io.design import board_toml, target_toml
-from tests.drawing.raster import shapes_of
 from tests.outcome import fails_with, refuses
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -86,12 +80,6 @@ def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
         assert sorted([sheet.width, sheet.height]) == sorted(PAPERS["Letter"])
 
 
-@pytest.mark.slow
-def test_a_pdf_is_the_same_again():
-    sheets = paper_sheets(board_parts(reference_board(), 10.0), "A4", "board")
-    assert pdf(sheets) == pdf(sheets)
-
-
 def test_sheets_cover_the_board_and_seams_run_between_dots():
     """Each dot is whole on a sheet, at its place against the others: a sheet's shift is that of all on it."""
     (part,) = board_parts(reference_board(), 10.0)
@@ -132,39 +120,6 @@ def test_seams_leave_no_gap(taken):
     assert max(b - a for a, b in pieces) <= 100.0
     assert not any(low < seam < high for seam in seams for low, high in taken.tolist())
     assert len(seams) == 2
-
-
-def test_seams_avoid_words_unless_a_circle_would_be_cut():
-    """The only seam may lie from 50 to 95. Words give way where there is no room for both."""
-    words, circles = np.array([[85.0, 101.0]]), np.array([[60.0, 101.0]])
-    assert seams_between(0.0, 110.0, 100.0, np.zeros((0, 2)), words) == [84.0]
-    assert seams_between(0.0, 110.0, 100.0, np.array([[90.0, 101.0]]), np.array([[40.0, 89.0]])) == [89.0]
-    assert seams_between(0.0, 110.0, 100.0, circles, words) == [59.0]
-    assert seams_between(0.0, 100.0, 100.0, np.zeros((0, 2))) == []  # what fits is not split
-
-
-def test_a_board_that_fits_a_sheet_without_its_dimensions_is_not_cut():
-    """Its own 220 × 172 mm have room on A4 landscape; with dimensions and table they would take two sheets."""
-    board = replace(reference_board(), rows=13, columns=17, pitch_mm=12.0, radius_mm=3.0, corner_radius_mm=4.5)
-    (part,) = board_parts(board, 10.0)
-    (sheet,) = paper_sheets([part], "A4", "board")
-    assert (sheet.bare, sheet.cuts, sheet.width) == (True, False, 297.0)
-    discs = [shape for shape in shapes_of(sheet) if isinstance(shape, Disc)]
-    assert len(discs) == 13 * 17
-    assert not any(sheet.bare for sheet in paper_sheets([part], "A3", "board"))
-
-
-def test_parts_on_one_sheet_stand_in_rows():
-    """Nine equal ones, none over another: all in a row or a column would be 0.1 or 12 times as wide as high."""
-    part = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)[0]
-    sheet = one_sheet([replace(part, name=f"board {i}") for i in range(9)], "boards")
-    assert 0.3 < (sheet.width - FURNITURE[0]) / (sheet.height - FURNITURE[1]) < 3
-    cut = [s for s in shapes_of(sheet) if isinstance(s, Line) and s.closed]
-    boxes = [extent([line]) for line in cut]
-    for i, one in enumerate(boxes):
-        assert (one[0] >= 0).all()
-        assert (one[1] <= [sheet.width, sheet.height]).all()
-        assert all((one[1] < other[0]).any() or (other[1] < one[0]).any() for other in boxes[:i])
 
 
 def test_the_lengths_to_check_are_said():
@@ -216,26 +171,6 @@ def test_a_design_that_is_not_there_is_said(files):
         draw(files / "nothing.toml", files / "a.svg")
 
 
-def test_the_plan_beside_a_plate_has_the_numbers_of_its_circles():
-    """Each in the place of its circle, on a smaller scale; no word is on the plate."""
-    target = reference_target()
-    for face, part in zip(target.faces, target_parts(target, 10.0), strict=True):
-        for below in (True, False):
-            shapes = table(part, below)
-            (plan,) = (s for s in shapes if isinstance(s, Line))
-            scale = np.ptp(plan.points, axis=0)[0] / np.ptp(part.outline, axis=0)[0]
-            assert scale < 0.5
-            numbers = {s.words: s for s in shapes if isinstance(s, Text) and s.height == PLAN_LETTERS}
-            assert set(numbers) == set(face.ids)
-            for circle, xy in zip(face.ids, face.xy_mm, strict=True):
-                place = plan.points[0] + scale * (xy - part.outline[0])
-                words = numbers[circle]
-                np.testing.assert_allclose([words.x, words.y + words.height / 2], place, atol=1e-9)
-            low, high = part.outline.min(0), part.outline.max(0)
-            words = [s.box() for s in (*framed(part), *shapes) if isinstance(s, Text)]
-            assert not any((box[0] < high).all() and (box[1] > low).all() for box in words)
-
-
 def test_too_many_sheets_and_circles_without_a_radius_are_refused(files):
     (files / "board.toml").write_text('type = "chessboard"\nrows = 60\ncolumns = 60\nsquare_mm = 100\n')
     refuses("E-DRAW-SHEETS … --paper … A4 … 500", draw, files / "board.toml", files / "board.pdf")
@@ -245,16 +180,3 @@ def test_too_many_sheets_and_circles_without_a_radius_are_refused(files):
     )
     with fails_with("E-BOARD-RADIUS … radius_mm"):
         draw(files / "grid.yaml", files / "grid.pdf")
-
-
-@pytest.mark.slow
-def test_boards_of_a_set_are_drawn_one_by_one(files):
-    (files / "boards.toml").write_text(
-        'type = "boards"\n[[board]]\ntype = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n'
-        '[[board]]\ntype = "charuco"\nrows = 3\ncolumns = 3\nsquare_mm = 20\nmarker_mm = 15\ndictionary = "4X4_50"\n'
-        "x_mm = 100\n"
-    )
-    drawn = draw(files / "boards.toml", files / "boards.pdf")
-    assert [part.name.split(":")[0] for part in drawn.parts] == ["board 1", "board 2"]
-    assert len(drawn.sheets) == 2
-    assert {path.suffix for path in files.glob("boards.*")} & set(SUFFIXES) == {".pdf"}

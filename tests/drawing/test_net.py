@@ -61,39 +61,6 @@ def test_a_box_is_one_net(target):
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
 
 
-def test_the_sketch_has_the_numbers_of_all_circles(target):
-    """Where they are on the face, at a fifth; the letters do not overlap."""
-    part = net_part(target)
-    words = [s for s in part.shapes if isinstance(s, Text) and not s.words.startswith("under ")]
-    numbers = [s for s in words if s.height < 2]
-    ids = [circle for face in target.faces for circle in face.ids]
-    assert sorted(s.words for s in numbers) == sorted(ids)
-    assert sorted(s.words for s in words if s not in numbers) == sorted(face.id for face in target.faces)
-    circles = circles_of(part)
-    xy = np.array([circles[label] for face in target.faces for label in face.labels()])
-    places = np.array([[s.x, s.y + s.height / 2] for s in numbers])
-    for place, circle in zip(places.mean(0) + (xy - xy.mean(0)) / 5, ids, strict=True):
-        same = places[[s.words == circle for s in numbers]]
-        assert np.linalg.norm(same - place, axis=1).min() < 1e-6
-    boxes = [s.box() for s in words]
-    assert not any((a[0] < b[1]).all() and (b[0] < a[1]).all() for a, b in combinations(boxes, 2))
-
-
-def test_words_of_tabs_stand_on_them(target):
-    three = replace(target, faces=tuple(face for face in target.faces if face.id in ("front", "right", "top")))
-    turned = set()
-    for part in (net_part(target), net_part(three)):
-        tabs = [line.points for line in part.lines if line.layer == "CUT" and len(line.points) == 4]
-        for word in (s for s in part.shapes if isinstance(s, Text) and s.words.startswith("under ")):
-            turned.add(word.turned)
-            across = word.height / 2
-            middle = np.array([word.x - across, word.y] if word.turned else [word.x, word.y + across])
-            (tab,) = (tab for tab in tabs if np.linalg.norm(tab.mean(0) - middle) < 0.1)
-            along = np.abs(tab[3] - tab[0])
-            assert (along[1] > along[0]) == word.turned
-    assert turned == {True, False}
-
-
 @pytest.mark.slow
 def test_a_net_is_on_one_sheet(target, tmp_path):
     """400 × 200 mm and more."""

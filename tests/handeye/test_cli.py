@@ -9,7 +9,6 @@ import yaml
 from stcal.design import BoardDesign
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
-from stcal.handeye.report.export import FORMS
 from stcal.io.cameras.read import read_camera
 from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import chessboard_mm
@@ -106,16 +105,6 @@ def test_all_methods_are_compared(command, tmp_path):
         assert row["method"] in page.read_text()
     assert data["method"] == "pose"
     assert len(data["splits"]) == 2
-
-
-def test_one_method_by_name(command, tmp_path):
-    truth = simulated(np.random.default_rng(6), 12, **NOISE)
-    source = poses_file(tmp_path / "poses.csv", truth)
-    code, shown, _ = command(source, "--method", "park-martin", "--splits", 0, "--out", tmp_path / "h.json")
-    assert code == 0
-    assert "eye-in-hand, park-martin: 12 poses" in shown
-    assert json.loads((tmp_path / "h.json").read_text())["covariance"] is None
-    assert_error(command(source, "--method", "kalman"), INPUT, "--method kalman: ", "one of tsai-lenz, park-martin")
 
 
 def test_stated_sigmas_weight(command, tmp_path):
@@ -225,23 +214,6 @@ def test_bad_rows_of_images_are_named(command, chessboard, tmp_path, rows, code,
     poses.write_text("\n".join([header, *lines]) + "\n")
     images, _, _, *rest = chessboard.arguments()
     assert_error(command(images, "--poses", poses, *rest, "--workers", 1), code, *parts)
-
-
-def test_every_form_of_export(command, tmp_path):
-    """In one call, each in its file, and each gives the transform of the result file back."""
-    source, out = poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(5), 8, **NOISE)), tmp_path / "h"
-    words = [word for form in FORMS for word in ("--export", f"{form}={tmp_path / 'deep' / form}.txt")]
-    words += ["--camera-frame", "link", "--parent", "tool0", "--child", "left_link"]
-    code, shown, _ = command(source, "--splits", 0, "--out", out, *words)
-    assert code == 0
-    wanted = Rigid.from_matrix(json.loads(out.read_text())["flange_from_camera"])
-    for form, kind in FORMS.items():
-        path = tmp_path / "deep" / f"{form}.txt"
-        assert f"written: {path}" in shown
-        link = kind.read(path.read_text())[0]
-        assert (link.parent, link.child) == ("tool0", "left_link")
-        found = link.pose @ Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
-        assert np.abs(found.matrix() - wanted.matrix()).max() < 1e-6  # mm, as printed
 
 
 @pytest.mark.parametrize(

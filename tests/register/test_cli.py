@@ -1,7 +1,6 @@
 """``stcal register``: files in and out, bad rows by line, base and kinematics beside the transform."""
 
 import json
-import re
 
 import numpy as np
 import pytest
@@ -46,24 +45,6 @@ def run(monkeypatch, capsys):
     return call
 
 
-@pytest.mark.slow
-def test_json_and_page(run, tmp_path):
-    a, b = points()
-    b[4] += [0, 9, 0]
-    out, page = tmp_path / "new" / "found.json", tmp_path / "found.html"
-    code, printed, err = run(written(tmp_path, rows_of(a, b)), "--folds", 2, "--out", out, "--report", page)
-    assert (code, err) == (0, "")
-    content = json.loads(out.read_text())
-    np.testing.assert_allclose(content["b_from_a"], B_FROM_A.matrix(), atol=1.0)
-    # the line of a row: the header is line 1
-    assert [o["line"] for o in content["outliers"]] == [6]
-    assert content["outliers"][0]["length_mm"] == pytest.approx(9, abs=0.5)
-    assert "line 6" in printed
-    assert f"written: {out}" in printed
-    assert page.read_text().startswith("<!DOCTYPE html>")
-    assert not list(tmp_path.glob("*.partial"))
-
-
 def test_two_motions_are_refused_unless_allowed(run, tmp_path):
     """A third of the points moved together by 9 mm, as when an instrument is knocked."""
     a, b = points()
@@ -79,23 +60,6 @@ def test_two_motions_are_refused_unless_allowed(run, tmp_path):
     other = json.loads(out.read_text())["alternative"]
     assert other["lines"] == list(range(2, 32, 3))
     assert other["apart_mm"] == pytest.approx(9, abs=0.5)
-
-
-@pytest.mark.slow
-def test_methods_and_threshold(run, tmp_path):
-    a, b = points(60)
-    b[7] += [0, 4, 0]
-    pairs, out = written(tmp_path, rows_of(a, b)), tmp_path / "o.json"
-
-    def found(*options):
-        assert run(pairs, *options, "--folds", 0, "--out", out, "--overwrite")[0] == 0
-        return json.loads(out.read_text())
-
-    plain, within = found("--method", "least-squares"), found("--threshold", 0.3)
-    assert plain["held_out"] is None
-    assert plain["inliers"] == [True] * 60
-    assert within["threshold_mm"] == 0.3
-    np.testing.assert_array_equal(np.linalg.norm(within["residuals"], axis=1) < 0.3, within["inliers"])
 
 
 def test_a_bad_row_is_named_and_nothing_written(run, tmp_path):
@@ -226,23 +190,3 @@ def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pai
     assert code == 3
     assert "27 parameters" in err
     assert "robot" not in json.loads(out.read_text())
-
-
-@pytest.mark.slow
-def test_the_published_method_takes_its_numbers(run, tmp_path):
-    a, b = points(60)
-    b[:6] += 3.0
-    path = written(tmp_path, rows_of(a, b))
-    words = ("--method", "liu2017", "--sample", 20, "--share", 0.6, "--threshold-mm", 0.4, "--tries", 400)
-    page = tmp_path / "page.html"
-    code, text, _ = run(path, *words, "--orthogonality", 0.05, "--report", page)
-    assert code == 0
-    assert "threshold 0.4 mm" in text
-    assert "eqs. 8 and 9 are not legible" in text
-    shown = page.read_text(encoding="utf-8")
-    assert "Size of the sample" in shown
-    assert re.search(r"within 0\.4 mm .*more than 60 %", shown, re.S)
-    code, _, error = run(path, "--method", "liu2017", "--sample", 60)
-    assert (code, "lower it (--sample)" in error) == (3, True)
-    code, _, error = run(path, "--share", 0.6)
-    assert (code, "only with --method liu2017" in error) == (2, True)

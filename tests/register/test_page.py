@@ -9,10 +9,9 @@ import pytest
 
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.files import json_text
-from stcal.parallel import _limited
-from stcal.register import page, register, workspace
+from stcal.register import register
 from stcal.register.file import GRID, RegistrationFile
-from stcal.register.page import FEW_ROWS, MOST_LABELS, registration_report, space_figure
+from stcal.register.page import FEW_ROWS, registration_report
 from stcal.register.workspace import findings
 from stcal.report.document import Section
 
@@ -124,15 +123,6 @@ def test_page_of_three_points():
 
 
 @pytest.mark.slow
-def test_page_of_a_plane():
-    rng = np.random.default_rng(0)
-    a = rng.uniform(-200, 200, (30, 3)) * [1, 1, 0]
-    b = B_FROM_A @ a + rng.normal(0, 0.1, a.shape)
-    page = registration_report(findings("plane.csv", range(2, 32), a, b, register(a, b))).page()
-    assert page.count("data:image/svg+xml;base64,") == 2  # no planes through a body that there is not
-
-
-@pytest.mark.slow
 def test_sigma_of_the_transform_by_place():
     """By Monte Carlo: the spread of the fitted transform at a point far from the others."""
     rng = np.random.default_rng(1)
@@ -147,31 +137,3 @@ def test_sigma_of_the_transform_by_place():
             stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
     # 100 trials know a σ to 7 %; the own σ of five are good to 9 % / √5
     np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.25)
-
-
-@pytest.mark.slow
-def test_thousands_of_outliers_are_told_in_few_lines_and_labels(monkeypatch):
-    """The farthest by line, the others by their number; the lengths of all residuals are computed once a page, not once
-    a row."""
-    found = found_of(n=3000, wild=range(1000))
-    assert "… and 945 more rows; result files have all" in registration_report(found).text()
-    assert space_figure(found).svg().count('font-size="6.5"') == 3 * MOST_LABELS
-    asked = []
-    whole = type(found).length_mm.fget
-    monkeypatch.setattr(type(found), "length_mm", property(lambda self: asked.append(1) or whole(self)))
-    registration_report(found).page()
-    assert len(asked) < 5
-
-
-@pytest.mark.slow
-def test_the_field_and_the_page_keep_blas_to_one_thread(monkeypatch):
-    """As `register` does: small matrices, on which threads wait for each other."""
-    held = []
-    for module, name in ((workspace, "cubes"), (page, "space_figure")):
-        inner = getattr(module, name)
-        monkeypatch.setattr(module, name, lambda *given, inner=inner: held.append(_limited.locked()) or inner(*given))
-    before = found_of(n=30)
-    b = before.registration.residuals + before.registration.b_from_a @ before.xyz_a
-    registration_report(findings("pairs", before.lines, before.xyz_a, b, before.registration)).page()
-    assert len(held) > 1
-    assert all(held)

@@ -48,19 +48,6 @@ def test_what_paper_cannot_do_is_not_printed():
         assert gone not in text
 
 
-@pytest.mark.slow
-def test_a_heading_does_not_end_a_sheet():
-    """Wherever the second section begins, its first lines are on the sheet of its heading."""
-    for rows in range(20, 60, 3):
-        sheets = words(pdf_of(page(rows))).split("\f")
-        (own,) = [sheet for sheet in sheets if "Second" in sheet]
-        assert own.split("Second", 1)[1].split().count("word") >= 20, rows
-
-
-def test_the_same_page_gives_the_same_bytes():
-    assert pdf_of(page(5)) == pdf_of(page(5))
-
-
 def test_without_the_library_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "weasyprint", None)
     with fails_with("E-EXTRA-MISSING"):

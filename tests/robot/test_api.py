@@ -48,7 +48,7 @@ def files(tmp_path):
     return tmp_path
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_example_of_the_docstring_runs(files, monkeypatch, capsys):
     example = textwrap.dedent(robot.__doc__.split("::\n", 1)[1])
     monkeypatch.chdir(files)

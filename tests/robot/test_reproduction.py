@@ -14,7 +14,7 @@ def study(monkeypatch):
     return module
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_one_arm_is_calibrated_by_the_target_on_its_flange(study):
     draw = study.one_draw(3, 0, 0.0)
     shift = np.linalg.norm(draw.pose_error[:, 3:], axis=1)

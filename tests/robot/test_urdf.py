@@ -201,25 +201,6 @@ def test_mistakes_are_named(tmp_path, change, options, words):
     assert str(caught.value).startswith(f"URDF {path}: ")
 
 
-def test_command_line(stcal_robot, tmp_path):
-    toml, urdf, again = (tmp_path / name for name in ("a.toml", "a.urdf", "b.toml"))
-    stcal_robot("init", toml)
-    code, out, _ = stcal_robot("convert", toml, urdf)
-    assert (code, "robot MH80: 6 joints from base_link to flange, and 1 tools" in out) == (0, True)
-    code, out, _ = stcal_robot("convert", urdf, again)
-    assert code == 0
-    assert "6 joints from base_link to tool: joint_1, joint_2" in out
-    q = values(mh80())
-    assert np.abs(forward(load_robot(again), q).difference(forward(mh80(), q))).max() < 1e-9
-    for words, told in (
-        ((toml, tmp_path / "c.toml"), "both are robot files; one of each needed"),
-        ((toml, tmp_path / "c.txt"), "a name ending in .urdf or .toml needed"),
-        ((toml, tmp_path / "c.urdf", "--to-link", "a"), "only for reading a URDF"),
-    ):
-        code, _, error = stcal_robot("convert", *words)
-        assert (code, told in error) == (2, True)
-
-
 def test_robots_that_a_urdf_cannot_hold_are_refused():
     with fails_with("E-ROBOT-NAME … '\\x1b[31mred' has control characters"):
         robot_urdf(replace(EXAMPLE, name="\x1b[31mred"))

@@ -20,6 +20,7 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import tag_cube
+from tests.levels import sampled
 from tests.outcome import fails_with
 
 CUBE = tag_cube(60.0)
@@ -73,28 +74,26 @@ def test_groups_that_show_other_faces_than_their_names_say():
     assert note.startswith("not as drawn: group 12 is named after faces 1 and 2 and shows faces 1 and 3: correct")
 
 
-@pytest.mark.slow
-def test_one_tag_of_another_size_and_one_of_another_id_are_named(tmp_path):
+@pytest.mark.parametrize("what", sampled(["size", "id"]))
+def test_one_tag_of_another_size_or_id_is_named(tmp_path, what):
     write_body(
         tmp_path / "set", make_body_scene(CUBE, body_camera(640), BodyOptions(images=10, distance_mm=300, seed=5))
     )
     text = body_toml(CUBE)
-    sizes = [line for line in text.splitlines() if "size_mm = " in line and "dictionary" in line]
-    reports = []
-    for name, changed in (
-        ("size", text.replace(sizes[1], sizes[1].replace("size_mm = 45.0", "size_mm = 40.0"))),
-        ("id", text.replace("id = 2,", "id = 77,")),
-    ):
-        assert changed != text
-        (path := tmp_path / f"{name}.toml").write_text(changed, encoding="utf-8")
-        result = pipeline.run(tmp_path / "set/images", None, tmp_path / name, path, None, RunOptions())
-        reports.append((result, next(check for check in result.checks if check.key == "scales")))
-    (size, scales), (ids, sound) = reports
-    assert (scales.verdict, scales.names) == ("failed", ("face 2",))
-    assert scales.reason.startswith("face 2 would fit with 1.1")
-    assert size.judgement.verdict == "no"
-    assert sound.verdict != "failed"
-    assert any("tag 2 of dict_apriltag_36h11" in note.lower() and "not 77 of" in note for note in ids.notes)
+    second = [line for line in text.splitlines() if "size_mm = " in line and "dictionary" in line][1]
+    old, new = {"size": (second, second.replace("size_mm = 45.0", "size_mm = 40.0")), "id": ("id = 2,", "id = 77,")}[
+        what
+    ]
+    (path := tmp_path / "target.toml").write_text(text.replace(old, new), encoding="utf-8")
+    result = pipeline.run(tmp_path / "set/images", None, tmp_path / "run", path, None, RunOptions())
+    scales = next(check for check in result.checks if check.key == "scales")
+    if what == "size":
+        assert (scales.verdict, scales.names) == ("failed", ("face 2",))
+        assert scales.reason.startswith("face 2 would fit with 1.1")
+        assert result.judgement.verdict == "no"
+    else:
+        assert scales.verdict != "failed"
+        assert any("tag 2 of dict_apriltag_36h11" in note.lower() and "not 77 of" in note for note in result.notes)
 
 
 def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):

@@ -41,7 +41,7 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
-from tests.levels import sampled
+from tests.levels import FULL, sampled
 from tests.outcome import COMPUTATION, assert_error, fails_with, refuses
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
@@ -161,8 +161,7 @@ def calibrated(target, images, size):
     return body, calibrate([model], camera, target, board, options, camera_prior(camera))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("target", [tag_cube(60), tag_dodecahedron(30)], ids=["cube", "dodecahedron"])
+@pytest.mark.parametrize("target", sampled([tag_cube(60), tag_dodecahedron(30)]), ids=["cube", "dodecahedron"])
 def test_a_body_of_tags_gives_faces_and_camera(target):
     scene, images = observed(target, 10, 8)
     body, result = calibrated(target, images, (1200, 800))
@@ -180,10 +179,11 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
 
 
-def test_corners_behind_a_finger_are_named_and_no_others():
+@pytest.mark.parametrize(("sets", "least"), [(5, 3), pytest.param(10, 7, marks=FULL)])
+def test_corners_behind_a_finger_are_named_and_no_others(sets, least):
     """A corner in few images hides some of its error in its tag's pose: not each is named, but none that is right."""
     named = []
-    for seed in range(10):
+    for seed in range(sets):
         scene, images = observed(tag_cube(60), 10, seed)
         hidden = [("3.png", label) for label in images[3].labels[:2]]
         moved = images[3].centre_px.copy()
@@ -194,7 +194,7 @@ def test_corners_behind_a_finger_are_named_and_no_others():
         assert found in ([], hidden)
         assert all(each.residual_px > each.limit_px for each in body.contradictions)
         named.append(found == hidden)
-    assert sum(named) >= 7
+    assert sum(named) >= least
 
 
 @pytest.mark.parametrize("seed", sampled(range(5)))
@@ -279,8 +279,9 @@ def test_few_photographs_show_each_face_twice(seed):
     assert all(shown.count(face.id) >= 2 for face in scene.target.faces)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("target", "images"), [(tag_cube(60), 20), (tag_dodecahedron(60), 40)])
+@pytest.mark.parametrize(
+    ("target", "images", "seed"), [(tag_cube(60), 20, 0), (tag_cube(60), 20, 1), (tag_dodecahedron(60), 40, 2)]
+)
 def test_each_face_is_seen_often_and_squarely(target, images, seed):
     """Five times, and twice within 45° of the normal; at random, a face of a cube is in two to four of 20 images."""
     scene = make_body_scene(target, body_camera(900), BodyOptions(images, 300.0, seed=seed))
@@ -300,17 +301,16 @@ def test_faces_that_are_hardly_seen_are_named():
     for face in scene.target.faces:
         assert f"{face.id} ({shown.count(face.id)} of 2 images" in scene.hardly_seen()
     target = tag_cube(60)
-    plans = [plan_body(PlanOptions(n, distance_mm=300, width=900), target, target.rough_poses()) for n in (10, 20)]
-    said = [plan_text(plan, "") for plan in plans]
-    assert [("hardly seen: face" in text) for text in said] == [True, False]
+    plan = plan_body(PlanOptions(10, distance_mm=300, width=900), target, target.rough_poses())
+    assert "hardly seen: face" in plan_text(plan, "")
 
 
 def test_what_is_forecast_is_what_is_simulated():
     """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
     target, near = tag_cube(60), 145.0
-    plan = PlanOptions(images=10, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    plan = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
     forecast, _, _ = planned_photographs(plan, target)
-    simulated = make_body_scene(target, body_camera(900), BodyOptions(10, near, seed=3, print_errors=1.0))
+    simulated = make_body_scene(target, body_camera(900), BodyOptions(8, near, seed=3, print_errors=1.0))
     pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
     assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
     assert not np.array_equal(forecast.target_from_face["2"].matrix(), simulated.target_from_face["2"].matrix())
@@ -330,7 +330,7 @@ def test_the_distance_that_a_body_needs_is_named():
 @pytest.mark.slow
 def test_photographs_from_the_shortest_distance_of_a_design_can_be_simulated(tmp_path, stcal_sfm):
     size, distance = 12, 50
-    camera = ("--distance", distance, "--images", 6)
+    camera = ("--distance", distance, "--images", 2)
     words = ("design", tmp_path / "cube", "--tags", "cube", "--size", size, "--width", 640, *camera)
     assert stcal_sfm(*words)[0] == 0
     words = ("simulate", tmp_path / "data", "--target", tmp_path / "cube/target.toml", "--width", 320, *camera)
@@ -424,16 +424,16 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
 @pytest.mark.slow
 def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
     """As many as one takes first: what they do not determine is an error, what they do not test is "not possible"."""
-    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=8, distance_mm=300, seed=5))
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=6, distance_mm=300, seed=5))
     write_body(tmp_path / "set", scene)
     solved, refusals = 0, []
-    for count, camera in ((2, None), (4, None), (6, None), (6, tmp_path / "set/cameras.txt")):
+    for count in (2, 4, 6):
         taken = tmp_path / f"{count}"
-        taken.mkdir(exist_ok=True)
+        taken.mkdir()
         for path in sorted((tmp_path / "set/images").iterdir())[:count]:
             shutil.copy(path, taken)
         try:
-            result = pipeline.run(taken, camera, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
+            result = pipeline.run(taken, None, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions())
         except StcalError as error:
             refusals.append(str(error))
         else:
@@ -442,7 +442,7 @@ def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
             assert tested or result.judgement.verdict != "yes"
             named = {name for s in result.solutions for name in (*s.left_out, *s.model.images)}
             assert named == {image.observations.name for image in result.labelled}
-    assert 0 < solved < 4
+    assert 0 < solved < 3
     assert all("; add " in line or "take " in line for line in refusals), refusals
 
 
@@ -483,7 +483,7 @@ def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path):
     assert 0.01 / long < held.target.scale_sigma < 1e-3  # the bar's, and what few small photographs add
 
 
-@pytest.mark.slow
+@FULL
 @pytest.mark.skipif(not CUBE.is_dir(), reason="real photographs are not shipped")
 def test_a_real_cube_of_charuco_boards(tmp_path):
     faces = "".join(

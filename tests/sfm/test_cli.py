@@ -1,6 +1,5 @@
 """The commands as a user types them."""
 
-import csv
 import json
 import sys
 
@@ -149,39 +148,6 @@ def test_simulate_says_which_faces_have_no_place(command, wedge, tmp_path):
     code, _, err = command("simulate", tmp_path / "data", *wedge)
     assert code == 2
     assert "does not say where face flank is; add approximate rough_pose = { origin_mm, x, normal }" in err
-
-
-@pytest.mark.slow
-def test_simulate_detect_run_compare(command, tmp_path):
-    data, out, one = tmp_path / "data", tmp_path / "run", ("--workers", 1)
-    code, text, _ = command(
-        "simulate", data, "--width", 1296, "--images", 3, "--second-design", "--seed", 2, "--png", *one
-    )
-    assert code == 0
-    assert "9 images in 3 groups" in text
-    files = [*one, "--camera", data / "cameras.txt", "--target", data / "target.toml", "--board", data / "board.toml"]
-    code, text, _ = command("detect", data / "images", *files, "--out", tmp_path / "detect")
-    assert code == 0
-    assert (tmp_path / "detect" / "overlays" / "top-left" / "IMG_1000.png.jpg").stat().st_size > 10_000
-    code, text, _ = command("run", data / "images", *files, "--out", out)
-    assert code == 0
-    assert "faces.json" in text
-    # Detection alone finds the same circles as the whole run.
-    places = tmp_path / "detect" / "detections.csv", out / "labels.csv"
-    looked, used = (list(csv.DictReader(path.read_text().splitlines())) for path in places)
-    assert [(row["image"], row["label"]) for row in looked] == [(row["image"], row["label"]) for row in used]
-    assert sorted(path.name for path in out.iterdir()) == sorted(
-        [".stcal", "colmap", "faces.json", "inputs", "labels.csv", "overlays", "report.html", "report.json"]
-    )
-    faces = json.loads((out / "faces.json").read_text())
-    assert faces["unit"] == "mm"
-    assert set(faces["target_from_face"]) == {"top", "left", "right"}
-    assert all(len(xyz) == 3 for xyz in faces["circles"].values())
-    code, text, _ = command("compare", out, data / "truth.json", "--json", tmp_path / "errors.json")
-    assert code == 0
-    errors = json.loads((tmp_path / "errors.json").read_text())
-    assert "left" in text
-    assert 0 < errors["worst"]["translation_um"] < 60
 
 
 @pytest.mark.full

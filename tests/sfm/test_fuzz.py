@@ -16,15 +16,21 @@ from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_pro
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, perform, went_through
-from tests.levels import sampled
+from tests.levels import FULL, sampled
 
 pytestmark = pytest.mark.slow
 KNOWN_SEED = 20
 SEED = int(os.environ.get("STCAL_SEED", KNOWN_SEED))
 """`scripts/full` draws another one each time."""
 CASES, PARTS = 360, 30
-IN_SAMPLE = range(0, PARTS, 4)
+IN_SAMPLE = range(0, PARTS, 8)
 """Parts that `.ci/run` judges."""
+
+
+@pytest.fixture(scope="session")
+def case(tmp_path_factory):
+    """A folder for all cases of a process, emptied for each: mistakes of one call share what it gives on good data."""
+    return tmp_path_factory.mktemp("fuzzing") / "case"
 
 
 def spoiled(stock, folder, numbers, both=True) -> list[Judged]:
@@ -46,15 +52,15 @@ def shortest_first() -> list[tuple[int, str]]:
     return [(n, calls[n].command) for n in sorted(range(CASES), key=lambda n: calls[n].seconds)]
 
 
-def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
+def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, case):
     cases = shortest_first()
     first = {command: n for n, command in reversed(cases)}
-    found = spoiled(stock, tmp_path / "case", first.values())
+    found = spoiled(stock, case, first.values())
     assert {each.command for each in found} == set(first)
     rest = [n for n, _ in cases if n not in first.values()]
     missing = KINDS
     while missing := missing - {suffix for each in found for suffix in BY_SUFFIX if f"{suffix}: " in each.said}:
-        found += spoiled(stock, tmp_path / "case", [rest.pop(0)], both=False)
+        found += spoiled(stock, case, [rest.pop(0)], both=False)
     assert len(found) < 2 * len(first)
 
 
@@ -65,13 +71,13 @@ def test_the_cases_are_of_every_command_but_long_ones():
 
 
 @pytest.mark.parametrize("part", sampled(range(PARTS), kept=IN_SAMPLE))
-def test_whatever_comes_in_is_judged(stock, tmp_path, part):
-    assert len(spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))) == CASES // PARTS
+def test_whatever_comes_in_is_judged(stock, case, part):
+    assert len(spoiled(stock, case, range(part, CASES, PARTS))) == CASES // PARTS
 
 
 @pytest.mark.parametrize(("kind", "number"), sampled([("s", n) for n in range(24)] + [("d", n) for n in range(8)]))
-def test_kept_files_and_closed_streams(stock, tmp_path, kind, number):
-    found = perform(stock, tmp_path / "case", SEED, f"{kind}{number}")
+def test_kept_files_and_closed_streams(stock, case, kind, number):
+    found = perform(stock, case, SEED, f"{kind}{number}")
     assert (found.said, found.failures) == (found.said, ())
 
 
@@ -86,41 +92,40 @@ ALL_ARE_EQUAL = _Equal()
 
 
 @pytest.mark.slow
-def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
+def test_a_cache_that_is_believed_is_seen(stock, case, monkeypatch):
     """A run that takes an edited file for what it kept has another answer."""
     monkeypatch.setattr(kept, "SPOILED", (kept._edited,))
     monkeypatch.setattr(
         kept, "CALLS", [call for call in CALLS if call.command == "sfm run" and "~run" in call.words][:1]
     )
     monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob(".stcal/cache/[0-9a-f]*.npz")))
-    assert kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 1).failures == ()
+    assert kept.of_kept(stock, case, KNOWN_SEED, 1).failures == ()
     monkeypatch.setattr(io_cache, "_digest", lambda _: ALL_ARE_EQUAL)
-    assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 1).failures] == ["silent wrong"]
+    assert [kind for kind, _ in kept.of_kept(stock, case, KNOWN_SEED, 1).failures] == ["silent wrong"]
 
 
-BRIEF = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2]
-"""Those of calls that take together less than a minute of processor time; `scripts/full` makes all mistakes."""
 OF_ROBOTS = ("identify", "axes", "compensate", "verify", "locate", "register")
-SLOW = sampled(
-    [name for name in MISTAKES if name not in BRIEF and name.startswith(OF_ROBOTS)], kept=range(0, len(MISTAKES), 4)
-)
-"""Mistakes with robots, instruments and located targets, which no other test tells; `.ci/run` makes every fourth."""
+"""Mistakes with robots, instruments and located targets, which no other test tells."""
+TOLD = [name for name, mistake in MISTAKES.items() if mistake.call.seconds <= 1.2 or name.startswith(OF_ROBOTS)]
+LONG = {f"identify: {name}" for name in ("metres as mm", "inches as mm", "rows shuffled", "alpha in rad")}
+LONG |= {"identify: nominal robot 4.1 m off", "handeye, poses: robot in inches"}
+"""Mistakes that are told after ten seconds or more; `scripts/full` makes them, and those with photographs."""
 
 
-@pytest.mark.parametrize("name", [*BRIEF, *SLOW])
-def test_a_mistake_is_told(stock, tmp_path, name):
-    found = mistaken(stock, tmp_path / "case", name).failures
+@pytest.mark.parametrize("name", [pytest.param(name, marks=FULL if name in LONG else ()) for name in TOLD])
+def test_a_mistake_is_told(stock, case, name):
+    found = mistaken(stock, case, name).failures
     assert {kind for kind, _ in found} <= {"no program could tell"}, found
 
 
-ELSEWHERE = {"sfm demo", "sfm detect", "robot from-photos"}
-"""Commands whose good call is made by another test of `.ci/run`: from the wheel, in a tutorial, in `test_chain`."""
+ELSEWHERE = {"sfm demo", "sfm detect", "sfm advise"}
+"""Commands whose good call is made elsewhere in `.ci/run`: from the wheel, and in tutorials."""
 FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.command for before in CALLS[:n]} | ELSEWHERE]
 
 
 @pytest.mark.parametrize("number", sampled(range(len(CALLS)), kept=FIRST), ids=[call.command for call in CALLS])
-def test_calls_go_through(stock, tmp_path, number):
-    assert went_through(stock, tmp_path / "case", number).failures == ()
+def test_calls_go_through(stock, case, number):
+    assert went_through(stock, case, number).failures == ()
 
 
 INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")
@@ -133,17 +138,17 @@ INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")
         ("check is blind", lambda path, robot: require_written(path, lambda: 0.0, 0.0, 0.0, "mm")),
     ],
 )
-def test_a_writer_without_a_check_is_found(stock, tmp_path, monkeypatch, kind, instead):
+def test_a_writer_without_a_check_is_found(stock, case, monkeypatch, kind, instead):
     """Every file that a call writes is read again (`test_calls_go_through`), and its check sees another number."""
     monkeypatch.setattr("stcal.robot.kinematics.file.require_robot_written", instead)
-    assert went_through(stock, tmp_path / "case", INIT).failures == ((kind, "robot.toml"),)
+    assert went_through(stock, case, INIT).failures == ((kind, "robot.toml"),)
 
 
 @pytest.fixture
-def schedule(stock, tmp_path):
+def schedule(stock, case):
     call = call_of("register", "register/pairs.csv")
-    read, written = lay_out(stock, tmp_path, call, earlier=True)
-    return call, tmp_path, read, written, hashes(tmp_path)
+    read, written = lay_out(stock, case, call, earlier=True)
+    return call, case, read, written, hashes(case)
 
 
 def kinds(schedule, *outcome, refused=False) -> set[str]:
@@ -189,11 +194,11 @@ def test_files_are_watched(schedule):
     assert kinds(schedule, 2, "", ERROR, 1.0) == {"input changed", "broken result", "earlier result lost"}
 
 
-def test_a_call_in_this_process(stock, tmp_path):
+def test_a_call_in_this_process(stock, case):
     call = call_of("sfm compare", "run/faces.json")
-    lay_out(stock, tmp_path, call, earlier=True)
-    outcome = in_process(call, "stcal-sfm", tmp_path)
+    lay_out(stock, case, call, earlier=True)
+    outcome = in_process(call, "stcal-sfm", case)
     assert outcome.code == 0, outcome.err
     assert "as JSON" in outcome.out
-    assert (tmp_path / OUT / "errors.json").read_text() != EARLIER
-    assert json.loads((tmp_path / OUT / "errors.json").read_text())["faces"]
+    assert (case / OUT / "errors.json").read_text() != EARLIER
+    assert json.loads((case / OUT / "errors.json").read_text())["faces"]

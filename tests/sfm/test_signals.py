@@ -70,55 +70,6 @@ def test_colmaps_bindings_leave_the_signals_as_they_were():
     assert ended(process, signal.SIGTERM) == (7, [])
 
 
-def test_a_signal_while_colmaps_bindings_load_waits_for_the_commands_handler():
-    """They set a handler of their own on the way, which prints a stack and aborts; sent when they have."""
-    begin = """
-import os, signal, sys
-from importlib.machinery import PathFinder
-
-class Send:
-    def find_spec(self, name, path=None, target=None):
-        if name != "pycolmap._core":
-            return None
-        spec = PathFinder.find_spec(name, path, target)
-        load = spec.loader.exec_module
-        spec.loader.exec_module = lambda module: (load(module), os.kill(os.getpid(), signal.SIGTERM))
-        return spec
-
-signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
-sys.meta_path.insert(0, Send())
-import stcal.sfm.mapping.colmap
-signal.pause()
-"""
-    found = subprocess.run([sys.executable, "-P", "-c", begin], capture_output=True, text=True, check=False, timeout=60)
-    assert (found.returncode, found.stderr) == (7, "")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
-def test_a_signal_while_a_process_starts_waits_until_that_has_what_it_begins_with(name):
-    """The server has forked it, and it reads from this process what to do: cut off there, it would print a stack."""
-    begin = f"""
-import os, signal, sys, time
-from multiprocessing import forkserver
-from stcal.parallel import run_parallel
-
-connect = forkserver.connect_to_new_process
-
-def asked(fds):
-    found = connect(fds)
-    os.kill(os.getpid(), signal.{name})
-    time.sleep(0.2)
-    return found
-
-signal.signal(signal.{name}, lambda *_: sys.exit(7))
-forkserver.connect_to_new_process = asked
-list(run_parallel(abs, [(-1,), (-2,)], 2))
-"""
-    found = subprocess.run([sys.executable, "-P", "-c", begin], capture_output=True, text=True, check=False, timeout=60)
-    assert (found.returncode, found.stderr) == (7, "")
-
-
 @pytest.mark.parametrize(
     ("number", "said", "code", "seconds"),
     sampled([(*end, seconds) for end in ENDS for seconds in (0.5, 2.0, 5.0)], kept=(1, 5)),

@@ -75,29 +75,6 @@ def test_exposure_clips_and_blooms():
     assert 85 < bright[40, 58] < 110  # half of 15 % of the 145 grey values lost beside it: 91
 
 
-def test_light_falls_off():
-    corners = degrade.vignetted(EVEN, 0.4)
-    assert corners[0, 0] == pytest.approx(72, abs=0.01)
-    assert corners[100, 150] == pytest.approx(120, rel=1e-3)
-    slope = degrade.graded(EVEN, 4.0, 0.0)
-    assert slope[7, 0] == pytest.approx(120)
-    assert slope[7, -1] == pytest.approx(30)
-    veiled = degrade.hazy(STEP, 0.6, 1)
-    assert np.median(veiled[:, 61] - veiled[:, 58]) == pytest.approx(0.4 * 160, abs=2)
-
-
-def test_pixels_of_sensor_and_file():
-    hot = degrade.hot_pixels(EVEN, 0.01, 0) != EVEN
-    assert hot.mean() == pytest.approx(0.01, rel=0.2)  # 600 of 60 000
-    dust = degrade.dusty(EVEN, 10, 0) / 120
-    assert 0.2 < dust.min() < 0.9
-    assert dust.max() <= 1
-    assert 0.5 < (dust > 0.99).mean() < 0.99
-    assert degrade.stored(np.array([[-4.0, 99.6, 300.0]])).tolist() == [[0, 100, 255]]
-    deep = degrade.stored(np.array([[0.0, 255.0]]), 12)
-    assert (deep.dtype, deep.tolist()) == (np.uint16, [[0, 4095]])
-
-
 def test_the_truth_says_where_circles_are(rendered, photo):
     truth = rendered.truth["groups"][photo.group]["images"][photo.name]["circles"]
     ellipses = photo.ellipses()
@@ -142,33 +119,8 @@ def test_cut_circles_lose_their_share(photo):
     assert degrade.covered_labels(photo, image) == (set(), {label})
 
 
-def test_half_of_a_circle_is_darker(photo):
-    image = degrade.half_darker(photo, 0.2)
-    window, unit = photo.circle(photo.board, 10, 1.0)
-    along = unit[..., 0] * np.cos(0.6) + unit[..., 1] * np.sin(0.6)
-    inside = np.hypot(unit[..., 0], unit[..., 1]) < 0.7
-    kept = (image / np.maximum(photo.grey, 1))[window]
-    assert kept[inside & (along < -0.3)] == pytest.approx(1, abs=0.02)
-    assert np.median(kept[inside & (along > 0.3)]) == pytest.approx(0.82, abs=0.04)  # of the contrast, not the light
-
-
-def test_a_sheet_covers_its_share_of_the_board(photo):
-    whole, part = degrade.covered_labels(photo, degrade.board_covered(photo, 0.4, 2))
-    assert all(label.startswith("board") for label in whole | part)
-    assert 0.25 < len(whole | part) / len(photo.board.labels) < 0.5
-
-
 def test_what_stands_behind_covers_neither_target_nor_board(photo):
     board = photo.board.moved(np.eye(3), np.array([150.0, 200.0, 400.0]))
     image = degrade.behind(photo, [board], [(255.0, 90.0)])
     assert degrade.covered_labels(photo, image) == (set(), set())
     assert 0.005 < (np.abs(image - photo.grey) > 20).mean() < 0.2
-
-
-def test_the_box_is_lit_from_one_side(photo):
-    image = degrade.unevenly_lit(photo, 4.0)
-    lit = image / np.maximum(photo.grey, 1)
-    board = photo.face_region(photo.board) > 0.99
-    assert np.abs(image - photo.grey)[board].max() < 0.5
-    face = photo.face_region(photo.faces[0]) > 0.99
-    assert 0.2 < np.median(lit[face]) < 0.95

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -10,21 +9,15 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.report.figures import (
-    MOST_NAMED,
     by_robot,
-    enlargement,
     equal_area,
     image_coverage,
-    overlays,
-    pose_bars,
     turns_between,
 )
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_report
 from stcal.handeye.solve import handeye
 from tests.support.handeye import simulated, simulated_views
-
-MOST_BYTES = 3_000_000
 
 
 @pytest.fixture(scope="module")
@@ -36,16 +29,6 @@ def truth():
 def outcome(request, truth) -> Outcome:
     result = handeye(truth.pairs, truth.setup, request.param, truth.views, HandEyeOptions(with_scale=True))
     return Outcome("images", result, pairs=truth.pairs, views=truth.views)
-
-
-def with_images(outcome: Outcome, folder) -> Outcome:
-    camera = outcome.views.camera
-    noise = np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), np.uint8)
-    names = tuple(f"{i}.png" for i in range(len(outcome.pairs.names)))
-    for name in names:
-        cv2.imwrite(str(folder / name), noise)
-    result, pairs = (replace(each, names=names) for each in (outcome.result, outcome.pairs))
-    return replace(outcome, result=result, pairs=pairs, folder=folder)
 
 
 def views_of(camera, *corners) -> Views:
@@ -123,68 +106,3 @@ def test_a_board_behind_the_camera_is_nowhere(truth, outcome):
     behind = replace(outcome.result, stand_from_board=Rigid(translation=[0, 0, 1e5]) @ outcome.result.stand_from_board)
     assert any(np.isnan(px).any() for px in by_robot(behind, truth.pairs, truth.views))
     assert outcome_report(replace(outcome, result=behind)).page()
-
-
-@pytest.mark.slow
-def test_overlays_of_the_worst_a_usual_and_the_best(outcome, tmp_path):
-    outcome = with_images(outcome, tmp_path)
-    found, missing = overlays(outcome)
-    assert missing == []
-    predicted, seen = by_robot(outcome.result, outcome.pairs, outcome.views), [v.xy_px for v in outcome.views.views]
-    rms = [np.sqrt(((px - xy) ** 2).sum(1).mean()) for px, xy in zip(predicted, seen, strict=True)]
-    worst = int(np.argmax(rms))
-    titles = [each.title for each in found]
-    assert (titles[0], titles[2]) == (f"worst: {worst}.png", f"best: {np.argmin(rms)}.png")
-    assert titles[1].startswith("usual: ")
-    assert found[0].says == f"{max(rms):.3g} px RMS by the robot's pose"
-    x, y, u, v, title = found[0].corners[0]
-    off = predicted[worst][0] - seen[worst][0]
-    assert (x, y) == pytest.approx(tuple(seen[worst][0]))
-    assert (u - x, v - y) == pytest.approx(tuple(found[0].factor * off))
-    assert f"{np.hypot(*off):.2f} px" in title
-    page = outcome_report(outcome).page()
-    assert f"enlarged {found[0].factor:.0f} times" in page
-    assert len(page) < MOST_BYTES
-    assert page.count("<image href") == 3
-
-
-@pytest.mark.slow
-def test_an_image_that_is_gone_is_said_and_no_error(outcome, tmp_path):
-    whole = with_images(outcome, tmp_path)
-    name = overlays(whole)[0][0].title.removeprefix("worst: ")
-    (tmp_path / name).unlink()
-    found, missing = overlays(whole)
-    assert [each.title.split(":")[0] for each in found] == ["usual", "best"]
-    assert missing == [f"{name} cannot be shown: No such file or directory"]
-    (tmp_path / name).write_bytes(b"no image")
-    assert "not readable as an image" in overlays(whole)[1][0]
-    assert "cannot be shown" in outcome_report(whole).page()
-    for path in tmp_path.iterdir():
-        path.unlink()
-    assert "cannot be shown" in outcome_report(whole).page()
-
-
-@pytest.mark.parametrize(("length", "factor"), [(0.05, 500), (0.2, 200), (1.0, 20), (30.0, 1), (500.0, 1), (0.0, 1)])
-def test_residuals_are_enlarged_by_a_round_number(length, factor):
-    """So that they are at most 6 % of an image 800 px wide, 48 px."""
-    off = np.full((50, 2), length / np.sqrt(2))
-    assert enlargement(off, 800) == factor
-
-
-def test_a_chart_of_many_poses_has_room():
-    """Of 120, every third has its name; bars stay within their panel."""
-    truth = simulated(np.random.default_rng(3), 120, robot=(2e-4, 0.1), camera=(5e-4, 0.2))
-    result = handeye(truth.pairs, truth.setup, "park-martin")
-    chart = pose_bars(result)
-    assert len(chart.names) == 40 <= MOST_NAMED
-    assert [text for _, text, _ in chart.names][:3] == ["1", "4", "7"]
-    for panel in chart.panels:
-        heights = [height for _, _, height, _, _ in panel.bars]
-        assert max(heights) == pytest.approx(
-            chart.panels[1].bars[0][1] + chart.panels[1].bars[0][2] - chart.panels[1].top
-        )
-        assert all(chart.left <= x <= chart.width for x, *_ in panel.bars)
-    turn = np.degrees(np.linalg.norm(result.residuals[:, :3], axis=1))
-    heights = np.array([height for _, _, height, _, _ in chart.panels[0].bars])
-    assert heights / heights.max() == pytest.approx(turn / turn.max())
-    assert chart.panels[0].bars[4][4] == f"pose 5: {turn[4]:.4f}°"

@@ -79,24 +79,6 @@ def test_every_sigma_that_there_is_has_a_name():
     assert max(v for k, v in HandEyeFile.of(outcome).sigma.items() if k in FACTORS) > 1.5
 
 
-@pytest.mark.slow
-def test_the_page_shows_every_part(of_views, of_methods):
-    page = outcome_report(of_views).page()
-    for part in ("base_from_camera", "flange_from_board", "a note with &lt;markup&gt; &amp; more", "x&lt;1&gt;.png"):
-        assert part in page
-    for part in ("pose 10", "Coverage of the image", "Use with care", "What the verdict rests on"):
-        assert part in page
-    page = outcome_report(of_methods).page()
-    assert "Coverage of the image" not in page
-    assert "Overlays" not in page
-    assert "tsai-lenz" in page
-    assert "zhao finds no rotation" in page
-    # Of an outcome that a program made of a result alone.
-    page = outcome_report(replace(of_views, pairs=None, views=None, held_out=None)).page()
-    assert "<img" not in page
-    assert "errors on poses held out are not known" in page
-
-
 def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_methods):
     data = json.loads(json_text(HandEyeFile.of(of_views, whole=True)))
     assert data["base_from_camera"] == of_views.result.base_from_camera.matrix().tolist()
@@ -108,13 +90,3 @@ def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_method
     data = json.loads(json_text(HandEyeFile.of(of_methods, whole=True)))
     assert [row["reason"] for row in data["methods"]] == [None, None, "hand-eye: zhao finds no rotation"]
     assert "methods" not in HandEyeFile.of(of_methods).content()
-
-
-def test_the_chart_of_poses_has_the_names_that_tell_them_apart(of_methods):
-    names = tuple(f"session_of_monday/left_{i:02d}_long_exposure.png" for i in range(10))
-    outcome = replace(of_methods, result=replace(of_methods.result, names=names))
-    page = outcome_report(outcome).page()
-    for i, name in enumerate(names):
-        assert f"<title>{name}</title>{i:02d}</text>" in page
-        assert f"<title>{name}: " in page  # of its bar, with the value
-    assert "names below it are cut to what tells them apart" in page

@@ -1,6 +1,5 @@
 """The axis method on simulated arms, where everything is known, and on tracked sweeps of a Fanuc."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +17,7 @@ from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
+from tests.levels import SLOW, sampled
 from tests.outcome import fails_with, refuses
 from tests.support.arms import two_arms
 
@@ -46,7 +46,7 @@ def coupled() -> Robot:
 
 
 NOMINALS = {"MH80": mh80, "Craig": craig, "SCARA": scara, "coupled": coupled}
-QUICK_AND_SLOW = ["SCARA", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Craig", "MH80", "coupled"))]
+QUICK_AND_SLOW = ["SCARA", pytest.param("coupled", marks=SLOW), *sampled(["Craig", "MH80"], kept=())]
 
 
 def arm(nominal: Robot) -> Robot:
@@ -202,7 +202,7 @@ def test_leaving_out_a_row_is_fitting_without_it():
         assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_influence_is_leaving_out(monkeypatch):
     """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
     nominal = mh80()
@@ -253,8 +253,7 @@ def test_a_row_without_a_target_is_named():
     assert any(f"line {data.lines[40]}: rows without a target, beside rows with one" in note for note in notes)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("off_mm", [0.5, 20.0, 300.0, 2000.0])
+@pytest.mark.parametrize("off_mm", sampled([0.5, 20.0, 300.0, 2000.0]))
 def test_a_gross_error_is_named_and_left_out(off_mm):
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 6), SIGMA, 7)
@@ -401,27 +400,6 @@ def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
     assert normal > 100
 
 
-@pytest.mark.slow
-def test_command(fanuc, tmp_path, stcal_robot):
-    folder, result = fanuc
-    out, file, page = (tmp_path / f"axes.{kind}" for kind in ("toml", "json", "html"))
-    words = "--robot", folder / "robot.toml", "--out", out, "--json", file, "--report", page
-    code, said, _ = stcal_robot("axes", folder / "sweeps.csv", *words)
-    assert code == 0
-    assert "D-H value of joints 2–3 refused: foot 59" in said
-    assert "1075.57" in said
-    again = load_robot(out)
-    assert again.rows[1].a == result.robot.rows[1].a
-    assert set(again.tools) == {"", "N1", "N2", "N3"}
-    content = json.loads(file.read_text())
-    assert content["format"] == "stcal axes 1"
-    assert len(content["axes"]) == 6
-    assert content["pairs"][1]["hayati"] is True
-    assert np.array(content["covariance"]).shape == (24, 24)
-    assert "D-H value of joints 2–3 refused" in page.read_text()
-    assert page.read_text().count("data:image/svg+xml") == 1
-
-
 def test_axes_that_are_parallel_but_for_the_smallest_number_are_compared_in_silence():
     """A determinant by elimination divides by what is left of a row."""
     z = np.array([[0, 0, 1], [0, -1.7e-310, 1], [5e-324, 0, 1]])
@@ -497,20 +475,3 @@ def test_orientations_help_and_their_covariance_is_true(places):
     assert 0.75 < np.mean(squares) < 1.35
     with_them, without = np.mean(sizes, axis=0)
     assert with_them < 0.9 * without
-
-
-@pytest.mark.slow
-def test_the_command_takes_orientations(tmp_path, stcal_robot):
-    true = arm(mh80())
-    data = posed(true, sweep_values(true, 5), SIGMA)
-    quaternion = Rotation.from_matrix(data.rotations).as_quat()[:, [3, 0, 1, 2]]
-    head = [*(f"q{j + 1}_rad" for j in range(6)), "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"]
-    rows = np.hstack([data.q, data.positions, quaternion])
-    np.savetxt(tmp_path / "poses.csv", rows, delimiter=",", header=",".join(head), comments="")
-    (tmp_path / "robot.toml").write_text(robot_toml(mh80()), encoding="utf-8")
-    words = "axes", tmp_path / "poses.csv", "--robot", tmp_path / "robot.toml"
-    code, said, _ = stcal_robot(*words)
-    assert (code, "orientations: not used; state σ" in said) == (0, True)
-    code, said, _ = stcal_robot(*words, "--orientations", 150, "--out", tmp_path / "out.toml")
-    assert (code, "orientations: used, as points 150 mm from the target" in said) == (0, True)
-    assert len(load_robot(tmp_path / "out.toml").tools) == 1

@@ -71,7 +71,7 @@ def test_fixed_dimensions_stay_and_are_said(tmp_path):
     assert nominal.joints[1].fixed == {"a": "measured on a CMM"}
     found = identify(nominal, data)
     assert found.robot.rows[1].a == pytest.approx(mh80().rows[1].a, abs=1e-3)
-    assert abs(identify(mh80(), data).robot.rows[1].a - mh80().rows[1].a) > 0.01
+    assert abs(identify(mh80(), data, IdentifyOptions(folds=0)).robot.rows[1].a - mh80().rows[1].a) > 0.01
     assert any("a of row 2 (measured on a CMM)" in note for note in found.notes)
     assert found.all_held_out is not None
 

@@ -68,7 +68,7 @@ def test_of_a_rigid_arm_the_rigid_model_is_taken_and_the_elastic_one_finds_hardl
     assert elsewhere(found, true) < 1.5 * elsewhere(rigid, true)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_sigma_of_strong_elasticity_settle():
     """Links give way by three and ten times the usual: σ of compliances went in circles, by factors of up to five."""
     for share, seed in ((3.0, 0), (3.0, 1), (10.0, 2)):

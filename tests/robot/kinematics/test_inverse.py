@@ -96,7 +96,7 @@ def test_the_pose_is_reached_from_a_near_start(name):
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.sampled_from(sorted(ARMS)), st.integers(0, 2**31))
 def test_the_pose_is_reached_from_any_start_and_no_branch_is_nearer(name, seed):
     robot = ARMS[name]
@@ -117,7 +117,7 @@ def test_nearest_of_all_branches_and_turns():
     rng = np.random.default_rng(8)
     turn = 2 * np.pi
     low, high = robot.limits().T
-    for q in joint_vectors(robot, 12, rng, 0.9):
+    for q in joint_vectors(robot, 5, rng, 0.9):
         pose = forward(robot, q)
         near = joint_vectors(robot, 1, rng, 0.9)[0]
         every = branches(robot, pose[0]).q
@@ -152,7 +152,7 @@ def test_eight_branches_of_an_arm_with_a_spherical_wrist():
     robot = replace(mh80(), joints=(Joint(),) * 6)
     rng = np.random.default_rng(4)
     counts = []
-    for q in joint_vectors(mh80(), 25, rng, 0.5):
+    for q in joint_vectors(mh80(), 10, rng, 0.5):
         found = branches(robot, forward(robot, q)[0])
         counts.append(len(found))
         apart = (found.q - q + np.pi) % (2 * np.pi) - np.pi

@@ -1,7 +1,6 @@
 """Compensation: the identified robot gets to where the nominal one only believes to be."""
 
 import csv
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made
@@ -224,24 +223,6 @@ def test_bad_targets_are_named(case):
     shorter = replace(case.nominal, rows=case.nominal.rows[:5], joints=case.nominal.joints[:5], coupling=None)
     with fails_with("E-ROBOT-MISMATCH"):
         compensate(case.real, read_targets(case.write(list(POSE), case.pose_rows()), case.real), shorter)
-
-
-@pytest.mark.slow
-def test_command_line(case, stcal_robot):
-    path = case.write(list(POSE), case.pose_rows()[:FEW])
-    files = {k: case.folder / f"new/out.{k}" for k in ("csv", "json", "html")}
-    robots = ["--robot", case.folder / "identified.toml", "--nominal", case.folder / "nominal.toml"]
-    saved = ["--out", files["csv"], "--json", files["json"], "--report", files["html"]]
-    code, out, _ = stcal_robot("compensate", path, *robots, *saved)
-    assert code == 0
-    assert f"{FEW} of {FEW} poses reached" in out
-    content = json.loads(files["json"].read_text())
-    real = load_robot(case.folder / "identified.toml")
-    q = np.radians([list(p["joints"].values()) for p in content["poses"]])
-    np.testing.assert_allclose(forward(real, q).translation, case.poses.translation[:FEW], atol=1e-8)
-    assert len(files["csv"].read_text().splitlines()) == FEW + 1
-    assert "<h2>Joint values</h2>" in files["html"].read_text()
-    assert sorted(p.name for p in (case.folder / "new").iterdir()) == ["out.csv", "out.html", "out.json"]
 
 
 def loaded_rows(case, mass):

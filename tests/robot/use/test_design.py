@@ -1,6 +1,5 @@
 """Observability indices by hand; chosen measurement poses against random ones."""
 
-import json
 from dataclasses import replace
 from itertools import combinations
 
@@ -8,11 +7,9 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.table import read_table
 from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made, measured
@@ -174,21 +171,3 @@ def test_mistakes_are_named():
         design(ARM, DesignOptions(count=10, candidates=50, box=(5000, 0, 0, 6000, 1, 1)))
     sliding = replace(ARM, joints=(*ARM.joints[:2], Joint("prismatic"), *ARM.joints[3:]))
     refuses("E-ROBOT-LIMITS … 3", design, sliding)
-
-
-def test_command_line(tmp_path, stcal_robot):
-    (tmp_path / "robot.toml").write_text(robot_toml(ARM))
-    out, page, file = (tmp_path / f"poses.{kind}" for kind in ("csv", "html", "json"))
-    words = "--robot", tmp_path / "robot.toml", "--count", 15, "--candidates", 150
-    words += "--out", out, "--report", page, "--json", file
-    code, said, _ = stcal_robot("design", *words, "--box", "-2500,-2500,-500,2500,2500,3000")
-    assert (code, "15 poses for 27 parameters" in said) == (0, True)
-    html, content = page.read_text(), json.loads(file.read_text())
-    for name, value in content["chosen"].items():
-        assert f'<th scope="row" class="l">{name}</th><td>{value:.4g}</td>' in html
-    assert html.count("<img") == 3
-    table = read_table(out, "poses")
-    q = np.column_stack([table.numbers(f"q{i}_deg") for i in range(1, 7)])
-    reached = forward(ARM, np.radians(q))
-    np.testing.assert_allclose(reached.translation, table.poses("nominal_").translation, atol=1e-6)
-    assert stcal_robot("design", *words, "--box", "1,2,three")[0] == 2

@@ -114,17 +114,6 @@ def test_no_error_at_all_gives_no_reduction(tmp_path):
     json.dumps(content, allow_nan=False)
 
 
-def test_command_line(tmp_path, stcal_robot):
-    path = written(tmp_path, lines_of("before") + lines_of("after"))
-    plot, file, page = tmp_path / "plot.svg", tmp_path / "v.json", tmp_path / "v.html"
-    code, out, _ = stcal_robot("verify", path, "--plot", plot, "--json", file, "--report", page)
-    assert (code, "71.4 %" in out) == (0, True)
-    assert "<svg" in plot.read_text()
-    assert json.loads(file.read_text())["sets"][0]["mean_mm"] == pytest.approx(0.35)
-    assert "RMS of all pairs" in page.read_text()
-    assert stcal_robot("verify", path, "--plot", "x.png")[0] == 2
-
-
 @pytest.mark.parametrize(("off_mm", "warned"), [(0.01, False), (15.0, False), (4100.0, True)])
 def test_commands_of_another_robot_are_said(off_mm, warned):
     """Distances that miss the commanded ones, though they are as long in all: no other unit."""

@@ -1,7 +1,5 @@
 """Distances against stated lengths and against a second calibration."""
 
-import json
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -82,23 +80,6 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
     mixed = against_run(budget, at_20, saved.folder, (saved.board_design, saved.board_design))
     assert len(mixed.notes) == 2
     assert "hold at different temperatures" in mixed.notes[1]
-
-
-def test_command(stcal_sfm, small_run, budget, tmp_path):
-    path, out = lengths_csv(tmp_path / "lengths.csv", budget, 1.5), tmp_path / "budget.json"
-    code, text, error = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
-    assert code == 4
-    assert f"length test against {path}: differs; results are written" in error
-    words = ("--check-lengths", path, "--no-strict", "--quiet")
-    verdict = f"warning: length test against {path}: differs\n"
-    assert stcal_sfm("budget", small_run, *words) == (0, "", verdict)
-    assert "differs: 4 of 4 lengths beyond U, where 1 in 22 is by chance; largest |E_n| 1.50, " in text
-    assert "agrees: all " in text
-    one, two = json.loads(out.read_text())["length_tests"]
-    assert (one["agrees"], two["agrees"]) == (False, True)
-    assert one["lengths"][0]["e_n"] == pytest.approx(1.5, abs=1e-5)
-    assert re.match(r"(\d+) of \1 photographs have the same view in the other run", two["notes"][0])
-    assert len(two["lengths"]) == 10  # of four faces: six pairs and four within
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,11 @@
 """What is drawn on an overlay is where it should be."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.overlay import draw_overlay
-from stcal.sfm.runs.folder import overlay_path
 
 FOCAL = np.array([2000.0, 2000.0])
 GREY = 90
@@ -53,29 +50,6 @@ def test_the_rim_is_drawn_where_the_ellipse_is(scale):
     assert np.linalg.norm(inside - at, axis=1).min() < 1
 
 
-def test_a_small_thumbnail_is_enlarged_and_the_drawing_with_it():
-    picture = overlay(["1:3"], [[400.0, 300.0]], [60 * np.eye(2)], 1.0, width=800)
-    assert picture.shape == (1200, 1600, 3)
-    found = coloured(picture)
-    away = np.abs(np.linalg.norm(found - 2 * np.array([400.25, 300.25]), axis=1) - 120)
-    assert np.percentile(away, 20) < 1.5
-
-
-def test_faces_have_colours_of_their_own():
-    one = overlay(["1:3"], [[800.0, 600.0]], [60 * np.eye(2)], 1.0)
-    two = overlay(["2:3"], [[800.0, 600.0]], [60 * np.eye(2)], 1.0)
-    x, y = 860, 600
-    near = np.s_[y - 3 : y + 4, x - 2 : x + 3]
-    assert np.abs(one[near].mean((0, 1)) - two[near].mean((0, 1))).max() > 20
-
-
-def test_the_caption_grows_with_the_notes():
-    plain, noted = (overlay(["1:3"], [[800.0, 600.0]], [60 * np.eye(2)], 1.0, notes=n) for n in (0, 2))
-    caption = np.s_[-60:, :]
-    assert (np.abs(noted - plain)[caption].max(2) > 60).sum() > 100
-    assert np.abs(noted - plain)[:-80].max() < 20
-
-
 def test_what_is_left_out_has_a_cross_and_the_picture_says_what_it_means():
     """White along the diagonals of the circle, and nowhere else beside a line of words at the bottom."""
     labels, centres = ["1:3", "1:4"], [[500.0, 600.0], [1000.0, 600.0]]
@@ -87,15 +61,3 @@ def test_what_is_left_out_has_a_cross_and_the_picture_says_what_it_means():
     assert np.abs(across - up).max() < 8
     assert 60 < across.max() < 100  # as large as the circle
     assert crossed[580:590, 980:990].max() > 230
-
-
-def test_a_long_name_is_cut_to_one_of_its_own():
-    long = ["ü" * 118 + f"{k}.jpg" for k in range(2)]
-    paths = [overlay_path(Path("out"), f"12/{name}") for name in long]
-    assert paths[0] != paths[1]
-    assert {path.parent for path in paths} == {Path("out/overlays/12")}
-    for path, name in zip(paths, long, strict=True):
-        assert 190 < len(path.name.encode()) <= 204
-        assert path.name[:80] == name[:80]
-    assert overlay_path(Path("out"), "12/a.jpg") == Path("out/overlays/12/a.jpg")
-    assert overlay_path(Path("out"), "a.png") == Path("out/overlays/a.png.jpg")

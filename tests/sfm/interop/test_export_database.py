@@ -455,14 +455,6 @@ def test_a_copy_that_is_not_the_same_does_not_appear(loss, database, refused, mo
     assert sign in refused(database, error=StcalError)
 
 
-def test_a_full_disk_is_one_line_and_leaves_nothing(database, refused, monkeypatch):
-    def full(*_):
-        raise sqlite3.OperationalError("database or disk is full")
-
-    monkeypatch.setattr(export, "_write", full)
-    assert "out.db: cannot be written (database or disk is full); check the folder's space" in refused(database)
-
-
 @pytest.mark.parametrize("links", [True, False], ids=["hard links", "no hard links"])
 def test_a_file_that_appears_meanwhile_is_not_overwritten(links, database, tmp_path, monkeypatch):
     def no_links(*_):
@@ -500,12 +492,3 @@ def test_the_schema_of_a_version(version, schema):
 def test_a_version_whose_schema_is_not_known(version):
     with pytest.raises(InputError, match=f"COLMAP {version}: its database schema is not known; use a release of 3.8, "):
         schema_of_version(version)
-
-
-def test_the_command_says_what_it_wrote(stcal_sfm, small_run, tmp_path):
-    before = state_of(small_run)
-    code, out, err = stcal_sfm("export-database", small_run, tmp_path / "out.db", "--schema", "3.8")
-    assert (code, err) == (0, "")
-    assert out.splitlines()[0] == "schema 3.8, checked: 8 images, 28 pairs, camera model OPENCV"
-    assert str(tmp_path / "out.db") in out.splitlines()[1]
-    assert state_of(small_run) == before

@@ -1,14 +1,12 @@
 """The exported model read back: by COLMAP, old and new, and by small readers of what the formats' documents say."""
 
 import csv
-import errno
 import json
 import os
 import re
 import shutil
 import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -189,19 +187,6 @@ def test_native_colmap_reads_it(exported, kind, tmp_path):
             assert np.abs(np.array(xyz, float) - ours.point3D(int(point_id)).xyz).max() < 1e-9
 
 
-def test_faces_and_board_differ_in_colour(exported):
-    rgb = [colour for _, colour, _ in read_nvm(exported["nvm"])[1]]
-    by_face = {}
-    for row, colour in zip(labels_of(exported["nvm"]), rgb, strict=True):
-        by_face.setdefault(row["label"].split(":")[0], set()).add(tuple(colour))
-    assert by_face.keys() == {"board", "1", "2", "4", "5"}
-    assert all(len(colours) == 1 for colours in by_face.values())
-    assert len(set.union(*by_face.values())) == len(by_face)
-    read = pycolmap.Reconstruction(str(exported["colmap-bin"]))
-    for row, colour in zip(labels_of(exported["colmap-bin"]), rgb, strict=True):
-        assert read.point3D(int(row["point"])).color.tolist() == colour
-
-
 @pytest.mark.parametrize(
     ("kind", "read", "project", "up"),
     [("nvm", read_nvm, project_nvm, 1), ("bundler", read_bundler, project_bundler, -1)],
@@ -304,22 +289,6 @@ def test_a_space_in_a_name_is_a_quotation_mark_in_nvm(own, tmp_path):
     assert "12/IMG 1000.jpg" in {name for name, *_ in read_nvm(tmp_path / "model.nvm")[0]}
 
 
-def test_the_command(small_run, stcal_sfm, tmp_path):
-    (tmp_path / "empty").mkdir()
-    code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "empty", "--format", "bundler")
-    assert code == 0
-    assert sorted(path.name for path in (tmp_path / "empty").iterdir()) == ["bundle.out", "labels.csv", "list.txt"]
-    assert "8 images" in out
-    camera = read_camera(small_run / "inputs/cameras.txt")
-    assert f"f = {camera.focal.mean():.4f} px" in out
-    assert "(647.5, 431.5)" in out  # 1296 × 864 px, centre of the first pixel at (0, 0)
-    assert stcal_sfm("export-model", small_run, tmp_path / "model.nvm", "--format", "nvm")[0] == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "model.nvm", "model.nvm.labels.csv"]
-    code, out, _ = stcal_sfm("export-model", small_run, tmp_path / "new" / "place", "--format", "colmap-txt")
-    assert (code, out.startswith("8 images and "), "ideal" in out) == (0, True, False)
-    assert (tmp_path / "new" / "place" / "cameras.txt").exists()
-
-
 @pytest.mark.parametrize("kind", ["nvm", "bundler"])  # a file, and a folder
 def test_nothing_is_overwritten(small_run, stcal_sfm, tmp_path, kind):
     (tmp_path / "file").write_text("mine", encoding="utf-8")
@@ -331,24 +300,6 @@ def test_nothing_is_overwritten(small_run, stcal_sfm, tmp_path, kind):
         assert "exists, and nothing is overwritten" in error
     assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "file", "full"]
-
-
-def test_a_full_disk_is_one_line_with_the_place(small_run, stcal_sfm, tmp_path, monkeypatch):
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device")  # as a write says it, without a name
-
-    monkeypatch.setattr(Path, "write_text", full)
-    code, out, error = stcal_sfm("export-model", small_run, tmp_path / "m.nvm", "--format", "nvm")
-    assert (code, out, error.count("\n")) == (2, "", 1)
-    assert f"{tmp_path / 'm.nvm'}: No space left on device; check the path" in error
-    assert not any(tmp_path.iterdir())
-
-
-def test_labels_are_not_overwritten_either(small_run, stcal_sfm, tmp_path):
-    (tmp_path / "m.nvm.labels.csv").write_text("mine", encoding="utf-8")
-    code, _, error = stcal_sfm("export-model", small_run, tmp_path / "m.nvm", "--format", "nvm")
-    assert (code, "m.nvm.labels.csv: exists" in error) == (2, True)
-    assert not (tmp_path / "m.nvm").exists()
 
 
 def test_errors(own, small_run, stcal_sfm, tmp_path):

@@ -1,7 +1,6 @@
 """COLMAP models read back with labels: made by the mapper, edited, damaged, or of something else."""
 
 import json
-import os
 import random
 import shutil
 import sqlite3
@@ -236,14 +235,6 @@ def test_a_deleted_board(saved, model):
         model.delete_point3D(point)
     with fails_with("E-SCALE-FEW-DOTS … group 12 … scale: 3 … 4"):
         calibrate_models(model.as_binary(), saved)
-
-
-def test_a_text_of_gigabytes_is_not_read(model):
-    """pycolmap takes a line of any length."""
-    path = model.as_text() / "points3D.txt"
-    os.truncate(path, 3 << 30)
-    with fails_with("E-MODEL-UNREADABLE … 3221 … 100"):
-        open_model(path.parent)
 
 
 def test_points_deleted_from_a_text_by_hand(saved, model, plain):
@@ -535,14 +526,6 @@ def test_a_file_is_missing(saved, tmp_path, name):
         calibrate_models(folder, saved)
 
 
-def test_a_folder_in_place_of_a_file(saved, tmp_path):
-    folder = own_copy(saved.folder / "colmap/models" / "12", tmp_path / "model")
-    (folder / "points3D.bin").unlink()
-    (folder / "points3D.bin").mkdir()
-    with fails_with("E-MODEL-UNREADABLE"):
-        open_model(folder)
-
-
 def test_every_whole_model_passes(tmp_path):
     """Rigs of several sensors, frames of several images, points without a track, images without keypoints, and every
     camera model that pycolmap has: what is checked before reading must not refuse what can be read."""
@@ -592,24 +575,6 @@ def test_no_model(saved, stcal_sfm, tmp_path):
     for place in ("missing", "file", "empty"):
         outcome = stcal_sfm("faces", tmp_path / place, "--run", saved.folder)
         assert_error(outcome, INPUT, "E-MODEL-UNREADABLE", f"{tmp_path / place}")
-
-
-def test_the_command_says_what_the_models_say(saved, stcal_sfm, tmp_path):
-    code, out, err = stcal_sfm(
-        "faces", saved.folder / "colmap/models", "--run", saved.folder, "--out", tmp_path / "f.json"
-    )
-    assert (code, err) == (0, "")
-    found = calibrate_models(saved.folder / "colmap/models", saved)
-    written = json.loads((tmp_path / "f.json").read_text(encoding="utf-8"))
-    assert (written["format"], written["unit"], written["solve"]) == ("stcal faces 1", "mm", "chain")
-    for face, pose in found.target.target_from_face.items():
-        assert np.array_equal(written["target_from_face"][face], pose.matrix())
-        x, y, z = pose.translation
-        assert f"{face:>6} {x:11.4f} {y:11.4f} {z:11.4f} " in out
-    assert "group 12: 4 images, " in out
-    assert out.splitlines()[-1] == f"faces: {tmp_path / 'f.json'}"
-    outcome = stcal_sfm("compare", tmp_path / "f.json", tmp_path / "f.json")  # it is a faces.json like any other
-    assert outcome[0] == 0
 
 
 def test_the_folder_of_the_answer_is_needed(saved, stcal_sfm, tmp_path):

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import time
 from dataclasses import replace
 from importlib import import_module
 
@@ -16,14 +15,13 @@ from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.cameras.read import read_camera
-from stcal.io.images import Skipped
 from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
-from stcal.sfm.measurement.images import MeasuredImage, MeasureOptions, measure, measure_labelled
+from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
-from stcal.sfm.measurement.report import measure_report, poses_file
+from stcal.sfm.measurement.report import poses_file
 from stcal.sfm.measurement.target import TargetCircles, read_target
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import FULL
@@ -225,24 +223,6 @@ def test_sigma_factor_of_the_run_and_a_given_one(scene, known):
     ]
     assert np.trace(parts[1][3:, 3:]) > 2 * np.trace(parts[0][3:, 3:])
     assert np.allclose(parts[2], parts[0], rtol=1e-9, atol=0)
-
-
-@pytest.mark.slow
-def test_a_pose_costs_some_steps_and_no_search(scene, known):
-    """Processor time over that of one linearised distortion of its circles, the best of several rounds in the same run:
-    64 measured (2 ms), of two minima with their steps and covariance; a search over starts would take thousands."""
-    rng = np.random.default_rng(10)
-    images = [one_view(scene, rng, ONE[i % 5], NOISE_PX, (0, 65), (600, 1500))[2] for i in range(20)]
-    poses, linearised = np.inf, np.inf
-    for _ in range(8):
-        start = time.process_time()
-        for image in images:
-            pose_of(image, known.truth, scene.camera)
-        middle = time.process_time()
-        for image in images * 10:
-            scene.camera.distort_jacobian(image.centre)
-        poses, linearised = min(poses, middle - start), min(linearised, (time.process_time() - middle) / 10)
-    assert poses < 250 * linearised
 
 
 def test_too_few_circles_and_wrong_labels(scene, known):
@@ -465,23 +445,3 @@ def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_data
     assert code == 4
     assert "error: --strict: failed: χ² of " in err
     assert (tmp_path / "poses.csv").exists()
-
-
-def test_of_many_images_those_that_need_a_look_are_printed(scene, known):
-    """One ambiguous pose and one image that was left out, of a hundred each."""
-    rng = np.random.default_rng(4)
-    truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
-    poses = [
-        pose_of(see(scene, truth, faces, 0.5, rng), known.truth, scene.camera) for faces in (("1", "2", "4"), ("1",))
-    ]
-    images = tuple(MeasuredImage(f"{i:03}.jpg", poses[i == 70]) for i in range(100))
-    unknown = tuple(Skipped(f"x{i}.jpg", "no face of the target recognised", "pose") for i in range(100))
-    none = measure_labelled([], scene.camera, known.truth)
-    result = replace(none, images=images, common=np.zeros((100, 6, 0)), left_out=unknown)
-    lines = measure_report(result, "images").text().splitlines()
-    assert len(lines) < 40
-    assert [line.split()[:2] for line in lines if ".jpg  1" in line] == [["070.jpg", "1"]]
-    assert [line.split()[-1] for line in lines if line.startswith("σ position")] == ["070.jpg"]
-    assert [line.split()[0] for line in lines if "more" in line] == ["left", "99"]
-    every = measure_report(result, "images", every=True).text().splitlines()
-    assert sum(".jpg  1" in line for line in every) == sum(line.startswith("left out x") for line in every) == 100

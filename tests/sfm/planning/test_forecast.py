@@ -357,20 +357,6 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
 
 
 @pytest.mark.slow
-def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
-    code, text, _ = stcal_sfm("advise", small_run, "--count", 1, "--json", tmp_path / "advice.json")
-    content = json.loads((tmp_path / "advice.json").read_text())
-    assert code == 0
-    assert content["format"] == "stcal advice 1"
-    (view,) = content["views"]
-    assert view["worst_sigma_um"] < content["worst_sigma_um"]
-    assert f"{view['from_image']}" in text
-    now, then = (f"{c['worst_face']}: {c['worst_sigma_um']:.2f}" for c in (content, view))
-    assert f"{now} → {then}" in text
-    assert "warning" not in text
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "change", "warning"),
     [
@@ -399,17 +385,6 @@ def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
     code, _, error = stcal_sfm("advise", tmp_path / "run")
     assert (code, error.count("\n")) == (2, 1)
     assert "target_model: damaged or incomplete" in error
-
-
-@pytest.mark.slow
-def test_plan_command(stcal_sfm, tmp_path):
-    code, text, _ = stcal_sfm("plan", "--width", 2592, "--images", 2, "--json", tmp_path / "plan.json")
-    content = json.loads((tmp_path / "plan.json").read_text())
-    assert code == 0
-    assert content["groups"] == ["12", "14", "15", "23"]
-    assert content["worst_face"] == "3"  # the only one that is two groups away from the reference
-    assert "worst is face 3" in text
-    assert {row["what"] for row in content["remedies"]} >= {"twice the images", "a board of half the σ"}
 
 
 def plan(images=2, noise=NOISE, groups=(("1", "2"), ("2", "3"))):

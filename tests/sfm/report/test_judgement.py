@@ -7,14 +7,11 @@ from pathlib import Path
 import pytest
 
 from stcal.sfm import checks
-from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS
 from stcal.sfm.report.judgement import (
     CAUSE,
-    CHANCE,
     INVALIDATES,
     LEFT_OUT_WHOLE,
     OF_WHOLE_SET,
-    TESTS_OF_CHANCE,
     judged,
     judgement_of,
 )
@@ -148,13 +145,6 @@ def test_each_source_has_its_own_remedy(source, edge_share, words, not_said):
     assert not_said not in found.next
 
 
-def test_a_report_without_sources_does_not_guess():
-    own = report()
-    for face in own["faces"].values():
-        face.pop("translation_sources_um", None)
-    assert "budget RUN" in judgement_of(own).next
-
-
 def test_results_for_comparison_are_not_for_use():
     own = report()
     for solve, remedy in (("paper", "--solve paper"), ("chain", "--no-eccentricity")):
@@ -258,13 +248,6 @@ def test_a_group_that_was_left_out_calls_for_care_and_says_why():
     assert judgement_of(own).use.count("With care: ") == 1
 
 
-def test_a_face_of_one_image_is_in_the_sentence():
-    own = report()
-    own["faces"]["3"]["images"] = 1
-    told = judgement_of(own)
-    assert (told.verdict, "face 3 rests on one image" in told.use) == ("yes", True)
-
-
 @pytest.mark.parametrize("key", INVALIDATES)
 def test_after_no_there_are_no_micrometres_but_what_does_not_hold(key):
     failed = judged(report(check(key, "failed", remedy="x"), check("b", "passed")))
@@ -291,11 +274,6 @@ def test_the_intrinsics_are_no_premise_where_they_were_adjusted():
     assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
     own["options"]["refine_camera"] = True
     assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")
-
-
-def test_how_often_chance_does_it_is_that_of_the_checks():
-    assert pytest.approx(1 / SUSPICIOUS) == TESTS_OF_CHANCE
-    assert f"{round(1 / SUSPICIOUS):,}, 'failed' in one in {round(1 / FAILED):,}." in CHANCE
 
 
 def test_a_cause_that_no_check_saw_is_no():

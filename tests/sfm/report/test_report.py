@@ -2,20 +2,15 @@
 
 import base64
 import copy
-import json
 import re
 from html import unescape
 from html.parser import HTMLParser
 
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from stcal.report.svg import Drawing, round_below
+from stcal.report.svg import Drawing
 from stcal.sfm.report import figures
-from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
 from stcal.sfm.report.page import report_html
-from stcal.sfm.report.sections import factor_in_words
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -237,11 +232,6 @@ def test_a_control_without_eccentricity_raises_an_alarm(joint, chained):
     assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
 
 
-@pytest.mark.parametrize(("factor", "words"), [(0.95, "as large as"), (1.0, "as large as"), (0.9, "0.9 times")])
-def test_residuals_within_5_percent_are_as_large_as_stated(factor, words):
-    assert f"residuals are {words} the centres' own σ" in factor_in_words(factor)
-
-
 def test_numbers_have_their_digits(joint):
     faces = rows_of(joint, "faces")
     assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6, "4", "10", "0.4", "2", "a"] in faces
@@ -280,12 +270,6 @@ def test_two_ways_to_a_face_are_a_check():
     assert trust["Disagreement of chains, position (µm)"] == ["20.0", "face 2 by b"]
 
 
-def test_long_rankings_are_folded(joint):
-    assert "2 more pairs" in joint
-    pairs = [row for row in rows_of(joint, "pairs") if len(row) == 7]
-    assert [row[6] for row in pairs if row[0] != "First"] == ["chosen"] + 16 * ["usable"]
-
-
 def test_left_out_with_reasons():
     report = make()
     report["summary"]["faces_not_seen"] = ["6"]
@@ -305,95 +289,6 @@ def test_left_out_with_reasons():
     assert ["1", "group a: face <6> has no frame"] in rows
 
 
-@pytest.mark.parametrize(("value", "below"), [(7.3, 5), (0.0299, 0.02), (3000, 2000), (0.0, 1), (float("nan"), 1)])
-def test_round_below(value, below):
-    assert round_below(value) == pytest.approx(below)
-
-
-def test_a_large_set_shows_the_overlays_that_deserve_a_look():
-    report = make()
-    names = [f"a/{i}.jpg" for i in range(FIRST_IMAGES + 50)]
-    report["images"] = [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(names, 1)]
-    report["residuals_by_image"] = [by_image(n) | {"max_px": 0.01 + 1e-5 * i} for i, n in enumerate(names)][:-1]
-    report["left_out"]["notes"] = [{"image": "a/3.jpg", "note": "board left out"}]
-    shown = shown_overlays(report)
-    assert len(shown) == FIRST_IMAGES
-    assert {"a/3.jpg", names[-1], names[-2]} <= set(shown)  # a note, not mapped, the largest residual
-    assert "a/4.jpg" not in shown
-    assert shown == sorted(shown, key=names.index)
-    page = report_html(report, dict.fromkeys(shown, JPEG))
-    assert "the other 50 are in overlays/" in page
-    assert f"All {len(names) - 1} images" in page
-
-
-def crosscheck(differences: list[str]) -> dict:
-    row = {"translation_um": 0.7631, "rotation_mdeg": 0.3037, "sigmas": 0.261}
-    faces = {"1": {"translation_um": 0.0, "rotation_mdeg": 0.0, "sigmas": None}, "2": row}
-    return {
-        "native": "3.8",
-        "pycolmap": "4.2.1",
-        "schema": "3.8",
-        "tolerances": dict.fromkeys(("face_um", "face_mdeg", "circle_um", "camera_mdeg"))
-        | {"camera_um": 20, "sigma": 0.5, "mapped_sigma": 3},
-        "images": {"native": 2, "pycolmap": 2, "run": 2},
-        "residual_rms_px": {"native": 0.00356, "pycolmap": 0.00357, "run": 0.00386},
-        "mapping": {
-            "faces": faces,
-            "circles_um": {"1:0": 0.1, "2:0": 0.765},
-            "circles_sigmas": {"1:0": 0.05},
-            "cameras": [{"image": NASTY, "position_um": 9.184, "rotation_mdeg": 0.536, "sigmas": 0.33}],
-        },
-        "result": {"faces": faces, "circles_um": {}},
-        "plain": {"faces": faces | {"2": None}},
-        "notes": ["group b: <none>"],
-        "differences": differences,
-    }
-
-
-@pytest.mark.slow
-def test_the_crosscheck_is_a_section_of_its_own():
-    page = report_html(make() | {"crosscheck": crosscheck([])}, OVERLAYS)
-    parsed = Page(page)
-    assert parsed.tags.count("h2") == 11
-    rows = rows_of(page, "crosscheck")
-    assert ["COLMAP 3.8", "2", "0.0036"] in rows
-    assert ["2", *["0.763", "0.304", "0.26"] * 2, "–", "–", "–"] in rows
-    assert [NASTY, "9.18", "0.536", "0.33"] in rows
-    assert "Group b: <none>" in parsed.text
-    differing = Page(report_html(make() | {"crosscheck": crosscheck(["face <2> 5 µm"])}, OVERLAYS)).text
-    assert ["face <2> 5 µm" in text for text in (parsed.text, differing)] == [False, True]
-
-
-def test_the_picture_stands_as_the_cameras_did():
-    """Their upward direction is drawn up, unless they were turned to all sides; the report itself is as it was."""
-    report = make()
-    turn = Rotation.from_rotvec([1.0, -2.0, 0.3]).as_matrix()
-    report["scene"]["cameras"] = [
-        {
-            "image": str(k),
-            "group": "a",
-            "position_mm": 900 * -turn[2],
-            "axes": Rotation.from_rotvec(tilt * turn[2]).apply(turn),
-        }
-        for k, tilt in enumerate((-0.4, 0.1, 0.4))
-    ]
-    before = json.dumps(report["faces"])
-    drawn = upright(report)
-    up = -np.mean([camera["axes"][1] for camera in drawn["scene"]["cameras"]], axis=0)
-    np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-9)
-    assert json.dumps(report["faces"]) == before
-    pose, shown = (np.array(each["faces"]["1"]["target_from_face"]) for each in (report, drawn))
-    circle = next(iter(report["scene"]["circles"]))
-    seen = [
-        np.linalg.inv(m) @ np.append(each["scene"]["circles"][circle], 1)
-        for m, each in ((pose, report), (shown, drawn))
-    ]
-    np.testing.assert_allclose(*seen, atol=1e-9)
-    for camera, angle in zip(report["scene"]["cameras"], (0, 2 * np.pi / 3, -2 * np.pi / 3), strict=True):
-        camera["axes"] = Rotation.from_rotvec(angle * turn[2]).apply(turn)
-    assert upright(report) is report
-
-
 def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
     """Their numbers are coordinates; only the scene that turns stands as the cameras did."""
     drawn = []
@@ -402,29 +297,6 @@ def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
     report_html(report, {NASTY: JPEG})
     assert drawn
     assert all(circles == report["scene"]["circles"] for circles in drawn)
-
-
-def test_a_body_of_tags_has_corners_and_no_board():
-    """All photographs in one folder, whose group is named by a dot in the files."""
-    report = make()
-    report["summary"] |= {"printed_faces": ["1", "2"], "scale_from": ["faces"]}
-    report["options"]["refine_camera"] = True
-    report["scene"]["boards"] = {}
-    report["residuals_by_label"].pop()
-    report["groups"][0]["scale"] |= {"source": "faces"}
-    report["groups"][0]["name"] = "."
-    report["groups"][0]["seeded"] = "faces of known shape, placed together"
-    for row in (*report["faces"].values(), *report["chains"]["2"]):
-        row["groups"] = ["."]
-    for row in (*report["residuals_by_image"], *report["scene"]["cameras"], *report["images"]):
-        row["group"] = "."
-    page = report_html(report, OVERLAYS)
-    text = Page(page).text.replace("on faces of circles, and into it on faces of boards and tags", "")
-    for word in ("circle", "Circle", "board", "Board", " dots", "Dots", "pitch", "Group ."):
-        assert word not in text, word
-    assert "σ hold for the stated size of the printed faces" in text
-    assert "Corners" in text
-    assert rows_of(page, "faces")[2][-1] == "all"
 
 
 def test_sigma0_is_what_the_certificate_says(joint):

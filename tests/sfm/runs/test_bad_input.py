@@ -302,43 +302,12 @@ def test_the_images_as_output_are_refused(small_set, stcal_sfm):
     assert len(list(small.images.rglob("*"))) == 5
 
 
-@pytest.mark.parametrize("below", ["", "deeper"])
-def test_a_file_as_output(small_set, stcal_sfm, below):
-    small = small_set("12", detected=False)
-    small.out.write_text("a file", encoding="utf-8")
-    outcome = stcal_sfm("run", small.images, "--camera", small.camera, "--out", small.out / below)
-    assert_error(outcome, INPUT, str(small.out), "; give a")
-    assert small.out.read_text(encoding="utf-8") == "a file"
-
-
 def test_a_wrong_folder_of_images_costs_no_earlier_result(small_set, small_run, stcal_sfm):
     small = small_set()
     own_copy(small_run / "faces.json", small.out)
     outcome = stcal_sfm("run", small.folder / "imagse", "--camera", small.camera, "--out", small.out)
     assert_error(outcome, INPUT, "E-IMAGES-FOLDER", "imagse", "does not exist")
     assert results_in(small.out) == ["faces.json"]
-
-
-USAGE = {
-    "no folder": (["run", "x"], ("'--out'", "`stcal-sfm run --help`")),
-    "no such option": (["run", "x", "--camra", "y"], ("--camra", "`stcal-sfm run --help`")),
-    "no such command": (["calibrate"], ("'calibrate'", "`stcal-sfm --help`")),
-    "no such choice": (["run", "x", "--camera", "y", "--out", "z", "--solve", "best"], ("'--solve'", "'chain'")),
-    "not a number": (["run", "x", "--camera", "y", "--out", "z", "--workers", "all"], ("'--workers'", "--help`")),
-    "no workers": (["run", "x", "--camera", "y", "--out", "z", "--workers", "0"], ("'--workers'", "--help`")),
-    "diameters": (
-        ["run", "x", "--camera", "y", "--out", "z", "--min-diameter", "50", "--max-diameter", "40"],
-        ("--max-diameter 40 px, more than --min-diameter 50 px needed",),
-    ),
-}
-
-
-@pytest.mark.parametrize("case", USAGE)
-def test_a_slip_on_the_command_line(stcal_sfm, monkeypatch, tmp_path, case):
-    monkeypatch.chdir(tmp_path)
-    arguments, parts = USAGE[case]
-    assert_error(stcal_sfm(*arguments), INPUT, *parts)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_truth_that_is_none(small_run, small_dataset, stcal_sfm, tmp_path):
@@ -369,15 +338,6 @@ def test_an_unfinished_run_is_not_compared(small_set, stcal_sfm):
 
 def command(*arguments) -> list[str]:
     return [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
-
-
-@pytest.mark.slow  # the quick one is that which is interrupted
-def test_a_real_process_exits_alike(small_set):
-    small = small_set("12")
-    for path in (small.images / "12").iterdir():
-        path.write_bytes(b"")
-    done = subprocess.run(command(*small.arguments()), capture_output=True, text=True, timeout=60)
-    assert_error((done.returncode, done.stdout, done.stderr), INPUT, "12/IMG_1000.jpg: empty file (0 bytes)")
 
 
 def test_debug_lets_the_error_through(small_set, stcal_sfm):
@@ -439,22 +399,6 @@ def same_centres(found, expected, tolerance_px: float) -> None:
     assert len(found) > 70
     worst = max(np.hypot(*np.subtract(found[key], expected[key])) for key in found)
     assert worst <= tolerance_px
-
-
-@pytest.mark.usefixtures("no_page")
-def test_names_with_spaces_and_non_ascii(small_set, small_run, stcal_sfm):
-    small, group = small_set("12"), "Gruppe „12“ & <b>"
-    names = ["zwei Flächen 1.JPG", "Bild, nr. 2.jpeg", "三.Jpg", 'a"quote".jpg']
-    for i, name in enumerate(names):
-        small.image(i).rename(small.images / "12" / name)
-    (small.images / "12").rename(small.images / group)
-    assert f"group {group}: 4 images" in assert_success(stcal_sfm(*small.arguments(*CHAIN)))
-    renamed = {f"12/IMG_{1000 + i}.jpg": f"{group}/{name}" for i, name in enumerate(names)}
-    known = detections(small_run)
-    expected = {(renamed[image], label): xy for (image, label), xy in known.items() if image in renamed}
-    same_centres(detections(small.out), expected, 0)
-    assert set(json.loads((small.out / "faces.json").read_text(encoding="utf-8"))["target_from_face"]) >= {"1", "2"}
-    assert (small.out / "overlays" / group / names[0]).exists()
 
 
 def test_formats_of_the_same_pixels(small_set):

@@ -1,7 +1,6 @@
 """Images taken out by name, and runs that end as failed where their checks have."""
 
 import json
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,7 +10,6 @@ from stcal.io.images import chosen_images
 from stcal.sfm.checks.verdict import Check, ranked
 from stcal.sfm.report.judgement import _first
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.text import _noted
 from tests.outcome import INPUT, assert_error, fails_with
 
 CHECKS_FAILED = 4
@@ -85,21 +83,6 @@ def test_images_are_named_as_in_results_or_by_their_path(small_set, monkeypatch)
     assert len(kept) == 5
     with fails_with("E-OPTION-EXCLUDE … --exclude … 8"):
         chosen_images(small.images, [each.name for each in chosen_images(small.images)[0]])
-
-
-def test_images_in_which_something_was_left_out_are_named():
-    images = [
-        SimpleNamespace(observations=SimpleNamespace(name=f"12/{i}.jpg"), notes=(f"face 2: no circle {i}",) * (i % 3))
-        for i in range(18)
-    ]
-    lines = list(_noted(images))
-    assert lines[:3] == ["12/1.jpg: face 2: no circle 1", *["12/2.jpg: face 2: no circle 2"] * 2]
-    assert len(lines) == 7
-    assert lines[-1] == (
-        "something was left out in 12/7.jpg, 12/8.jpg, 12/10.jpg, 12/11.jpg, 12/13.jpg, 12/14.jpg and 2 more too; the "
-        "report says what and why"
-    )
-    assert list(_noted(images[:3])) == lines[:3]
 
 
 def test_of_failed_checks_those_that_name_an_image_come_first():

@@ -4,7 +4,6 @@ import csv
 import json
 import math
 import re
-import shutil
 
 import pytest
 
@@ -16,7 +15,6 @@ from stcal.sfm.runs.saved import verify
 from stcal.sfm.runs.text import run_text
 from stcal.sfm.runs.transaction import added_results
 from tests.outcome import INPUT, assert_error
-from tests.report.browser import faults, opened, show, sideways_px
 
 
 @pytest.mark.slow
@@ -53,18 +51,6 @@ def test_into_a_file_of_ones_own(own_run, tmp_path, stcal_sfm):
     assert (tmp_path / "for the lab.pdf").read_bytes().startswith(b"%PDF")
     assert (own_run / RUN_MARKER).read_bytes() == before
     assert not (own_run / "report.pdf").exists()
-
-
-@pytest.mark.slow
-def test_photographs_that_are_gone_are_counted(own_run, tmp_path, stcal_sfm):
-    shutil.rmtree(own_run / "overlays" / "12")
-    code, out, _ = stcal_sfm("report", own_run, "--out", tmp_path / "page.html")
-    assert code == 0
-    assert out.startswith("4 overlays are no longer in the folder: the report is without them\n")
-    page = (tmp_path / "page.html").read_text()
-    assert "4 photographs are not shown: their overlays were no longer in the run" in page
-    assert page.count('alt="Overlay of 14/') == 4
-    assert "Overlay of 12/" not in page
 
 
 def test_what_cannot_be_made_is_said_in_one_line(own_run, tmp_path, stcal_sfm):
@@ -122,11 +108,3 @@ def test_residuals_of_the_table_are_those_of_the_report_and_of_the_page(small_ru
         assert [[float(v) / factor for v in each] for each in vectors] == [
             [pytest.approx(v, abs=0.051 / factor) for v in each] for each in own
         ]
-
-
-@pytest.mark.slow
-def test_the_page_of_a_run_in_a_browser(small_run):
-    with opened() as chrome:
-        for width in (1280, 400):
-            show(chrome, small_run / "report.html", width)
-            assert (width, sideways_px(chrome), faults(chrome)) == (width, 0, [])
