@@ -3,11 +3,13 @@
 
 Printed is χ² per degree of freedom, 1 where σ are right. Cameras: the views of a set are drawn into two halves, each
 calibrates by itself, and the difference of the two answers is over the sum of their covariances. Bodies: two cameras
-have photographed one cube, each with its own run; the poses of its faces are compared. Simulated: errors against the
+have photographed one cube, each with its own run; the poses of its faces are compared. Use: both cameras measure the
+cube, as the first one calibrated it, and their poses say where the second stands from the first; a hand-eye calibration
+and a robot by halves of their poses, compared where the robot's tool is. Simulated: errors against the
 truth, `field` with errors of twice the noise that neighbouring places of a photograph have in common, `print` with
 boards stretched, sheared and curved as printers do, `bad` with one photograph whose errors are eight times the noise.
 
-.venv/bin/python scripts/studies/halves_study.py [--part all|cameras|bodies|simulated] [--draws N]
+.venv/bin/python scripts/studies/halves_study.py [--part all|cameras|bodies|use|simulated] [--draws N]
 """
 
 import tempfile
@@ -15,7 +17,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from handeye_shared import CHARUCO, robot_table
 from real_bodies import pycamset_cube
+from same_results import prepare
 from scipy.spatial.transform import Rotation
 
 from scripts.runner import options_of
@@ -24,14 +28,24 @@ from stcal.boards.file import load_flat_board
 from stcal.design import BoardDesign, reference_board
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import block_diagonal, perturbed
 from stcal.geometry.print_modes import PrintModes
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, skew
+from stcal.handeye.solve import handeye
+from stcal.io.cameras.read import load_camera
 from stcal.io.design import target_of
-from stcal.sfm import pipeline
+from stcal.robot.identification.adjustment import tip_jacobian
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
+from stcal.robot.kinematics.file import load_robot
+from stcal.robot.kinematics.measurements import read_measurements
+from stcal.sfm import measure, pipeline
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.measurement.target import read_target
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from stcal.workflows.handeye_inputs import read_input
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 CAMERAS = {
@@ -116,6 +130,99 @@ def of_bodies() -> None:
     print(f"\ncube of ChArUco faces, real, two cameras: {np.mean(apart):.2f} (faces {np.round(sorted(apart), 2)})")
 
 
+def of_measuring(run: Path, other: Path) -> None:
+    """Print χ² of where one camera stands from the other, by the poses that both measure of one cube."""
+    circles, poses, roots = read_target(run / "faces.json", pycamset_cube()), [], []
+    for folder, camera in ((run, "cam0"), (other, "cam1")):
+        lens = load_camera(folder / "colmap" / "refined_cameras.txt")
+        found = measure(DATA / "real" / "pycamset_cube" / camera, lens, circles)
+        poses.append({image.name: image.pose for image in found.images})
+        roots.append(square_root(lens.covariance))
+    shape, names = square_root(circles.covariance), sorted(poses[0].keys() & poses[1].keys())
+    apart, own, common = [], [], []
+    for name in names:
+        (a, b), parts = (each[name] for each in poses), []
+        between = a.camera_from_target @ b.camera_from_target.inverse()
+        across = np.eye(6)  # of a motion of the second camera, seen from the first
+        across[:3, :3] = across[3:, 3:] = -between.rotation
+        shift = between.rotation @ b.camera_from_target.translation
+        across[3:, :3] = -skew(shift) @ between.rotation
+        to_first = np.eye(6)
+        to_first[3:, :3] = -skew(between.translation - a.camera_from_target.translation)
+        for pose, motion, root in ((a, to_first, roots[0]), (b, across, roots[1])):
+            rows = (3 * np.array([circles.place[label] for label in pose.labels])[:, None] + np.arange(3)).ravel()
+            parts.append((motion @ pose.by_circles @ shape[rows], motion @ pose.by_intrinsics @ root))
+        own.append(sum(m @ p.parts["image"] @ m.T for p, m in ((a, to_first), (b, across))))
+        common.append(np.hstack([parts[0][0] + parts[1][0], parts[0][1], parts[1][1]]))
+        apart.append(between)
+    full = block_diagonal(np.array([own]))[0] + np.vstack(common) @ np.vstack(common).T
+    each, mean, weight = Poses.of(apart), apart[0], np.linalg.inv(full)
+    motion = np.tile(np.eye(6), (len(names), 1))
+    for _ in range(5):
+        off = each.difference(Poses.of([mean] * len(names))).ravel()
+        mean = perturbed(mean, np.linalg.solve(motion.T @ weight @ motion, motion.T @ weight @ off))
+    off = each.difference(Poses.of([mean] * len(names))).ravel()
+    print(row_of("measure: cube, two cameras, real", len(names), [off @ weight @ off / (len(off) - 6)]))
+
+
+def square_root(covariance: np.ndarray) -> np.ndarray:
+    """A matrix whose product with its transpose is the covariance."""
+    value, vector = np.linalg.eigh(covariance)
+    return vector * np.sqrt(np.maximum(value, 0))
+
+
+def row_of(name: str, count: int, values: Sequence[float]) -> str:
+    """A row of the table of uses."""
+    return f"| {name} | {count} | {np.mean(values):.2f} |"
+
+
+def drawn_halves(count: int, draws: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Random halves of numbers."""
+    rng = np.random.default_rng(0)
+    for _ in range(draws):
+        drawn = rng.permutation(count)
+        yield np.sort(drawn[: count // 2]), np.sort(drawn[count // 2 :])
+
+
+def of_use(draws: int) -> None:
+    """Print χ² of what a target is used for."""
+    print("\n| use | poses | χ² |\n|---|---|---|")
+    with tempfile.TemporaryDirectory() as name:
+        scratch, cube = Path(name), DATA / "real" / "pycamset_cube"
+        for camera in ("cam0", "cam1"):
+            pipeline.run(cube / camera, None, scratch / camera, pycamset_cube())
+        of_measuring(scratch / "cam0", scratch / "cam1")
+        folder = DATA / "charuco_handeye" / "test_set_charuco"
+        (scratch / "board.toml").write_text(CHARUCO)
+        table = robot_table(folder / "poses", scratch / "poses.csv")
+        given = read_input(folder / "images", table, folder / "cal_data.yaml", scratch / "board.toml", 1)
+        assert given.views is not None
+        values = []
+        for parts in drawn_halves(len(given.pairs), draws):
+            one, two = (handeye(given.pairs[own], "eye-to-hand", "reprojection", given.views[own]) for own in parts)
+            (off,) = Poses.of([one.mount_from_camera]).difference(Poses.of([two.mount_from_camera]))
+            assert one.covariance is not None
+            assert two.covariance is not None
+            values.append(off @ np.linalg.solve(one.covariance + two.covariance, off) / 6)
+        print(row_of("hand-eye: ChArUco by corners, real", len(given.pairs), values), flush=True)
+        prepare(scratch)
+        robot = load_robot(scratch / "rokae.toml")
+        data = read_measurements(scratch / "rokae.csv", robot)
+        for kind in ("pose", "position"):
+            values = []
+            for parts in drawn_halves(len(data), draws):
+                ends = []
+                for own in parts:
+                    found = identify(robot, data[own], IdentifyOptions(kind, folds=0, partial=True))
+                    at, motion = tip_jacobian(found.state, data.q, data.targets, found.seen.kind)
+                    motion = motion[:, 3:, : len(found.names)]
+                    ends.append((at.translation, motion @ found.covariance @ np.swapaxes(motion, 1, 2)))
+                off, covariance = ends[0][0] - ends[1][0], ends[0][1] + ends[1][1]
+                square = np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+                values.append(float(square.mean() / 3))
+            print(row_of(f"robot: Rokae by {kind}s, real", len(data), values), flush=True)
+
+
 def simulated(rng: np.random.Generator, kind: str) -> list[ImageObservations]:
     """Views of the reference board, held by hand 0.3 to 0.6 m away."""
     board, views = reference_board(), []
@@ -167,6 +274,8 @@ def main() -> None:
         of_cameras(arguments.draws)
     if arguments.part in ("all", "bodies") and (DATA / "real" / "pycamset_cube").is_dir():
         of_bodies()
+    if arguments.part in ("all", "use") and (DATA / "rokae_tracker").is_dir():
+        of_use(arguments.draws)
     if arguments.part in ("all", "simulated"):
         of_simulated(arguments.draws)
 

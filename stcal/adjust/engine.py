@@ -29,7 +29,10 @@ TINY = 1e-300
 class Values(Protocol):
     """The members of a block, such as a :class:`Vector` or a :class:`~stcal.geometry.least_squares.PoseStack`."""
 
-    dim: int  # number of unknowns of a member
+    @property
+    def dim(self) -> int:
+        """Number of unknowns of a member."""
+        ...
 
     def __len__(self) -> int:
         """Return the number of members."""
@@ -53,7 +56,7 @@ class Vector:
     array: np.ndarray
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of unknowns of a member."""
         return self.array.shape[1]
 
@@ -259,12 +262,14 @@ class Adjustment:
         minimum = self.minimum(values, **options).required("adjustment", "give a better start, or fewer unknowns")
         return minimum.linear
 
-    def minimum(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Minimum[dict[str, Any], Solution]":
+    def minimum(
+        self, values: Mapping[str, Any] | None = None, settled: float = SETTLED, **options: Any
+    ) -> "Minimum[dict[str, Any], Solution]":
         """Return where the descent ended, with the solution there as ``linear``."""
         begin = {block.name: block.start for block in self.blocks} if values is None else dict(values)
         if not np.isfinite(self.cost(begin)):
             raise InputError("E-OPTION-RANGE", "adjustment: a residual is not finite at the start; start elsewhere")
-        return minimise(begin, self.at, self.moved, cost=self.cost, **{"settled": SETTLED} | options)
+        return minimise(begin, self.at, self.moved, cost=self.cost, settled=settled, **options)
 
     def cost(self, values: Mapping[str, Any]) -> float:
         """Return the cost of a state, in σ²; infinite where a residual is not finite."""
@@ -307,9 +312,13 @@ class Solution:
     problem: Adjustment
     values: dict[str, Any]
 
-    @cached_property
+    @property
     def cost(self) -> float:
         """Cost of the state, in σ²."""
+        return self._cost
+
+    @cached_property
+    def _cost(self) -> float:
         return sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in self.rows) + sum(
             prior.cost(self.values) for prior in self.problem.priors
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -217,7 +217,6 @@ class PoseStack:
         Translations.
     """
 
-    dim: ClassVar[int] = 6
     rotation: np.ndarray
     translation: np.ndarray
 
@@ -225,6 +224,11 @@ class PoseStack:
     def of(cls, *poses: Rigid) -> "PoseStack":
         """Return the stack of single poses."""
         return cls(np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
+
+    @property
+    def dim(self) -> int:
+        """Number of unknowns of a pose."""
+        return 6
 
     def rigid(self, row: int) -> Rigid:
         """Return the pose of one row."""

@@ -190,7 +190,8 @@ LENS, DOTS = 0, 1
 
 def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
     """Returns the adjustment of all boards from a state, and its unknowns there."""
-    parts, values, first = [], {"lens": Vector(setting.away(state.camera)[None])}, 0
+    parts, first = [], 0
+    values: dict[str, Any] = {"lens": Vector(setting.away(state.camera)[None])}
     for model in state.models:
         a, board = Adjustment(), setting.boards[model.group]
         values[POSES + model.group] = PoseStack.of(*model.camera_from_model)
