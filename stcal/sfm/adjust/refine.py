@@ -3,15 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.linalg import LinAlgError
-from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
+from stcal.adjust.engine import Adjustment, Vector
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import minimise
-from stcal.geometry.normal_equations import blocks_of, reduce
+from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset, fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import robust_sigma
@@ -34,24 +32,38 @@ def adjust(model: M, camera: Camera) -> M:
             f"group {model.group}: no two images have {MIN_POINTS} circles or corners in common; add images, until two "
             "show each face beside a neighbour",
         )
-    minimum = minimise(
-        model,
-        lambda state: _Normal.of(state, camera),
-        _moved,
-        cost=lambda state: _cost(state, camera),
-        damping=DAMPING,
-        least_damping=DAMPING,
-        settled=EXACTLY,
-        max_steps=MAX_STEPS,
+    a, poses = Adjustment(), PoseStack.of(*model.camera_from_model)
+    few = 2 * len(model.images) <= len(model.labels)  # the larger part of the unknowns is eliminated
+    cameras = a.block("poses", poses, eliminate=not few)
+    points = a.block("points", Vector(model.xyz_model), eliminate=few)
+    a.factor(
+        lambda poses, points: off_px(placed(model, poses, points), camera),
+        [(cameras, model.image_index), (points, model.point_index)],
+        derivatives=lambda poses, points: projection_jacobians(placed(model, poses, points), camera),
+        root=whitening(model),
     )
     remedy = "check the camera file, and the sizes of printed faces in target.toml"
-    return minimum.required(f"group {model.group}: bundle adjustment", remedy).state
+    minimum = a.minimum(damping=DAMPING, least_damping=DAMPING, settled=EXACTLY, max_steps=MAX_STEPS)
+    values = minimum.required(f"group {model.group}: bundle adjustment", remedy).state
+    return placed(model, values["poses"], values["points"])
 
 
-def _cost(model: GroupModel, camera: Camera) -> float:
+def placed(model: M, poses: PoseStack, points: Vector) -> M:
+    """Returns the model with these poses and points."""
+    rigid = tuple(poses.rigid(i) for i in range(len(poses)))
+    return replace(model, camera_from_model=rigid, xyz_model=points.array)
+
+
+def off_px(model: GroupModel, camera: Camera) -> np.ndarray:
+    """Returns projected minus measured centres (n, 2); infinite where a point lies behind its camera."""
     if (model.xyz_camera()[:, 2] <= 0).any():
-        return np.inf
-    return float((model.whiten(model.residuals_px(camera)) ** 2).sum())
+        return np.full((len(model.image_index), 2), np.inf)
+    return -model.residuals_px(camera)
+
+
+def whitening(model: GroupModel) -> np.ndarray:
+    """Returns the matrices (n, 2, 2) that whiten the observations."""
+    return model.whiten(np.tile(np.eye(2), (len(model.image_index), 1, 1)))
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -66,51 +78,6 @@ def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray,
     return by_pose, by_camera @ rotation
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Normal:
-    """Normal equations of m poses and p points, and their ``cross`` blocks (m, p, 6, 3)."""
-
-    cost: float
-    poses: np.ndarray
-    pose_right: np.ndarray
-    points: np.ndarray
-    point_right: np.ndarray
-    cross: np.ndarray
-
-    @classmethod
-    def of(cls, model: GroupModel, camera: Camera) -> "_Normal":
-        by_pose, by_point = (model.whiten(derivative) for derivative in projection_jacobians(model, camera))
-        residual = model.whiten(model.residuals_px(camera))
-        m, p = len(model.images), len(model.labels)
-        cross = np.zeros((m, p, 6, 3))
-        cross[model.image_index, model.point_index] = np.swapaxes(by_pose, 1, 2) @ by_point
-        return cls(
-            _cost(model, camera),
-            *blocks_of(by_pose, residual, model.image_index, m),
-            *blocks_of(by_point, residual, model.point_index, p),
-            cross,
-        )
-
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step (6m + 3p,) of poses, then points, and its gain; the larger of both sets is eliminated."""
-        poses, points = (block + damping * block * np.eye(block.shape[1]) for block in (self.poses, self.points))
-        if self.poses.size // 6 <= self.points.size // 3:
-            pose_step, point_step = _solve(poses, self.pose_right, points, self.point_right, self.cross)
-        else:
-            cross = self.cross.transpose(1, 0, 3, 2)
-            point_step, pose_step = _solve(points, self.point_right, poses, self.pose_right, cross)
-        gain = float((pose_step * self.pose_right).sum() + (point_step * self.point_right).sum())
-        return np.concatenate([pose_step.ravel(), point_step.ravel()]), gain
-
-
-def _moved(model: M, step: np.ndarray) -> M:
-    """Returns the model after steps of its poses and points."""
-    poses, points = step[: 6 * len(model.images)].reshape(-1, 6), step[6 * len(model.images) :].reshape(-1, 3)
-    return replace(
-        model, camera_from_model=moved_poses(model.camera_from_model, poses), xyz_model=model.xyz_model + points
-    )
-
-
 def moved_poses(poses: tuple[Rigid, ...], step: np.ndarray) -> tuple[Rigid, ...]:
     """Returns poses after left perturbations (m, 6)."""
     turned = Rotation.from_rotvec(step[:, :3]).as_matrix()
@@ -118,24 +85,6 @@ def moved_poses(poses: tuple[Rigid, ...], step: np.ndarray) -> tuple[Rigid, ...]
         Rigid(turn @ pose.rotation, pose.translation + shift)
         for turn, pose, shift in zip(turned, poses, step[:, 3:], strict=True)
     )
-
-
-def _solve(kept, kept_right, dropped, dropped_right, cross) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the steps of the kept blocks (a, i) and of the eliminated ones (b, j); ``cross`` : (a, b, i, j)."""
-    a, b, i, j = cross.shape
-    reduction = reduce(dropped, dropped_right, cross.transpose(1, 3, 0, 2).reshape(b, j, a * i))
-    normal = -reduction.normal
-    normal.reshape(a, i, a, i)[np.arange(a), :, np.arange(a)] += kept
-    step = _solve_symmetric(normal, kept_right.ravel() - reduction.right)
-    return step.reshape(a, i), reduction.back(step)
-
-
-def _solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solves by Cholesky decomposition if the damping permits it; else returns the shortest solution."""
-    try:
-        return cho_solve(cho_factor(matrix), right)
-    except LinAlgError:
-        return np.linalg.lstsq(matrix, right, rcond=1e-14)[0]
 
 
 MAX_ROUNDS = 20

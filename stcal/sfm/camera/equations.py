@@ -14,7 +14,7 @@ from stcal.geometry.clusters import ByClusters
 from stcal.geometry.least_squares import PoseStack, minimise
 from stcal.geometry.print_modes import PrintModes
 from stcal.sfm.adjust.equations import image_cost, normalised
-from stcal.sfm.adjust.refine import projection_jacobians
+from stcal.sfm.adjust.refine import off_px, placed, projection_jacobians, whitening
 from stcal.sfm.data.model import MetricModel
 
 MAX_STEPS = 200
@@ -180,8 +180,8 @@ class Normal:
 
     def _state(self, values: Mapping[str, Any]) -> State:
         names = [model.group for model in self.models]
-        placed = [_placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
-        return State(tuple(placed), self.setting.camera(values["lens"].array[0]))
+        moved = [placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
+        return State(tuple(moved), self.setting.camera(values["lens"].array[0]))
 
 
 POSES, DOTS_OF = "poses of ", "dots of "
@@ -203,7 +203,7 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
             partial(_off, model, setting),
             [(lens, None), (dots, model.point_index), (poses, model.image_index)],
             derivatives=partial(_slopes, model, setting),
-            root=model.whiten(np.tile(np.eye(2), (len(model.image_index), 1, 1))),
+            root=whitening(model),
             cluster=first + model.image_index,
             loss=Huber(setting.huber),
         )
@@ -215,21 +215,12 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
     return Joined(parts, ("lens",)), values
 
 
-def _placed(model: MetricModel, poses: PoseStack, dots: Vector) -> MetricModel:
-    rigid = tuple(poses.rigid(i) for i in range(len(poses)))
-    return replace(model, camera_from_model=rigid, xyz_model=dots.array)
-
-
 def _off(model: MetricModel, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> np.ndarray:
-    """Returns projected minus measured dots (n, 2), px; infinite behind a camera, and for a lens that is none."""
-    moved, camera = _placed(model, poses, dots), setting.camera(lens.array[0])
-    if (moved.xyz_camera()[:, 2] <= 0).any():
-        return np.full((len(model.image_index), 2), np.inf)
-    return -moved.residuals_px(camera)
+    return off_px(placed(model, poses, dots), setting.camera(lens.array[0]))
 
 
 def _slopes(model: MetricModel, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> list[np.ndarray]:
-    moved, camera = _placed(model, poses, dots), setting.camera(lens.array[0])
+    moved, camera = placed(model, poses, dots), setting.camera(lens.array[0])
     by_pose, by_point = projection_jacobians(moved, camera)
     return [moved.by_parameters(camera) @ setting.basis, by_point, by_pose]
 
