@@ -8,6 +8,8 @@ import numpy as np
 from stcal.cross_validation import dealt
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import require_arguments
+from stcal.geometry.clusters import by_clusters
+from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.parallel import one_thread
@@ -77,6 +79,8 @@ OUTLIER_ROUNDS = 5
 """Largest number of rounds of leaving out gross errors; after 1 to 3 rounds the same ones are left out again."""
 MOSTLY_GOOD = 0.5
 """Smallest share of good observations; where fewer would be good, nothing is called an error."""
+SAME_DIGITS = 5
+"""Decimals, of rad or mm, to which joint values agree that are one place of the robot."""
 MOST_OF_IT = 0.5
 """Share of the squared residuals that a jump along the rows must explain to be named before parameters that stay
 open."""
@@ -416,12 +420,28 @@ def _covariance(adjusted: Adjustment, measured: Observed) -> np.ndarray:
     """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show."""
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
     if measured.kind != "distance":
-        return covariance
+        return _by_places(covariance, adjusted, measured)
     units = adjusted.solution.units
     blind = adjusted.solution.spectrum()[1][:, : unseen(measured.kind)]
     blind = np.pad(blind, ((0, len(units) - len(blind)), (0, 0)))
     projector = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
     return projector @ covariance @ projector.T
+
+
+def _by_places(covariance: np.ndarray, adjusted: Adjustment, measured: Observed) -> np.ndarray:
+    """Returns the covariance where joint values were measured several times: what the model lacks there is one error,
+    not several."""
+    rows = np.round(measured.data.q, SAME_DIGITS)
+    first, place = np.unique(rows, axis=0, return_inverse=True)
+    if len(first) == len(rows):
+        return covariance
+    solution, weighting = adjusted.solution, adjusted.weighting
+    root = np.sqrt(solution.weights)[:, None]
+    slope = root[..., None] * weighting.whiten(jacobian(solution.state, measured), measured)
+    information, pull = blocks_of(
+        slope, root * weighting.whiten(solution.residuals, measured), place.ravel(), len(first)
+    )
+    return by_clusters(np.linalg.inv(covariance), pull, information).covariance
 
 
 def _cross_validated(

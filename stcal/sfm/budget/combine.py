@@ -149,9 +149,11 @@ def budget(
     sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
     if own.circles_designed.shape[2]:
         sources += (_placed(own),)
-    rng = np.random.default_rng(0)
+    rng, joint = np.random.default_rng(0), found.joint
+    # Where photographs differ more than their pixels explain, it is they that are counted.
+    freedom = joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models)
     rows = [
-        _row(measurand, sources, own.designed_sigma_mm, found.joint.redundancy, rng)
+        _row(measurand, sources, own.designed_sigma_mm, freedom, rng)
         for measurand in measurands(found.joint, own, reference_face)
     ]
     views = tuple(_view(model) for model in found.joint.models)
@@ -206,7 +208,7 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
 
 
 def _row(
-    measurand: Measurand, sources: Sequence[Source], designed_sigma_mm: float, redundancy: int, rng: np.random.Generator
+    measurand: Measurand, sources: Sequence[Source], designed_sigma_mm: float, freedom: int, rng: np.random.Generator
 ) -> Row:
     covariances = {source.key: measurand.covariance(source, designed_sigma_mm) for source in sources}
     covariance = np.sum(list(covariances.values()), axis=0)
@@ -220,7 +222,7 @@ def _row(
         standard,
         COVERAGE_FACTOR * standard,
         _coverage(covariance, COVERAGE_FACTOR * standard, rng),
-        max(redundancy, 1) * (variance / estimated) ** 2 if estimated else np.inf,
+        max(freedom, 1) * (variance / estimated) ** 2 if estimated else np.inf,
     )
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.adjustment import jacobian, moved, observed, residuals, tips
+from stcal.robot.identification.adjustment import State, jacobian, moved, observed, residuals, tip_jacobian, tips
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.report import identified_report
 from stcal.robot.identification.result import Identified, IdentifyOptions
@@ -33,6 +33,26 @@ def simulated(seed: int, count: int, sigma_mm: float = 0.05, sigma_rad: float = 
     true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), tools)
     names = [targets[i % len(targets)] for i in range(count)]
     return true, measured(true, joint_vectors(true, count, rng), rng, sigma_mm, sigma_rad, names)
+
+
+@pytest.mark.slow
+def test_what_a_model_lacks_at_repeated_joint_values_counts_once():
+    """Forty places, four measurements at each with one error of 0.2 mm in common; taken for independent, the mean
+    squared error of new positions over the covariance is 5.3. Ten draws: 1 ± 0.15."""
+    squares = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        true, first = simulated(seed, 40, 0.2, 5e-4)
+        rows = np.repeat(np.arange(40), 4)
+        data = first[rows]
+        data = replace(data, positions=data.positions + rng.normal(0, 0.01, (160, 3)))
+        found, q = identify(mh80(), data, IdentifyOptions("position", folds=0)), joint_vectors(true, 50, rng)
+        at, motion = tip_jacobian(found.state, q, ("",) * 50, "position")
+        motion = motion[:, 3:, : len(found.names)]
+        covariance = motion @ found.covariance @ np.swapaxes(motion, 1, 2)
+        off = at.translation - tips(State(true.chain(), dict(true.tools)), q, ("",) * 50).translation
+        squares.append(np.einsum("mi,mi->m", off, np.linalg.solve(covariance, off[..., None])[..., 0]).mean() / 3)
+    assert 0.6 < np.mean(squares) < 1.6
 
 
 @pytest.mark.slow

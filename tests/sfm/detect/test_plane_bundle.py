@@ -4,7 +4,7 @@ import numpy as np
 
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.plane_bundle import PlaneBundle
+from stcal.sfm.detect.group_geometry import PlaneBundle
 
 FOCAL_PX = 1000.0
 GRID = np.array([[x, y, 0.0] for x in range(-40, 60, 20) for y in range(-40, 60, 20)])
