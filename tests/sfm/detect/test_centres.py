@@ -97,6 +97,21 @@ def exact(camera, circles):
     return camera.project(circle_image_offset(centre, normal, radius))
 
 
+@pytest.mark.parametrize("blur", [0.5, 1.2, 2.0])
+@pytest.mark.parametrize("radius", [6.0, 12.0])
+def test_light_that_slopes_across_a_disc_does_not_move_its_centre(radius, blur):
+    """0.6 % a pixel. Taken for the slope of the blurred disc, it moves the centre by its slope times the variance of
+    the blur: 0.0094 and 0.025 px at blurs of 1.2 and 2 px."""
+    camera, factor, middle = Camera(80, 80, [1400.0, 1400.0], [39.5, 39.5], np.zeros(8)), 8, np.array([39.7, 40.2])
+    y, x = (np.indices((80 * factor, 80 * factor)) + 0.5) / factor - 0.5
+    inside = np.hypot(x - middle[0], y - middle[1]) < radius
+    fine = cv2.GaussianBlur(30 + inside * 150 * (1 + 0.006 * (x - middle[0])), (0, 0), blur * factor)
+    image = fine.reshape(80, factor, 80, factor).mean((1, 3))
+    start = Ellipses(middle[None] + 0.15, radius * np.eye(2)[None], np.full(1, 100.0))
+    found = measure_centres(np.round(image).astype(np.uint8), camera, start, start)
+    assert abs(found.centre_px[0, 0] - middle[0]) < 0.003  # the fine grid leaves 0.002
+
+
 @pytest.mark.parametrize("bright", [True, False])
 def test_without_noise_the_centre_is_the_ideal_ellipses_centre(bright):
     """Quantisation to 1/8 px on the fine grid and 8 bit leave about 0.002 px, more on the
@@ -201,7 +216,7 @@ def half_dark(rng, radius, share, angle, noise=1.0):
 
 
 @pytest.mark.parametrize(
-    ("radius", "before_px"), [(8, 0.038), (14, 0.022), pytest.param(28, 0.007, marks=pytest.mark.slow)]
+    ("radius", "before_px"), [(8, 0.038), (14, 0.021), pytest.param(28, 0.007, marks=pytest.mark.slow)]
 )
 def test_a_half_that_is_darker_moves_no_centre(radius, before_px):
     """Halves darker by a tenth moved the centre by ``before_px`` at least when brightness was two planes; now what is

@@ -277,6 +277,13 @@ class Fits:
         planes = jacobian[:, 6:]
         planes[:, 0], planes[:, 1], planes[:, 2] = 1, x, y
         planes[:, 3], planes[:, 4], planes[:, 5] = inside, inside * x, inside * y
+        # A sloping disc that is blurred is not the slope of a blurred disc: ∫ x D = x (D*G) + s² ∂(D*G)/∂x.
+        edge = (
+            bell
+            * blur
+            / (slope_rho * np.float32(np.sqrt(2 * np.pi)) * self.radius[selection].astype(np.float32)[:, None])
+        )
+        planes[:, 4:6] -= edge[:, None] * gradient
         around = _around(a, b) if waves else np.zeros((len(active), 0, rho.shape[1]), np.float32)
         for k, within in enumerate(waves):
             planes[:, 6 + k * per_side : 6 + (k + 1) * per_side] = around * (inside if within else 1 - inside)[:, None]
