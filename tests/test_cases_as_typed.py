@@ -150,6 +150,8 @@ TYPED: dict[str, tuple[Typed, ...]] = {
             )
         ),
     ),
+    "sqlite": (Typed(INPUT, "E-CAMERA-UNREADABLE", ("no database of COLMAP", "cameras is no table")),) * 3,
+    "toml_dotted": (Typed(INPUT, "E-TOML-INVALID", ("a name of more than 60 parts",)),),
 }
 """By folder, each command of its ``cmd``."""
 
@@ -222,7 +224,7 @@ OPEN = set(
     csv_formula drawing_y_down he_drift_1.7mm he_franka_column_major he_mobile_planar_4dof
     he_scara_4dof_noise he_tcp_set_halfway isoluminant_circles keem_cube_folds live_rebinding
     loc_motion_blur_6px principal_point_outside pymp_left reg_million_pairs rob_orientation_by_controller
-    rob_ur5_file_for_ur5e ros_coefficients scale_distance_wrong sqlite tag_twice_single tags_mirrored toml_dotted
+    rob_ur5_file_for_ur5e ros_coefficients scale_distance_wrong tag_twice_single tags_mirrored
     video_rotation_180
     """,
     )

@@ -1,6 +1,5 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
-import tomllib
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -32,7 +31,7 @@ from stcal.io.design import BoardEntry, Count, Rings, Squares, board_design, boa
 from stcal.io.design import load_board as load_dots
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
-from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string, validated
+from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_of, toml_string, validated
 from stcal.lengths import Length, radius, require_millimetres, side, stated_unusual
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles", "hexagonal-circles")
@@ -361,7 +360,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
     """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither."""
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
-        return tomllib.loads(text)
+        return toml_of(text)
     except OSError as error:
         raise InputError("E-BOARD-UNREADABLE", f"board file {path}: {error.strerror or error}; {REMEDY}") from error
     except UnicodeDecodeError:

@@ -24,6 +24,11 @@ YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)
 """A line as YAML has it."""
 
 
+DEEPEST = 60
+DEEP = re.compile(rf"""(?:[\w"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}""")
+"""A dotted name of more parts than any table needs."""
+
+
 class Strict(BaseModel):
     """A model that refuses unknown keys."""
 
@@ -75,12 +80,19 @@ def validated(content: Any, model: type[M], where: str) -> M:
         raise first_mistake(error, where, top=model.model_fields) from error
 
 
+def toml_of(text: str) -> dict[str, Any]:
+    """Return the content of a TOML text; raises ValueError where it is none, or nested so deep that it fills memory."""
+    if DEEP.search(text):
+        raise ValueError(f"a name of more than {DEEPEST} parts")
+    return tomllib.loads(text)
+
+
 def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
     """Read and validate a TOML file; messages name the kind of file, ``what``, and the ``remedy`` for a missing one."""
     text = ""
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
-        content = tomllib.loads(text)
+        content = toml_of(text)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{what} {path}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits

@@ -132,6 +132,9 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         # Without its log a database is read as it stands: SQLite would write files beside it.
         how = "mode=ro" if _has_log(path) else "mode=ro&immutable=1"
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)) as database:
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_PARAMETERS)
+            if not database.execute(STORED_TABLE).fetchone():  # a view is a program, which may not end
+                raise sqlite3.DatabaseError("cameras is no table")
             rows = database.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
         cameras = {str(number): (NUMBERS[model], *rest) for number, model, *rest in rows}
         model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), str(path))]
@@ -149,6 +152,11 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {path}: no database of COLMAP ({reason}); check it"
         ) from error
+
+
+STORED_TABLE = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'cameras' AND sql NOT LIKE '%VIRTUAL%'"
+MOST_PARAMETERS = 100_000
+"""Most bytes of a value: of a camera's parameters there are some hundred."""
 
 
 def _has_log(path: Path) -> bool:
