@@ -100,7 +100,7 @@ def main() -> None:
     """The table of all sets."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "sets", nargs="*", default=["exact", "sample", "clean", "clutter", "white_block", "focus", "rim"]
+        "sets", nargs="*", default=["exact", "sample", "clean", "clutter", "white_block", "focus", "uneven", "rim"]
     )
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--runs", type=Path, help="keep the runs here")
