@@ -23,6 +23,8 @@ from stcal.geometry.robust import huber_cost, huber_weights
 
 STEP = 1e-6
 """Step of numerical derivatives, as a share of 1, or of the unknown's size where that is more."""
+HELD = 1e-14
+"""Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
 TINY = 1e-300
 
 
@@ -251,7 +253,9 @@ class Adjustment:
         self.factors.append(Factor(residuals, derivatives, ends, whiten, kind, cluster, loss or Huber()))
 
     def prior(self, block: Block, mean: np.ndarray, weight: np.ndarray) -> None:
-        """Add knowledge of a :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
+        """Add knowledge of a kept :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
+        if block.eliminate:
+            raise InputError("E-OPTION-COMBINATION", f"block {block.name}: eliminated, its prior must be a factor")
         self.priors.append(Prior(block, np.asarray(mean), np.asarray(weight)))
 
     def solve(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Solution":
@@ -367,7 +371,8 @@ class Solution:
         )
         normal[held], normal[:, held], right[held] = 0.0, 0.0, 0.0  # of priors
         normal[held, held] = 1.0
-        block[~block.any(axis=(1, 2))] = np.eye(a)  # members that are fixed, or without rows
+        own = np.einsum("mii->mi", block)
+        own[:] = np.where(own > 0, (1 + HELD) * own, 1.0)  # 1: fixed members, and what no row depends on
         return normal, right, block, block_right, cross
 
     @cached_property

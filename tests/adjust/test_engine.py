@@ -166,6 +166,8 @@ def test_mistakes_are_named():
         a.block("x", Vector(np.zeros((1, 1))))
     with pytest.raises(InputError, match="eliminated"):
         a.block("y", Vector(np.zeros((1, 1))), eliminate=True)
+    with pytest.raises(InputError, match="its prior must be a factor"):
+        a.prior(x, np.zeros((1, 1)), np.eye(1))
     a.factor(lambda v: 1 / v.array, [(x, None)])
     with pytest.raises(InputError, match="not finite at the start"):
         a.solve()
@@ -174,3 +176,15 @@ def test_mistakes_are_named():
     b.factor(lambda v: v.array - 1, [(y, None)])
     with pytest.raises(InputError, match="no factor has clusters"):
         b.solve().by_clusters(y)
+
+
+def test_a_member_that_its_rows_do_not_determine_stays():
+    a = Adjustment()
+    shift = a.block("shift", Vector(np.zeros((1, 1))))
+    points = a.block("points", Vector(np.zeros((3, 2))), eliminate=True)
+    x = np.array([1.0, 2.0, 3.0])
+    a.factor(lambda s, p: s.array + p.array[:, :1] - x[:, None], [(shift, None), (points, np.arange(3))], 0.1)
+    a.factor(lambda s: s.array - 1, [(shift, None)], 0.1)
+    found = a.solve().values
+    assert found["shift"].array == pytest.approx(1)
+    assert found["points"].array == pytest.approx(np.array([[0, 0], [1, 0], [2, 0]]), abs=1e-6)

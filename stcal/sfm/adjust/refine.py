@@ -1,6 +1,7 @@
 """Adjustment of one group: weighted bundle adjustment, alternating with the circles' eccentricity."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,10 +37,11 @@ def adjust(model: M, camera: Camera) -> M:
     few = 2 * len(model.images) <= len(model.labels)  # the larger part of the unknowns is eliminated
     cameras = a.block("poses", poses, eliminate=not few)
     points = a.block("points", Vector(model.xyz_model), eliminate=few)
+    at = lru_cache(maxsize=2)(partial(placed, model))
     a.factor(
-        lambda poses, points: off_px(placed(model, poses, points), camera),
+        lambda poses, points: off_px(at(poses, points), camera),
         [(cameras, model.image_index), (points, model.point_index)],
-        derivatives=lambda poses, points: projection_jacobians(placed(model, poses, points), camera),
+        derivatives=lambda poses, points: projection_jacobians(at(poses, points), camera),
         root=whitening(model),
     )
     remedy = "check the camera file, and the sizes of printed faces in target.toml"

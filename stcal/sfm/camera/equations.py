@@ -1,8 +1,8 @@
 """Normal equations of a camera calibration, with the places of the board's dots as unknowns."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -199,10 +199,11 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
         lens = a.block("lens", values["lens"])
         dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
         poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
+        at = lru_cache(maxsize=2)(partial(placed, model))
         a.factor(
-            partial(_off, model, setting),
+            partial(_off, at, setting),
             [(lens, None), (dots, model.point_index), (poses, model.image_index)],
-            derivatives=partial(_slopes, model, setting),
+            derivatives=partial(_slopes, at, setting),
             root=whitening(model),
             cluster=first + model.image_index,
             loss=Huber(setting.huber),
@@ -215,12 +216,15 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
     return Joined(parts, ("lens",)), values
 
 
-def _off(model: MetricModel, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> np.ndarray:
-    return off_px(placed(model, poses, dots), setting.camera(lens.array[0]))
+At = Callable[[PoseStack, Vector], MetricModel]
 
 
-def _slopes(model: MetricModel, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> list[np.ndarray]:
-    moved, camera = placed(model, poses, dots), setting.camera(lens.array[0])
+def _off(at: At, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> np.ndarray:
+    return off_px(at(poses, dots), setting.camera(lens.array[0]))
+
+
+def _slopes(at: At, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> list[np.ndarray]:
+    moved, camera = at(poses, dots), setting.camera(lens.array[0])
     by_pose, by_point = projection_jacobians(moved, camera)
     return [moved.by_parameters(camera) @ setting.basis, by_point, by_pose]
 
