@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stcal.report.svg import Axes, Drawing, Space, ticks
+from stcal.report.svg import Axes, Drawing, Space
 
 
 def written(drawing: Drawing) -> ElementTree.Element:
@@ -22,22 +22,6 @@ def test_any_name_can_be_written(name):
     drawing.words((0, 0), name)
     (text,) = written(drawing).iter("{http://www.w3.org/2000/svg}text")
     assert text.text == name.replace("\x07", "\ufffd").replace("\udcff", "\\udcff")
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "texts"),
-    [
-        (0, 0.17, ["0.00", "0.05", "0.10", "0.15"]),
-        (-20.7, 20.7, ["\N{MINUS SIGN}20", "\N{MINUS SIGN}10", "0", "10", "20"]),
-        (0, 5, ["0", "1", "2", "3", "4", "5"]),
-        (3, 3, []),
-        (0, np.nan, []),
-    ],
-)
-def test_ticks_are_round(low, high, texts):
-    values, words = ticks(low, high)
-    assert words == texts
-    assert all(low - 1e-9 <= value <= high + 1e-9 for value in values)
 
 
 def test_axes_hold_their_data():
