@@ -150,7 +150,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
             )
         ),
     ),
-    "sqlite": (Typed(INPUT, "E-CAMERA-UNREADABLE", ("no database of COLMAP", "cameras is no table")),) * 3,
+    "sqlite": (Typed(INPUT, "E-CAMERA-UNREADABLE", ("no database of COLMAP", "no such table: cameras")),) * 3,
     "toml_dotted": (Typed(INPUT, "E-TOML-INVALID", ("a name of more than 60 parts",)),),
 }
 """By folder, each command of its ``cmd``."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stcal.io.cameras.read import read_camera
+from tests.conftest import SAMPLE
 from tests.scripts import load_script
-from tests.support.test_degrade import SAMPLE
 
 study = load_script("envelope_study")
 DATA = study.read_set(SAMPLE, at_most=1)

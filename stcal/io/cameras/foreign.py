@@ -134,7 +134,7 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)) as database:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_PARAMETERS)
             if not database.execute(STORED_TABLE).fetchone():  # a view is a program, which may not end
-                raise sqlite3.DatabaseError("cameras is no table")
+                raise sqlite3.DatabaseError("no such table: cameras")
             rows = database.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
         cameras = {str(number): (NUMBERS[model], *rest) for number, model, *rest in rows}
         model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), str(path))]
