@@ -18,7 +18,7 @@ MIN_CIRCLES = 12
 """Smallest number of circles of an image for its law of blur, which has three parameters."""
 BY_CHANCE = 1e-6
 """Share of images with even blur of which a law is found by chance."""
-RESPONSE, RESPONSE_OF_BLUR2 = 0.54, 9.9
+RESPONSE, RESPONSE_OF_BLUR2 = 0.34, 6.2
 """Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
 square of the blur over the smaller radius. From circles of scenes that were rendered through points of a pupil and
 corrected as here. Half of it is a shift of the edges; the blur that fits show
