@@ -7,175 +7,25 @@ others alone.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from stcal.adjust.blocks import Block, Factor, Huber, Prior, Values, numbers
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, minimise
-from stcal.geometry.least_squares import PoseStack as PoseStack
 from stcal.geometry.normal_equations import Reduction, blocks_of, generalised_inverse, reduce
-from stcal.geometry.robust import huber_cost, huber_weights
 
-STEP = 1e-6
-"""Step of numerical derivatives, as a share of 1, or of the unknown's size where that is more."""
 HELD = 1e-14
 """Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
+LEFT = 1e-9
+"""Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 TINY = 1e-300
-
-
-class Values(Protocol):
-    """The members of a block, such as a :class:`Vector` or a :class:`~stcal.geometry.least_squares.PoseStack`."""
-
-    @property
-    def dim(self) -> int:
-        """Number of unknowns of a member."""
-        ...
-
-    def __len__(self) -> int:
-        """Return the number of members."""
-        ...
-
-    def moved(self, step: np.ndarray) -> Any:
-        """Return the members after steps (n, dim)."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Vector:
-    """Members without curvature.
-
-    Parameters
-    ----------
-    array : (n, dim) array
-        The members.
-    """
-
-    array: np.ndarray
-
-    @property
-    def dim(self) -> int:
-        """Number of unknowns of a member."""
-        return self.array.shape[1]
-
-    def __len__(self) -> int:
-        return len(self.array)
-
-    def moved(self, step: np.ndarray) -> "Vector":
-        """Return the members after steps (n, dim)."""
-        return Vector(self.array + step)
-
-
-@dataclass(frozen=True, slots=True)
-class Huber:
-    """Huber's loss of the lengths of rows over their σ.
-
-    Parameters
-    ----------
-    limit : float
-        Length up to which it is the square.
-    gross : float
-        Length beyond which it is constant, and the row has no weight.
-    """
-
-    limit: float = np.inf
-    gross: float = np.inf
-
-    def cost(self, length: np.ndarray) -> np.ndarray:
-        """Return the loss of lengths (r,)."""
-        return huber_cost(np.minimum(length, self.gross), self.limit)
-
-    def weight(self, length: np.ndarray) -> np.ndarray:
-        """Return the weights of lengths (r,)."""
-        return np.where(length > self.gross, 0.0, huber_weights(length, self.limit))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """A block of unknowns; to be had from :meth:`Adjustment.block`.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    start : Vector or PoseStack
-        Its n members at the start.
-    eliminate : bool
-        Whether it is eliminated.
-    fixed : (n,) bool array
-        Members that stay.
-    """
-
-    name: str
-    start: Values
-    eliminate: bool
-    fixed: np.ndarray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Factor:
-    """Rows of residuals; see :meth:`Adjustment.factor`."""
-
-    residuals: Callable[..., np.ndarray]
-    derivatives: Callable[..., Sequence[np.ndarray]] | None
-    on: tuple[tuple[Block, np.ndarray | None], ...]
-    root: np.ndarray
-    kind: str
-    cluster: np.ndarray | None
-    loss: Huber
-    order: dict[tuple[int, int], Any] = field(default_factory=dict)  # in which products are summed, by pair of blocks
-
-    def white(self, values: Mapping[str, Any], sigma: float) -> np.ndarray:
-        """Return the residuals (r, w) over their σ."""
-        raw = np.asarray(self.residuals(*(values[block.name] for block, _ in self.on)))
-        return self._whitened(raw, sigma)
-
-    def slopes(self, values: Mapping[str, Any], sigma: float) -> list[np.ndarray]:
-        """Return the derivatives (r, w, dim) of the residuals over σ, by each block."""
-        own = [values[block.name] for block, _ in self.on]
-        raw = self.derivatives(*own) if self.derivatives else self._numerical(own)
-        return [self._whitened(np.asarray(each), sigma) for each in raw]
-
-    def _whitened(self, raw: np.ndarray, sigma: float) -> np.ndarray:
-        if self.root.ndim < 3:
-            return raw * (self.root / sigma).reshape(*self.root.shape, *[1] * (raw.ndim - self.root.ndim))
-        return (self.root @ (raw if raw.ndim == 3 else raw[..., None])).reshape(raw.shape) / sigma
-
-    def _numerical(self, own: list[Any]) -> list[np.ndarray]:
-        """Return central differences: a row depends on one member, so that all members are moved at once."""
-        found = []
-        for i, values in enumerate(own):
-            columns = []
-            size = np.abs(values.array).max(initial=1.0) if isinstance(values, Vector) else 1.0
-            for k in range(values.dim):
-                step = np.zeros((len(values), values.dim))
-                step[:, k] = STEP * size
-                ends = [self.residuals(*own[:i], values.moved(s), *own[i + 1 :]) for s in (step, -step)]
-                columns.append((ends[0] - ends[1]) / (2 * STEP * size))
-            found.append(np.stack(columns, axis=-1))
-        return found
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prior:
-    """Knowledge of the members of a :class:`Vector` block: ``mean`` (n, dim), and inverse covariance (n·dim, n·dim)."""
-
-    block: Block
-    mean: np.ndarray
-    weight: np.ndarray
-
-    def away(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Return the members minus their mean, (n·dim,)."""
-        return (values[self.block.name].array - self.mean).ravel()
-
-    def cost(self, values: Mapping[str, Any]) -> float:
-        """Return the cost, in σ²."""
-        away = self.away(values)
-        return float(away @ self.weight @ away)
 
 
 @dataclass(eq=False)
@@ -404,7 +254,7 @@ class Solution:
 
     @cached_property
     def inverse(self) -> np.ndarray:
-        """Covariance (k, k) of the kept unknowns, of independent errors; directions that nothing determines are 0."""
+        """Covariance (k, k) of the kept unknowns, of independent errors; the pseudo-inverse of a singular matrix."""
         try:
             found = np.linalg.inv(self.normal)
         except LinAlgError:
@@ -440,7 +290,7 @@ class Solution:
         for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
             if block.eliminate:
                 by = -(self.reduction.from_kept @ along)
-                total += slope @ by[_numbers(index, slope)]
+                total += slope @ by[numbers(index, slope)]
             else:
                 by = along[self.places[block.name]].reshape(len(block.start), block.start.dim, -1)
                 total += slope @ (by[0] if index is None else by[index])
@@ -448,16 +298,27 @@ class Solution:
 
     def without(self, cluster: int) -> dict[str, Any]:
         """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""
-        normal, right = self.normal.copy(), self.right.copy()
+        dropped = self.reduction.step.shape
+        totals, slopes, residuals = [], [], []
         for rows in self.rows:
-            if rows.factor.cluster is None:
+            if rows.factor.cluster is None or not (own := rows.factor.cluster == cluster).any():
                 continue
-            own = rows.factor.cluster == cluster
-            total = self._total(rows, np.eye(self.kept))[own].reshape(-1, self.kept)
-            normal -= total.T @ total
-            right += total.T @ rows.residual[own].ravel()
-        kept = generalised_inverse(normal) @ right
-        return self.problem.moved(self.values, np.concatenate([kept, self.reduction.back(kept).ravel()]))
+            totals.append(self._total(rows, np.eye(self.kept))[own].reshape(-1, self.kept))
+            residuals.append(rows.residual[own].ravel())
+            by_dropped = np.zeros((*rows.residual[own].shape, *dropped))
+            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+                if block.eliminate:
+                    by_dropped[np.arange(own.sum()), :, numbers(index, slope)[own]] = slope[own]
+            slopes.append(by_dropped.reshape(residuals[-1].size, *dropped))
+        if not totals:
+            raise InputError("E-OPTION-NEEDS", f"adjustment: no row of cluster {cluster}; give one that factors have")
+        total, slope, residual = (np.concatenate(each) for each in (totals, slopes, residuals))
+        solved = np.einsum("mab,rmb->rma", self.reduction.inverse, slope)
+        taken = total @ self.inverse @ total.T + np.einsum("rma,sma->rs", slope, solved)
+        pull = np.linalg.lstsq(np.eye(len(residual)) - taken, residual, rcond=LEFT)[0]
+        kept = self.inverse @ (total.T @ pull)
+        away = np.einsum("rma,r->ma", solved, pull) - self.reduction.from_kept @ kept
+        return self.problem.moved(self.values, np.concatenate([kept, away.ravel()]))
 
     def redundancy(self, kind: str | None = None) -> float:
         """Return the redundancy of the rows of one kind, or of all."""
@@ -468,7 +329,7 @@ class Solution:
                 taken = float(((total @ self.inverse) * total).sum())
                 for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
                     if block.eliminate:
-                        inverse = self.reduction.inverse[_numbers(index, slope)]
+                        inverse = self.reduction.inverse[numbers(index, slope)]
                         taken += float(((slope @ inverse) * slope).sum())
                 left += rows.residual.shape[1] * np.count_nonzero(rows.weight) - taken
         return left
@@ -497,7 +358,7 @@ class Solution:
             mixed += np.einsum("rwp,rwk->pk", own, self._total(rows, np.eye(self.kept)))
             for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
                 if block.eliminate:
-                    np.add.at(by_dropped, _numbers(index, slope), np.swapaxes(slope, 1, 2) @ own)
+                    np.add.at(by_dropped, numbers(index, slope), np.swapaxes(slope, 1, 2) @ own)
         normal -= np.einsum("map,mab,mbq->pq", by_dropped, inverse, by_dropped)
         return normal - mixed @ self.inverse @ mixed.T, right - mixed @ (self.inverse @ self.right)
 
@@ -543,10 +404,6 @@ class Joined:
     def cost(self, values: Mapping[str, Any]) -> float:
         """Return the cost of a state, in σ²."""
         return sum(part.cost(values) for part in self.parts)
-
-    def start(self) -> dict[str, Any]:
-        """Return the state at the start of all blocks."""
-        return {block.name: block.start for part in self.parts for block in part.blocks}
 
     def moved(self, values: Mapping[str, Any], step: np.ndarray) -> dict[str, Any]:
         """Return the state after the steps of all parts, one after the other; shared blocks stand in each."""
@@ -627,10 +484,8 @@ class JoinedSolution:
             by = reduction.from_kept[0]
             mixed = -by @ self.inverse
             covariance = np.block([[self.inverse, mixed.T], [mixed, reduction.inverse[0] - mixed @ by.T]])
-            solution = Solution(part.problem, part.values)
-            vars(solution).update(rows=part.rows, _equations=part._equations, reduction=part.reduction)
-            vars(solution)["inverse"] = covariance
-            found.append(solution)
+            found.append(copy(part))
+            vars(found[-1])["inverse"] = covariance  # what its cached property would compute of the part alone
         return tuple(found)
 
     def by_clusters(self, block: Block) -> ByClusters:
@@ -664,7 +519,7 @@ class Rows:
         slopes = [each * root[:, None, None] for each in factor.slopes(solution.values, sigma)]
         for (block, members), slope in zip(factor.on, slopes, strict=True):
             if block.fixed.any():
-                slope[block.fixed[_numbers(members, slope)]] = 0.0
+                slope[block.fixed[numbers(members, slope)]] = 0.0
         places = tuple(solution.places.get(block.name) for block, _ in factor.on)
         return cls(factor, places, slopes, white * root[:, None], length, weight)
 
@@ -674,7 +529,7 @@ class Rows:
         mixed = cross.reshape(-1, cross.shape[2])
         ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
         for i, ((own, members), place, slope) in enumerate(ends):
-            square, pull = blocks_of(slope, -self.residual, _numbers(members, slope), len(own.start))
+            square, pull = blocks_of(slope, -self.residual, numbers(members, slope), len(own.start))
             if place is None:
                 block += square
                 block_right += pull
@@ -705,7 +560,7 @@ class Rows:
             none = np.zeros(1, int)
             return (none, none), np.tensordot(one, two, ((0, 1), (0, 1)))[None]
         if (i, j) not in self.factor.order:
-            first, second = _numbers(members, one), _numbers(others, two)
+            first, second = numbers(members, one), numbers(others, two)
             pair = first * (second.max(initial=0) + 1) + second
             order = np.argsort(pair, kind="stable")
             starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
@@ -713,11 +568,6 @@ class Rows:
         order, starts, pairs = self.factor.order[i, j]
         products = np.swapaxes(one, 1, 2) @ two
         return pairs, np.add.reduceat(products[order], starts, axis=0) if len(order) else products
-
-
-def _numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
-    """Return the member (r,) of each row."""
-    return np.zeros(len(slope), int) if members is None else members
 
 
 def _unknowns(place: slice | None, members: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.optimize import root_scalar
 
-from stcal.adjust.engine import Adjustment, Huber, Solution, Vector
+from stcal.adjust.blocks import Huber, Vector
+from stcal.adjust.engine import Adjustment, Solution
 from stcal.boards.design import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags

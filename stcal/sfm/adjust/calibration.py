@@ -20,10 +20,9 @@ from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, 
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.network import free_network
-from stcal.sfm.adjust.photographs import with_differences
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
-from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of
+from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of, with_differences
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
 FLATNESS_MM = 0.02

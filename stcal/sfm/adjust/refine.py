@@ -6,7 +6,8 @@ from functools import lru_cache, partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.adjust.engine import Adjustment, Vector
+from stcal.adjust.blocks import Vector
+from stcal.adjust.engine import Adjustment
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from stcal.adjust.engine import Adjustment, Block, Huber, Joined, JoinedSolution, Vector
+from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
 from stcal.geometry.clusters import ByClusters

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stcal.adjust.engine import Adjustment, Huber
+from stcal.adjust.blocks import Huber
+from stcal.adjust.engine import Adjustment
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.rigid import Rigid, skew

@@ -40,8 +40,8 @@ from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
-from stcal.sfm.adjust.photographs import with_differences
 from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.adjust.uncertainty import with_differences
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
