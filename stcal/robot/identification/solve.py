@@ -81,6 +81,7 @@ MOSTLY_GOOD = 0.5
 """Smallest share of good observations; where fewer would be good, nothing is called an error."""
 SAME_DIGITS = 5
 """Decimals, of rad or mm, to which joint values agree that are one place of the robot."""
+REPEATED = "joint values were measured several times: what the model lacks there counts once in σ"
 MOST_OF_IT = 0.5
 """Share of the squared residuals that a jump along the rows must explain to be named before parameters that stay
 open."""
@@ -180,6 +181,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         notes=data.notes
         + adjusted.rows.notes(identified)
         + adjusted.notes
+        + ((REPEATED,) if _places(observations) is not None else ())
         + doubts(prediction, observations, solution.units[named], covariance, names, tested)
         + tuple(each.sentence() for each in findings or ())
         + remarks
@@ -428,20 +430,25 @@ def _covariance(adjusted: Adjustment, measured: Observed) -> np.ndarray:
     return projector @ covariance @ projector.T
 
 
+def _places(measured: Observed) -> np.ndarray | None:
+    """Returns the number (r,) of the joint values of each row; None if no values are repeated, and for distances."""
+    rows = np.round(measured.data.q, SAME_DIGITS)
+    first, place = np.unique(rows, axis=0, return_inverse=True)
+    return None if measured.kind == "distance" or len(first) == len(rows) else place.ravel()
+
+
 def _by_places(covariance: np.ndarray, adjusted: Adjustment, measured: Observed) -> np.ndarray:
     """Returns the covariance where joint values were measured several times: what the model lacks there is one error,
     not several."""
-    rows = np.round(measured.data.q, SAME_DIGITS)
-    first, place = np.unique(rows, axis=0, return_inverse=True)
-    if len(first) == len(rows):
+    place = _places(measured)
+    if place is None:
         return covariance
-    solution, weighting = adjusted.solution, adjusted.weighting
-    root = np.sqrt(solution.weights)[:, None]
-    slope = root[..., None] * weighting.whiten(jacobian(solution.state, measured), measured)
-    information, pull = blocks_of(
-        slope, root * weighting.whiten(solution.residuals, measured), place.ravel(), len(first)
-    )
-    return by_clusters(np.linalg.inv(covariance), pull, information).covariance
+    solution, whiten = adjusted.solution, adjusted.weighting.whiten
+    sigma, root = np.sqrt(np.diag(covariance)), np.sqrt(solution.weights)[:, None]
+    slope = root[..., None] * whiten(jacobian(solution.state, measured), measured) * sigma
+    information, pull = blocks_of(slope, root * whiten(solution.residuals, measured), place, place.max() + 1)
+    clusters = by_clusters(np.linalg.inv(covariance / sigma[:, None] / sigma), pull, information)
+    return covariance + (clusters.covariance - clusters.independent) * sigma[:, None] * sigma
 
 
 def _cross_validated(

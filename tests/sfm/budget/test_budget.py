@@ -12,13 +12,14 @@ from stcal.errors import StcalError
 from stcal.io.design import board_toml, load_board
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
+from stcal.sfm.budget import combine
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.file import BudgetFile, _unusual
 from stcal.sfm.budget.lengths import against_stated
 from stcal.sfm.budget.page import budget_report
 from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
-from stcal.sfm.runs.saved import verify
+from stcal.sfm.runs.saved import adjusted_run, verify
 from stcal.sfm.runs.transaction import MarkerFile
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy, unsealed_copy
@@ -60,6 +61,15 @@ def test_with_nothing_stated_it_is_the_runs_own_covariance(saved, plain):
         for row in plain.of_kind(kind):
             own = saved.faces.target_from_face_covariance[row.measurand.name][part, part]
             np.testing.assert_allclose(row.covariance, own, rtol=0, atol=1e-3 * np.abs(own).max())
+
+
+def test_photographs_that_differ_are_what_is_counted(saved, plain, monkeypatch):
+    own = adjusted_run(saved)
+    monkeypatch.setattr(combine, "adjusted_run", lambda _: replace(own, state=replace(own.state, differ=3.0)))
+    told, images = budget_of_run(saved), sum(len(model.images) for model in plain.joint.models)
+    for before, after in zip(plain.rows, told.rows, strict=True):
+        assert before.standard < after.standard <= 3 * before.standard
+        assert images <= after.freedom < before.freedom
 
 
 def test_contributions_add_up_as_squares(plain):

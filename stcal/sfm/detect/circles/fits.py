@@ -277,7 +277,7 @@ class Fits:
         planes = jacobian[:, 6:]
         planes[:, 0], planes[:, 1], planes[:, 2] = 1, x, y
         planes[:, 3], planes[:, 4], planes[:, 5] = inside, inside * x, inside * y
-        # A sloping disc that is blurred is not the slope of a blurred disc: ∫ x D = x (D*G) + s² ∂(D*G)/∂x.
+        # A slope that is blurred with its disc: of x D, blurred by G of variance s², there is x (D∗G) + s² ∂(D∗G)/∂x.
         edge = (
             bell
             * blur
