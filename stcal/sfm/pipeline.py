@@ -30,7 +30,7 @@ from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
-from stcal.sfm.checks.suite import run_checks
+from stcal.sfm.checks.suite import run_checks, shows_rim
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
@@ -199,6 +199,9 @@ def run_on_files(
         if options.compare and result.target.target_from_face and model is not None:
             result = replace(result, comparison=compare_with_paper(result, _published(task, model)))
         evidence = result.evidence(camera_prior(result.camera))
+        if options.rim is None:
+            result = replace(result, options=replace(result.options, rim=shows_rim(evidence)))
+            evidence = replace(evidence, rim=bool(result.options.rim))
         is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
         if is_misfit and result.camera_given and not options.refine_camera:
             evidence = replace(evidence, cause=wrong_file(result.observations(), result.camera, result.board_design))

@@ -107,6 +107,7 @@ def defocused(
     camera: Camera,
     lens: ThinLens,
     blur_px: float,
+    light: np.ndarray | None = None,
 ) -> np.ndarray:
     """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens.
 
@@ -121,6 +122,7 @@ def defocused(
     normal : (3,) normal of the planes, camera frame
     corner_px : pixel (x, y) in the corner of the images
     blur_px : σ of the Gaussian blur that follows, which decides how many points of the lens are taken
+    light : (h, w) light of the disc on the last plane; even if None
 
     The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion.
     """
@@ -145,7 +147,8 @@ def defocused(
     mean = np.zeros_like(shares[0])
     for i, weight in enumerate(weights):
         seen = [_moved(share, maps[i]) for share, maps in zip(shares, moves, strict=True)]
-        mean += np.float32(weight) * (seen[0] if len(seen) == 1 else np.minimum(*seen))
+        share = seen[0] if len(seen) == 1 else np.minimum(*seen)
+        mean += np.float32(weight) * (share if light is None else share * _moved(light, moves[-1][i]))
     return mean
 
 

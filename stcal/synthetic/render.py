@@ -282,6 +282,10 @@ class RenderOptions:
         part of a disc that a camera sees through the hole's upper edge. A negative value raises the disc by that
         height: its top shines, its wall is dark, and the circle simply lies higher. The stated true circles stay where
         the face is. Dots of the board have the rims that its design states.
+    slope : float
+        Fraction by which the light of each disc of the faces rises from one side to the other, along x of its face.
+    fade : float
+        Fraction of its light that each disc of the faces lacks at its edge; the loss grows with the squared radius.
     """
 
     noise: float = 0.01
@@ -296,10 +300,12 @@ class RenderOptions:
     seed: int = 0
     lens: ThinLens | None = None
     rim_mm: float = 0.0
+    slope: float = 0.0
+    fade: float = 0.0
 
     def __post_init__(self):
         require_fields(self, "rendering", seed=0)
-        for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure"):
+        for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure", "slope", "fade"):
             if getattr(self, name) < 0:
                 raise InputError(
                     "E-SIMULATE-OPTIONS", f"rendering: {name} {getattr(self, name):g}, zero or more needed"
@@ -357,7 +363,12 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
         circles = together(circles, circles.select(holes).smaller(HOLE_SHARE))
         levels = np.append(levels, 2 * plate - levels[holes])
         rim_mm = np.append(rim_mm, np.minimum(rim_mm[holes], 0))
-    picture = _add_circles(picture, scene.camera, circles, levels, rim_mm, options)
+    turn = scene.groups[group].camera_from_target[image].rotation
+    slopes = np.zeros((len(levels), 3))  # of the discs' light, camera frame; none of dots and of holes
+    for i, label in enumerate(circles.labels):
+        if not isinstance(label, DotLabel):
+            slopes[i] = turn @ scene.target_from_face[label.face].rotation[:, 0]
+    picture = _add_circles(picture, scene.camera, circles, levels, rim_mm, slopes, options)
     return _expose(picture, options, rng)
 
 
@@ -373,6 +384,7 @@ def _add_circles(
     circles: ImageCircles,
     levels: np.ndarray,
     rim_mm: np.ndarray,
+    slopes: np.ndarray,
     options: RenderOptions,
 ) -> np.ndarray:
     """Blurs the picture and adds the circles, each blurred on a finer grid: by pixels, centres move by 0.004 px."""
@@ -391,10 +403,14 @@ def _add_circles(
         planes = [top[i]] if rim_mm[i] <= 0 else [top[i], top[i] + rim_mm[i] * normal]
         steep = circles.tilt_rad[i] > STEEP_RAD
         shares = [_fine_coverage(camera, (x0, y0, x1, y1), plane, normal, radius, steep=steep) for plane in planes]
+        own = None
+        if (options.slope or options.fade) and slopes[i].any():
+            own = _light_of_disc(camera, (x0, y0, x1, y1), planes[-1], normal, radius, slopes[i], options)
         if lens is not None and confusion[i] > SHARP_PX:
-            share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px)
+            share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px, own)
         else:
             share = shares[0] if len(shares) == 1 else np.minimum(*shares)
+            share = share if own is None else share * own
         if blur_px > 0:
             share = cv2.GaussianBlur(share, (0, 0), blur_px * FINE, borderType=cv2.BORDER_REPLICATE)
         share = share.reshape(y1 - y0, FINE, x1 - x0, FINE).mean((1, 3))
@@ -430,6 +446,20 @@ def _fine_coverage(
     share[:] = (outside <= 0)[..., None, None]
     share[rim] = cells_share.reshape(-1, FINE, SUBSAMPLES // FINE, FINE, SUBSAMPLES // FINE).mean((2, 4))
     return share.transpose(0, 2, 1, 3).reshape((y1 - y0) * FINE, (x1 - x0) * FINE)
+
+
+def _light_of_disc(
+    camera: Camera, box, centre: np.ndarray, normal: np.ndarray, radius: float, x: np.ndarray, options: RenderOptions
+) -> np.ndarray:
+    """Returns the light of a disc over its mean level on the squares of :func:`_fine_coverage`; ``x`` : unit vector."""
+    x0, y0, x1, y1 = box
+    ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
+    rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1)
+    place = (rays * ((normal @ centre) / (rays @ normal))[..., None] - centre) / radius
+    light = 1 + options.slope / 2 * np.clip(place @ x, -1.5, 1.5)
+    light -= options.fade * np.minimum((place**2).sum(-1), 1.5)
+    size = (FINE * (x1 - x0), FINE * (y1 - y0))
+    return cv2.resize(light.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
 
 
 def _relative_distance(xy: np.ndarray, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:

@@ -128,7 +128,10 @@ def test_centroids_move_by_half_the_gradient_of_the_variance(straight):
         box = (max(x0, 0), max(y0, 0), min(x1, dark.shape[1]), min(y1, dark.shape[0]))
         sharp, blurred = (
             _moments(
-                _add_circles(dark, straight.camera, one, none + 1, none, options)[box[1] : box[3], box[0] : box[2]], box
+                _add_circles(dark, straight.camera, one, none + 1, none, none[:, None], options)[
+                    box[1] : box[3], box[0] : box[2]
+                ],
+                box,
             )
             for options in (PLAIN, replace(PLAIN, lens=lens))
         )

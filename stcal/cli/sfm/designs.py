@@ -87,6 +87,9 @@ def simulate(
         "Set the height of rims in front of the faces' circles; with < 0 the circles are raised.",
         Opt("--rim-mm", min=-20, max=20),
     ] = 0.0,
+    slope: Annotated[
+        float, "Let the light of each circle of the faces rise by this fraction from side to side.", Opt(min=0, max=1)
+    ] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
         float | None,
@@ -140,6 +143,7 @@ def simulate(
     if target is not None and (body := body_of(target)).with_faces(printed=True).faces:
         others = {"--groups": groups, "--fisheye": fisheye, "--f-number": f_number, "--rim-mm": rim, "--board": board}
         others |= {
+            "--slope": slope,
             "--second-design": second_design,
             "--one-board": one_board,
             "--clutter": clutter,
@@ -169,6 +173,7 @@ def simulate(
         seed=seed,
         lens=_lens(scene, f_number, focus, focal, distance, camera),
         rim_mm=rim,
+        slope=slope,
     )
     with StageProgress() as progress:
         step = partial(progress, "render")

@@ -52,8 +52,11 @@ def run(
         bool, "Adjust the intrinsics too, starting from the given ones and weighted by their σ."
     ] = False,
     rim: Annotated[
-        bool, "Compute the height of rims in front of the circles, and give the faces of the surface behind them."
-    ] = False,
+        bool | None,
+        "Compute the height of rims in front of the circles, and give the faces of the surface behind them; if not given, "
+        "where the radii show a rim for certain.",
+        Opt("--rim/--no-rim"),
+    ] = None,
     board_only: Annotated[bool, "Use only the board, even if other circles are in view: λ and residuals."] = False,
     compare: Annotated[
         Literal["paper"] | None,

@@ -24,7 +24,13 @@ BLUR_SHARE_BY_TILT = 0.05
 """σ by which this share grows with the tangent of the tilt, which looks like a rim: it is 0.00 to 0.02 for circles that
 face the camera, 0.05 at 50° and 0.04 to 0.13 at 62° in rendered scenes (circles of 8 px and more)."""
 LEAST_SIGMA_MM = 0.003
-"""Smallest σ of a rim: what light that falls towards the edge of a circle adds."""
+"""Smallest σ of a rim: what else the light of a circle adds."""
+DOME_BY_TILT = 0.1
+"""The same of a dome's effect on radii, which is that of one step: of a quarter of the light, 0.1 px of a radius."""
+NARROW, NARROW_SIGMA, LEAST_DOME = 0.7, 2.0, 0.01
+"""Dome that the fit of an evenly lit disc finds, times (blur / narrowest radius)²; σ of that, which covers other forms of
+blur than a Gaussian (rendered sets: 0.06, 0.027, 0.01 at 3.5, 5, 7 blurs, and −0.05, −0.03 at 7, 10 out of focus); and
+the smallest σ of what all have in common."""
 HUBER = 2.0
 STEPS = 8
 
@@ -39,6 +45,8 @@ class RadiusViews:
     size_px: np.ndarray  # designed radius in the image
     blur_mm: np.ndarray  # correction of the radius for blur, which is in the ratio
     tan_tilt: np.ndarray  # of the angle between the normal and the line of sight
+    domes: np.ndarray  # (n, 2) by which share of its light each is brighter in the middle, and σ of that
+    by_dome_mm: np.ndarray  # by how much a dome of all its light makes it look smaller
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +70,7 @@ def radius_views(
     seen = [(images[name], model.keypoint[own]) for name, own in zip(model.images, rows, strict=True)]
     shape = np.concatenate([image.shape[keypoint] for image, keypoint in seen])
     blur = np.concatenate([image.blur_px[keypoint] for image, keypoint in seen])
+    domes = np.concatenate([image.domes[keypoint] for image, keypoint in seen])
     point = model.point_index[order]
     is_circle = np.array([label in design_mm for label in model.labels])[point]  # corners have no radius
     radius = np.array([design_mm.get(label, 1.0) for label in model.labels])[point]
@@ -75,6 +84,8 @@ def radius_views(
     measured = focal * np.sqrt(np.maximum(np.linalg.det(shape), 0))
     lost = np.divide(blur**2, 2 * measured, out=np.zeros_like(measured), where=measured > 0)
     cosine = np.abs((n * c).sum(1)) / np.linalg.norm(c, axis=1)
+    # Of the narrowest radius: the fit's own errors look like a dome.
+    narrow = np.divide(blur**2, cosine * size**2, out=np.zeros_like(size), where=blur > 0)
     return RadiusViews(
         point,
         radius,
@@ -82,6 +93,8 @@ def radius_views(
         size,
         lost / size * radius,
         np.sqrt(np.maximum(1 - cosine**2, 0)) / cosine,
+        np.column_stack([domes[:, 0] - NARROW * narrow, np.hypot(domes[:, 1], NARROW_SIGMA * narrow)]),
+        domes[:, 2] * radius,
     )
 
 
@@ -106,33 +119,56 @@ def find_rims(
         before += len(model.images)
         near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)  # not of corners, whose ratio is not a number
         for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
-            parts[kind].append((short[own], views.tan_tilt[own], views.design_mm[own], views.blur_mm[own], image[own]))
+            columns = (short, views.tan_tilt, views.design_mm, views.blur_mm, image, views.by_dome_mm, views.domes)
+            parts[kind].append(tuple(column[own] for column in columns))
     rims = {}
     for kind, found in parts.items():
-        short, tangent, radius, blur, image = (np.concatenate(values) for values in zip(*found, strict=True))
+        short, tangent, *others = (np.concatenate(values) for values in zip(*found, strict=True))
         if len(short) >= MIN_VIEWS and tangent.std() >= MIN_SPREAD:
-            rims[kind] = _rim(short, tangent, radius, blur, image)
+            rims[kind] = _rim(short, tangent, *others)
     return rims
 
 
-def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.ndarray, image: np.ndarray) -> Rim:
-    """Returns the rim from the radii's excess ``short`` (mm), with an offset of each radius and the share of blur left
-    in all. Circles of one ``image`` share exposure, focus and tilt: σ is at least that by whole images (Liang & Zeger
+def common_dome(domes: np.ndarray) -> tuple[float, float]:
+    """Returns the share of light by which all are brighter in the middle, and its σ, from those of each (n, 2)."""
+    share, sigma = domes[domes[:, 1] > 0].T
+    if not len(share):
+        return 0.0, LEAST_DOME
+    weight = 1 / sigma**2
+    return float(weight @ share / weight.sum()), float(weight @ sigma / weight.sum()) + LEAST_DOME
+
+
+def _rim(
+    short: np.ndarray,
+    tangent: np.ndarray,
+    radius: np.ndarray,
+    blur: np.ndarray,
+    image: np.ndarray,
+    by_dome: np.ndarray,
+    domes: np.ndarray,
+) -> Rim:
+    """Returns the rim from the radii's excess ``short`` (mm), with an offset of each radius, the share of blur left
+    in all, and the light that falls off towards the rim of all. Circles of one ``image`` share exposure, focus and tilt: σ is at least that by whole images (Liang & Zeger
     1986, Biometrika 73)."""
     _, kind = np.unique(radius, return_inverse=True)
-    rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -tangent / np.pi])
+    rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -by_dome, -tangent / np.pi])
+    dome, dome_sigma = common_dome(domes)
     height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)
     for _ in range(STEPS):
         right = short + lost_radius_mm(height, tangent, radius) - height * tangent / np.pi
         normal = (rows.T * weight) @ rows
-        normal[-2, -2] += (sigma / BLUR_SHARE) ** 2
+        pull = (rows.T * weight) @ right
+        normal[-3, -3] += (sigma / BLUR_SHARE) ** 2
+        normal[-2, -2] += (sigma / dome_sigma) ** 2
+        pull[-2] += (sigma / dome_sigma) ** 2 * dome
         inverse = np.linalg.pinv(normal, hermitian=True)
-        solution = inverse @ ((rows.T * weight) @ right)
+        solution = inverse @ pull
         height = float(solution[-1])
         length = np.abs(right - rows @ solution)
         sigma = float(robust_sigma(length, redundancy=max(1 - rows.shape[1] / len(rows), 0.1)))
         weight = huber_weights(length / max(sigma, 1e-9), HUBER)
-    by_tilt = BLUR_SHARE_BY_TILT * float((inverse @ ((rows.T * weight) @ (blur * tangent)))[-1])
+    left = np.hypot(BLUR_SHARE_BY_TILT * blur, DOME_BY_TILT * solution[-2] * by_dome) * tangent
+    by_tilt = float((inverse @ ((rows.T * weight) @ left))[-1])
     pull = (rows @ inverse[:, -1]) * weight * (right - rows @ solution)
     of_image = np.bincount(np.unique(image, return_inverse=True)[1], pull)
     by_image = float((of_image**2).sum()) * len(of_image) / max(len(of_image) - 1, 1)

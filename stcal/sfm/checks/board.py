@@ -14,7 +14,7 @@ from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
-from stcal.sfm.adjust.rims import Rim, lost_radius_mm, radius_views
+from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
 from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations
 
@@ -80,7 +80,8 @@ def measure_radii(
                 continue
             own = views.point_index == k
             hidden = lost_radius_mm(rim_mm.get(label, 0.0), views.tan_tilt[own], design_mm[label]) / design_mm[label]
-            ratio.setdefault(label, []).append(views.ratio[own] + hidden)
+            faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / design_mm[label]
+            ratio.setdefault(label, []).append(views.ratio[own] + hidden + faded)
             size.setdefault(label, []).append(views.size_px[own])
     return Radii(
         tuple(ratio),
@@ -127,9 +128,14 @@ KINDS = {"circles": ("circles of the faces", "the faces lie"), "dots": ("dots of
 """Name of each kind of circle, and what lies where its circles do."""
 
 
+def rim_limit_mm(rim: Rim, sigma_mm: float | None) -> float:
+    """Returns the height from which a rim is seen and moves the faces, whose positions are known to ``sigma_mm``."""
+    return max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
+
+
 def rim_check(
     rims: Mapping[str, Rim],
-    sigma_mm: float | None,  # largest σ of a face's position; a rim that moves the faces by less does no harm
+    sigma_mm: float | None,  # largest σ of a face's position
     allowed_mm: Mapping[str, float | None],  # the height that the result allows for; None: that estimated here
     has_circles: bool = True,
 ) -> Check:
@@ -141,7 +147,7 @@ def rim_check(
         return impossible(key, title, "too few different tilts of circles", "photograph faces from several angles")
     measured, names, reasons, settled = [], [], [], []
     for kind, rim in rims.items():
-        limit = max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
+        limit = rim_limit_mm(rim, sigma_mm)
         allowed = allowed_mm.get(kind, 0.0)
         beyond = 0.0 if allowed is None else rim.height_mm - allowed
         what, surface = KINDS[kind]
@@ -159,7 +165,7 @@ def rim_check(
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
         return Check(key, title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
     remedy = (
-        "faces are where their circles appear; for the luminous surface, run with --rim, or state rim_mm in "
+        "faces are where their circles appear; for the luminous surface, run without --no-rim, or state rim_mm in "
         "target.toml, of dots in board.toml"
     )
     return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)

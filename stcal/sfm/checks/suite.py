@@ -25,7 +25,15 @@ from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
-from stcal.sfm.checks.board import KINDS, board_checks, measure_radii, pitch_check, radius_checks, rim_check
+from stcal.sfm.checks.board import (
+    KINDS,
+    board_checks,
+    measure_radii,
+    pitch_check,
+    radius_checks,
+    rim_check,
+    rim_limit_mm,
+)
 from stcal.sfm.checks.causes import whole_set_cause
 from stcal.sfm.checks.faces import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
 from stcal.sfm.checks.images import (
@@ -101,6 +109,14 @@ def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, Mapping[str
     faces = list(evidence.target.rim_of().values())
     stated = {"circles": float(np.mean(faces)) if faces else 0.0, "dots": evidence.board.rim_mm}
     return rims, float(max(known)) if known else None, stated
+
+
+def shows_rim(evidence: Evidence) -> bool:
+    """Returns whether the radii of the faces' circles show for certain that they lie behind a rim that none stated."""
+    if evidence.calibration.joint is None or evidence.target.rim_of():
+        return False
+    rims, sigma_mm, _ = _rims(evidence)
+    return "circles" in rims and rims["circles"].height_mm > rim_limit_mm(rims["circles"], sigma_mm)
 
 
 def _before_circles_mm(evidence: Evidence, rims: Mapping[str, Rim], check: Check) -> dict[Label, float]:

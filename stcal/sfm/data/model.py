@@ -30,6 +30,7 @@ class ImageObservations:
     covariance_px2: np.ndarray  # (n, 2, 2) of ``centre_px``
     uneven_px: np.ndarray = None  # type: ignore[assignment]  # (n, 2) shift that uneven brightness would have caused
     blur_px: np.ndarray = None  # type: ignore[assignment]  # (n,) standard deviation across each rim, zero if unknown
+    domes: np.ndarray = None  # type: ignore[assignment]  # (n, 3) as of :class:`Centres`
 
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
@@ -41,6 +42,8 @@ class ImageObservations:
         object.__setattr__(self, "uneven_px", frozen(uneven, (n, 2), "uneven_px"))
         blur = np.zeros(n) if self.blur_px is None else self.blur_px
         object.__setattr__(self, "blur_px", frozen(blur, (n,), "blur_px"))
+        domes = np.zeros((n, 3)) if self.domes is None else self.domes
+        object.__setattr__(self, "domes", frozen(domes, (n, 3), "domes"))
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -96,6 +99,9 @@ class Centres:
     noise: np.ndarray  # (n,) robust σ of a pixel about the model, grey values
     rim: np.ndarray  # (n,) share of the rim that follows the model
     uneven_px: np.ndarray  # (n, 2) shift that uneven brightness would have caused
+    # (n, 3) by which share of the contrast a disc is brighter in its middle than at its rim, σ of that (0: unknown), and
+    # the share of its radius by which a dome of the whole contrast makes it look smaller
+    domes: np.ndarray
     ok: np.ndarray  # (n,) True if the ellipse is usable
 
     def __post_init__(self):
@@ -110,6 +116,7 @@ class Centres:
             ("noise", (n,)),
             ("rim", (n,)),
             ("uneven_px", (n, 2)),
+            ("domes", (n, 3)),
         ):
             freeze(self, name, shape, name)
         freeze(self, "ok", (n,), "ok", dtype=bool)

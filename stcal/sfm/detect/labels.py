@@ -93,6 +93,7 @@ def labelled_image(
         covariance_px2=centres.covariance_px2,
         uneven_px=centres.uneven_px,
         blur_px=centres.blur_px,
+        domes=centres.domes,
     )
     times = Counter(notes)
     return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))

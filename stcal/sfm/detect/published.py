@@ -221,6 +221,7 @@ def _centres(ellipses: Ellipses, candidates: Candidates) -> Centres:
         noise=np.zeros(n),
         rim=np.ones(n),
         uneven_px=np.zeros((n, 2)),
+        domes=np.zeros((n, 3)),
         ok=np.ones(n, bool),
     )
 

@@ -366,10 +366,12 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
     scale = "" if size is None else f", the size to {_relative(size)}"
     if "drawing" in report["summary"].get("scale_from", []):
         scale = ", in the unit of the drawing, and the size is not known"
+    rim = report["summary"].get("rim_mm")
+    surface = f" They are those of the luminous surface, behind rims of {rim:.3f} mm." if rim else ""
     return (
         f"Faces are known against face {report['reference_face']} to {number(position[0], 1)} µm (face {position[1]}) "
         f"and {number(rotation[0], 2)} mdeg (face {rotation[1]}) at worst, one σ along and about an axis{scale}; that "
-        f"holds where {_premise(report)} as stated."
+        f"holds where {_premise(report)} as stated.{surface}"
     )
 
 

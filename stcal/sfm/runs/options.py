@@ -44,9 +44,9 @@ class RunOptions:
         σ of a circle about the plane of its face, mm; None if it is unknown.
     refine_camera : bool
         Whether to adjust the intrinsics, with the given ones as observations.
-    rim : bool
+    rim : bool, optional
         Whether to estimate the height of a rim in front of the faces' circles, and to give the faces of their luminous
-        surface.
+        surface; if None, where the radii show a rim for certain and the design states none.
     board_only : bool
         Whether the board alone was photographed, so that λ and its residuals are the result. If False, the images tell.
     compare : {"paper"}, optional
@@ -72,7 +72,7 @@ class RunOptions:
     workers: int | None = None
     flatness_mm: float | None = FLATNESS_MM
     refine_camera: bool = False
-    rim: bool = False
+    rim: bool | None = None
     board_only: bool = False
     compare: Compare | None = None
     exclude: tuple[str, ...] = ()

@@ -332,7 +332,7 @@ class RunResult:
             options=self.options.adjustment(self.target_design),
             calibration=self.calibration,
             prior=prior if self.options.refine_camera else None,
-            rim=self.options.rim,
+            rim=bool(self.options.rim),
             camera_given=self.camera_given,
             blur_px={name: float(np.median(edge_blur)) for name, edge_blur in blur.items() if len(edge_blur)},
         )

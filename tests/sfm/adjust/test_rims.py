@@ -25,10 +25,14 @@ def scene():
     return make_scene(SceneOptions(seed=6, width=1944, height=1296, images_per_group=6, groups=(("1", "2"),)))
 
 
-def rims_of(scene, rim_mm):
+NO_DOMES = np.zeros(240), np.zeros((240, 2))
+"""Of circles whose light is even: what a dome does to radii, and domes."""
+
+
+def rims_of(scene, rim_mm, **look):
     images = []
     for i in range(6):
-        picture = render(scene, "12", i, RenderOptions(seed=5, rim_mm=rim_mm, clutter=False))
+        picture = render(scene, "12", i, RenderOptions(seed=5, rim_mm=rim_mm, **look))
         found = detect_image(picture, scene.camera, scene.target, None, EllipseOptions())
         images.append(label_single(f"12/{i:04d}", "12", found, scene.target).observations)
     radius = scene.target.radius_of() | scene.board.radius_of()
@@ -48,8 +52,10 @@ def test_the_height_of_a_rim_is_found(scene, rim_mm):
 
 
 @pytest.mark.slow
-def test_no_rim_is_found_where_there_is_none(scene):
-    rims = rims_of(scene, 0.0)
+@pytest.mark.parametrize("look", [{}, {"fade": 0.25}, {"fade": 0.25, "blur_px": 1.2}])
+def test_no_rim_is_found_where_there_is_none(scene, look):
+    """Nor where discs have a quarter less light at their rim, which makes them look smaller."""
+    rims = rims_of(scene, 0.0, **look)
     assert abs(rims["circles"].height_mm) < 3 * rims["circles"].sigma_mm
     assert rim_check(rims, 0.002, {}).verdict == "passed"
 
@@ -114,7 +120,14 @@ def test_a_blur_that_is_corrected_by_too_little_is_no_rim(height_mm):
     radius = np.where(np.arange(240) % 2, 4.0, 8.0)
     blur = 0.02 * distance**2 / radius * 6 * np.sqrt(1 + tangent**2)
     noise = rng.normal(0, 0.003, 240)
-    rim = _rim(noise + 0.2 * blur - lost_radius_mm(height_mm, tangent, radius), tangent, radius, blur, np.arange(240))
+    rim = _rim(
+        noise + 0.2 * blur - lost_radius_mm(height_mm, tangent, radius),
+        tangent,
+        radius,
+        blur,
+        np.arange(240),
+        *NO_DOMES,
+    )
     assert rim.height_mm == pytest.approx(height_mm, abs=2.5 * rim.sigma_mm)
     assert 0.003 < rim.sigma_mm < 0.0125  # of 0.05 mm at four σ
 
@@ -126,7 +139,7 @@ def test_errors_that_an_image_has_in_all_its_circles_are_in_sigma():
     for _ in range(100):
         image = np.repeat(np.arange(12), 20)
         tangent, common = rng.uniform(0.1, 2.0, 12)[image], rng.normal(0, 0.003, 12)[image]
-        rim = _rim(common + rng.normal(0, 0.003, 240), tangent, np.full(240, 8.0), np.zeros(240), image)
+        rim = _rim(common + rng.normal(0, 0.003, 240), tangent, np.full(240, 8.0), np.zeros(240), image, *NO_DOMES)
         normed.append(rim.height_mm / rim.sigma_mm)
     assert 0.5 < np.mean(np.square(normed)) < 2.0
     assert np.mean(np.abs(normed) > 4) <= 0.01

@@ -259,6 +259,7 @@ def test_a_board_upside_down_is_numbered_like_the_others():
             zeros,
             zeros,
             0 * view.centre,
+            np.zeros((n, 3)),
             ok,
         )
         seen = BoardSighting(np.arange(n), both[::-1] if i % 3 == 1 else both)

@@ -144,6 +144,7 @@ def measure_centres(
         noise=rims.noise,
         rim=rims.rim,
         uneven_px=(jacobian @ uneven[..., None])[..., 0],
+        domes=rims.domes,
         ok=ok,
     )
 
@@ -161,6 +162,7 @@ class _Rims:
     noise: np.ndarray
     rim: np.ndarray
     uneven: np.ndarray
+    domes: np.ndarray
 
     @classmethod
     def joined(cls, parts: list["_Rims"], order: np.ndarray) -> "_Rims":
@@ -198,6 +200,7 @@ def _rims(fits: Fits) -> _Rims:
         noise = robust_sigmas(np.abs(fits.residual), fits.real > 0)
         rim = (square <= ((MAX_RIM_RESIDUAL * contrast) ** 2 + (2 * noise) ** 2)[:, None] * total).mean(1)
         covariance, chance = covariances(fits)
+        domes = fits.domes()
     ok = ~fits.failed
     return _Rims(
         np.where(ok[:, None], fits.centre, fits.start),
@@ -209,4 +212,5 @@ def _rims(fits: Fits) -> _Rims:
         np.where(ok, noise, 0.0),
         np.where(ok, rim, 0.0),
         np.where(ok[:, None], fits.uneven, 0.0),
+        np.where(ok[:, None] & np.isfinite(domes), domes, 0.0),
     )

@@ -121,6 +121,7 @@ UNEVEN_CHI2 = 23.0
 """χ² of the third harmonic, two degrees of freedom, from which it is significant: a false alarm in one of 100 000
 circles."""
 WAVE_STEPS = 8
+TINY = 1e-9
 CUSP = 0.3
 """The edge's distance has a cusp in the middle of the ellipse; slopes and waves are kept to what they are at this share
 of the radius."""
@@ -205,6 +206,24 @@ class Fits:
         chi2 = (amplitude * found).sum((1, 2)) / sigma**2
         matters = np.hypot(*amplitude[..., 0].T) > UNEVEN * np.abs(self.levels[:, 3])
         return many & (chi2 > UNEVEN_CHI2) & matters
+
+    def domes(self) -> np.ndarray:
+        """Returns (n, 3): by which share of the contrast a disc is brighter in its middle than at its rim, σ of that, and
+        by which share it then looks too small. They are of one more step with a dome of light; it moves no centre."""
+        bell = np.exp(np.maximum(-0.5 * self.reduced * self.reduced, np.float32(-18)))
+        gradient = self.inverse_shape.astype(np.float32) @ self.on_unit
+        # (1 − ρ²) D, blurred with its disc as a slope is.
+        edge = 2 * self.blur[:, None].astype(np.float32) * np.sqrt((gradient**2).sum(1)) * bell / np.sqrt(2 * np.pi)
+        dome = (_normal_above(self.reduced, bell) * (1 - (self.on_unit**2).sum(1)) + edge) * self.real
+        own, left = ((self.scores @ each[..., None])[..., 0].astype(float) for each in (dome, self.residual))
+        by = (self.inverse @ own[..., None])[..., 0]
+        information = np.maximum((self.weight * dome * dome).sum(1, dtype=float) - (own * by).sum(1), TINY)
+        height = ((self.weight * dome * self.residual).sum(1, dtype=float) - (by * left).sum(1)) / information
+        sigma = np.maximum(robust_sigmas(np.abs(self.residual), self.real > 0), MIN_SIGMA) / np.sqrt(information)
+        contrast = np.where(self.levels[:, 3] == 0, 1, self.levels[:, 3]).astype(float)
+        turn = np.stack([by[:, 2:4], by[:, 3:5]], 1)
+        smaller = contrast * np.trace(np.linalg.solve(self.inverse_shape, turn), axis1=1, axis2=2) / 2
+        return np.column_stack([height / contrast, sigma / np.abs(contrast), smaller])
 
     def direction(self) -> np.ndarray:
         """Returns cosine and sine of each pixel's angle on the unit circle, (n, 2, m)."""
