@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+NOTED = 1.25
+"""Ratio from which it is said by how much photographs differ: of 16 photographs, chance is above in one run of 1000."""
 MOST_SHARE = 1 - 1e-6
 """Largest share of a direction's information in one cluster for which its pull is corrected."""
 LEAST_FREEDOM = 3.0

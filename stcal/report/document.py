@@ -154,7 +154,7 @@ class Html:
 
 TONES = {
     "passed": ("passed", "good", "accept", "yes"),
-    "care": ("suspicious", "use with care", "ambiguous", "with care"),
+    "care": ("suspicious", "use with care", "ambiguous", "with care", "part"),
     "failed": ("failed", "do not use", "reject", "no"),
     "open": ("not possible", "not applicable"),
 }

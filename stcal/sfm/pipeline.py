@@ -200,13 +200,14 @@ def run_on_files(
             result = replace(result, comparison=compare_with_paper(result, _published(task, model)))
         evidence = result.evidence(camera_prior(result.camera))
         if options.rim is None:
-            result = replace(result, options=replace(result.options, rim=shows_rim(evidence)))
-            evidence = replace(evidence, rim=bool(result.options.rim))
+            evidence = replace(evidence, rim=shows_rim(evidence))
         is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
         if is_misfit and result.camera_given and not options.refine_camera:
             evidence = replace(evidence, cause=wrong_file(result.observations(), result.camera, result.board_design))
-        result = replace(result, checks=run_checks(evidence, progress))
-        result = replace(result, calibration=_on_surface(result))
+        made = run_checks(evidence, progress)
+        larger = result.calibration.with_larger_sigma(max(check.enlarges for check in made))
+        result = replace(result, checks=made, calibration=larger)
+        result = replace(result, calibration=_on_surface(result, evidence.rim))
         result = replace(result, checks=(*result.checks, *own_checks(result, checks)))
         return replace(result, judgement=write_run(result, folder.stage, progress))
 
@@ -350,20 +351,20 @@ def _require_for_printed(options: RunOptions) -> None:
         )
 
 
-def _on_surface(result: RunResult) -> Calibration:
-    """Returns the calibration, of the luminous surface if the circles' rims are stated or are to be estimated."""
+def _on_surface(result: RunResult, rim: bool) -> Calibration:
+    """Returns the calibration, of the luminous surface if rims are stated, or to be estimated (``rim``)."""
     design, calibration = result.target_design, result.calibration
     heights, sigma_mm = design.rim_of(), 0.0
-    if result.options.rim:
+    if rim:
         radius = design.radius_of() | result.board_design.radius_of()
-        rim = find_rims(calibration.models, result.observations(), radius, calibration.camera).get("circles")
-        if rim is None:
+        found = find_rims(calibration.models, result.observations(), radius, calibration.camera).get("circles")
+        if found is None:
             raise InputError(
                 "E-RIM-UNKNOWN",
                 f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts; photograph them "
                 "from several angles, or state rim_mm in target.toml",
             )
-        heights, sigma_mm = dict.fromkeys(calibration.target.circles, rim.height_mm), rim.sigma_mm
+        heights, sigma_mm = dict.fromkeys(calibration.target.circles, found.height_mm), found.sigma_mm
     if not any(heights.values()):
         return calibration
     frame = result.options.adjustment(design).frame

@@ -44,7 +44,7 @@ def test_the_umbrella_command_is_the_same_thing(command, tmp_path):
     assert out.strip().count(".") == 2
 
 
-@pytest.mark.parametrize(("faces", "word"), [("1,2,4", "Yes"), ("1,3", "No: ")])
+@pytest.mark.parametrize(("faces", "word"), [("1,2,4", "Yes"), ("1,3", "Part: ")])
 def test_a_quiet_run_says_the_verdict_alone_and_only_where_it_is_not_yes(command, small_set, no_page, faces, word):
     """Face 3 is not in the photographs."""
     small = small_set("12", "14")

@@ -53,8 +53,8 @@ def run(
     ] = False,
     rim: Annotated[
         bool | None,
-        "Compute the height of rims in front of the circles, and give the faces of the surface behind them; if not given, "
-        "where the radii show a rim for certain.",
+        "Compute the height of rims in front of the circles, and give the faces of the surface behind them; if not "
+        "given, where the radii show a rim for certain.",
         Opt("--rim/--no-rim"),
     ] = None,
     board_only: Annotated[bool, "Use only the board, even if other circles are in view: λ and residuals."] = False,
@@ -71,8 +71,8 @@ def run(
     ] = None,
     expect_faces: Annotated[
         str | None,
-        "Answer no if one of these faces, such as 1,2, is missing from the result. If not given, the faces in the "
-        "names of the groups, such as 12, are expected.",
+        "End with exit code 4 if one of these faces, such as 1,2, is missing from the result. If not given, the faces "
+        "in the names of the groups, such as 12, are expected.",
         Opt(metavar="FACES"),
     ] = None,
     strict: shared.StrictByDefault = True,
@@ -114,7 +114,8 @@ def run(
     has_faces = bool(result.target.target_from_face)  # a run of the board alone has none, and was asked for none
     if has_faces and result.judgement is not None and result.judgement.verdict != "yes":
         verdict = f"may I use it? {result.judgement.use.removesuffix('.')}"
-        reasons = [verdict] if result.judgement.verdict == "no" else []
+        unmet = {face.id for face in result.target_design.faces}.intersection(result.judgement.missing)
+        reasons = [verdict] if result.judgement.verdict == "no" or unmet else []
         shared.require_usable(strict, reasons, out / "report.html", verdict)
 
 

@@ -10,6 +10,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
+from stcal.geometry.clusters import NOTED
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
@@ -61,8 +62,6 @@ class AdjustOptions:
             )
 
 
-NOTED = 1.25
-"""Ratio from which it is said by how much photographs differ: of 16 photographs, chance is above in one run of 1000."""
 JOINT_ROUNDS = 2
 """Number of joint adjustments. Eccentricity changes by nanometres between the first and the second."""
 
@@ -110,6 +109,12 @@ class Calibration(Brief):
     rim_mm: Mapping[CircleLabel, float] = field(default_factory=dict)
     rim_sigma_mm: float = 0.0  # of all of them together
     circle_sigma_px: float | None = None  # of the target's points in the joint adjustment, RMS per axis
+
+    def with_larger_sigma(self, factor: float) -> "Calibration":
+        """Returns the calibration with all σ of the joint adjustment multiplied by a factor."""
+        if self.joint is None or factor == 1:
+            return self
+        return replace(self, target=self.target.with_larger_sigma(factor), joint=self.joint.with_larger_sigma(factor))
 
 
 def calibrate(

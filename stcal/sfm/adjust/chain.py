@@ -1,7 +1,7 @@
 """Chains the faces of all groups into the target frame, and measures how far the ways to a face disagree."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,6 +46,22 @@ class CalibratedTarget(Brief):
     covariance_mm2: np.ndarray | None = None  # (3c, 3c) of all circles, target frame, in their order
     # by face and kind of observation, part of σ of x, y, z
     position_sources_mm: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+
+    def with_larger_sigma(self, factor: float) -> "CalibratedTarget":
+        """Returns the target with all σ multiplied by a factor."""
+        square = factor**2
+        return replace(
+            self,
+            face_covariance={k: square * c for k, c in self.face_covariance.items()},
+            circle_covariance={k: square * c for k, c in self.circle_covariance.items()},
+            distance_sigma_mm={k: factor * s for k, s in self.distance_sigma_mm.items()},
+            scale_sigma=None if self.scale_sigma is None else factor * self.scale_sigma,
+            covariance_mm2=None if self.covariance_mm2 is None else square * self.covariance_mm2,
+            position_sources_mm={
+                face: {kind: factor * s for kind, s in of_kind.items()}
+                for face, of_kind in self.position_sources_mm.items()
+            },
+        )
 
 
 def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:

@@ -84,6 +84,7 @@ class JointResult:
     bend_factor: float = 1.0  # off their plane
     print_amplitude: float = AMPLITUDES[0]  # of the smooth deviations of their prints
     differ: float = 1.0  # by how much photographs differ more than their pixels explain, as a ratio of σ
+    enlarged: float = 1.0  # factor on all σ by which groups, ways and parts of the images agree
 
     def __post_init__(self):
         c = len(self.labels)
@@ -92,8 +93,14 @@ class JointResult:
 
     @property
     def sigma_scale(self) -> float:
-        """Factor in the covariances: σ₀, but at least 1, as the single groups have confirmed the σ of the centres."""
-        return scale_of(self.sigma0)
+        """Factor in the covariances: ``enlarged`` times σ₀, which counts as 1 at least, as the single groups have
+        confirmed the σ of the centres."""
+        return self.enlarged * scale_of(self.sigma0)
+
+    def with_larger_sigma(self, factor: float) -> "JointResult":
+        """Returns the result with all σ multiplied by a factor."""
+        covariances = {k: factor**2 * getattr(self, k) for k in ("covariance_mm2", "camera_covariance")}
+        return replace(self, enlarged=factor * self.enlarged, **covariances)
 
     @property
     def settled(self) -> bool:
@@ -111,12 +118,14 @@ class Adjusted:
     normal: np.ndarray  # over the shared unknowns
     move_px: float  # largest move of a projection by the next whole step
     differ: float = 1.0  # by how much photographs differ more than their pixels explain, as a ratio of σ
+    enlarged: float = 1.0  # factor on all σ by which groups, ways and parts of the images agree
 
     def result(self) -> JointResult:
         """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``."""
         places = self.setting.places(self.shared)
         equations = self.normal, places.circles, places.intrinsics
-        return _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
+        joint = _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
+        return joint.with_larger_sigma(self.enlarged)
 
 
 def adjust_jointly(models: Sequence[MetricModel], board: BoardDesign, camera: Camera) -> JointResult:

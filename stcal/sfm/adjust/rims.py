@@ -28,9 +28,9 @@ LEAST_SIGMA_MM = 0.003
 DOME_BY_TILT = 0.1
 """The same of a dome's effect on radii, which is that of one step: of a quarter of the light, 0.1 px of a radius."""
 NARROW, NARROW_SIGMA, LEAST_DOME = 0.7, 2.0, 0.01
-"""Dome that the fit of an evenly lit disc finds, times (blur / narrowest radius)²; σ of that, which covers other forms of
-blur than a Gaussian (rendered sets: 0.06, 0.027, 0.01 at 3.5, 5, 7 blurs, and −0.05, −0.03 at 7, 10 out of focus); and
-the smallest σ of what all have in common."""
+"""Dome that the fit of an evenly lit disc finds, times (blur / narrowest radius)²; σ of that, which covers other forms
+of blur than a Gaussian (rendered sets: 0.06, 0.027, 0.01 at 3.5, 5, 7 blurs, and −0.05, −0.03 at 7, 10 out of focus);
+and the smallest σ of what all have in common."""
 HUBER = 2.0
 STEPS = 8
 
@@ -147,9 +147,9 @@ def _rim(
     by_dome: np.ndarray,
     domes: np.ndarray,
 ) -> Rim:
-    """Returns the rim from the radii's excess ``short`` (mm), with an offset of each radius, the share of blur left
-    in all, and the light that falls off towards the rim of all. Circles of one ``image`` share exposure, focus and tilt: σ is at least that by whole images (Liang & Zeger
-    1986, Biometrika 73)."""
+    """Returns the rim from the radii's excess ``short`` (mm), with an offset of each radius, the share of blur that is
+    left, and the light that falls off towards the rim, of all. Circles of one ``image`` share exposure, focus and tilt:
+    σ is at least that by whole images (Liang & Zeger 1986, Biometrika 73)."""
     _, kind = np.unique(radius, return_inverse=True)
     rows = np.column_stack([np.eye(kind.max() + 1)[kind], blur, -by_dome, -tangent / np.pi])
     dome, dome_sigma = common_dome(domes)

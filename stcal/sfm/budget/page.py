@@ -225,7 +225,7 @@ def certifies(file: BudgetFile) -> bool:
 
 def _is_reserved(file: BudgetFile) -> bool:
     """Returns whether the run's own answer has a reservation, which no certificate can have."""
-    return file.use.startswith("With care")
+    return file.use.startswith(("With care", "Part, with care"))
 
 
 def _is_valid(file: BudgetFile) -> bool:

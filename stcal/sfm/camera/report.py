@@ -3,12 +3,12 @@
 import numpy as np
 
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.report.camera import distortion_figure
 from stcal.report.document import Document, Section, Table, alarms, page_only, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
-from stcal.sfm.adjust.calibration import NOTED
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import CELLS, GRID, mean_residuals
 from stcal.sfm.camera.file import CalibrationFile

@@ -109,7 +109,7 @@ def halves_check(again: Again) -> Check:
         "images of one group contradict one another more than their residuals show: look for images in which something "
         "moved, or that are blurred; trust no σ below this difference"
     )
-    return judge(key, title, trials, "faces", remedy)
+    return judge(key, title, trials, "faces", remedy, covered=True)
 
 
 def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy: float) -> Trial:
@@ -152,7 +152,7 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
     if not trials:
         reason = "every group holds a face that no other links"
         return impossible(key, title, reason, again.loop_remedy())
-    check = judge(key, title, trials, "faces", "")
+    check = judge(key, title, trials, "faces", "", covered=True)
     if not check.names:
         return check
     curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
@@ -231,7 +231,7 @@ def loops_check(again: Again) -> Check:
         reason = "no face is reached in two ways that share no group"
         return impossible(key, title, reason, again.loop_remedy())
     remedy = "a group of these ways is wrong: compare with the result without each group, and look for what moved in it"
-    return judge(key, title, trials, "loops", remedy)
+    return judge(key, title, trials, "loops", remedy, covered=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,7 +273,7 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
     trial = Trial("all groups", value, "σ", extra, freedom, free)
-    check = judge(key, title, [trial], "adjustments", remedy)
+    check = judge(key, title, [trial], "adjustments", remedy, covered=True)
     if joint.settled:
         return check
     last = Measured("last step", joint.last_move_px, SETTLED_PX, "px", None)

@@ -14,7 +14,7 @@ from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.calibration import Calibration
-from stcal.sfm.adjust.network import Network, solve_score
+from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.verdict import (
     MOST_SIGMAS,
     SHOWN,
@@ -69,15 +69,13 @@ def camera_check(
         gained = prior.covariance - calibration.joint.camera_covariance
         estimate, sigma = change, np.sqrt(np.diag(prior.covariance))
         test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ change)
-        names = _names(prior.colmap_model)
+        names, redundancy = _names(prior.colmap_model), sum(n.redundancy.sum() for n in networks)
     else:
-        tested = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
-        tested = "THIN_PRISM_FISHEYE" if camera.fisheye else tested
-        basis, found = intrinsic_basis(tested), calibration.camera
-        normal, right = summed(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
-        test = solve_score(normal, right)
-        estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(tested)
-    redundancy = sum(n.redundancy.sum() for n in networks)
+        richest = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
+        richest = "THIN_PRISM_FISHEYE" if camera.fisheye else richest
+        basis, found = intrinsic_basis(richest), calibration.camera
+        test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
+        estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(richest)
     rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
     check = judge(key, title, [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
@@ -86,7 +84,7 @@ def camera_check(
     )
     values = ", ".join(f"{m.name} {m.value:+.2g}" for m in single if abs(m.value) > (m.limit or 0))
     reason = f"{check.reason}; the images suggest {values}" if check.names and values else check.reason
-    return Check(key, title, check.verdict, reason, check.measured + single, 1, check.names, check.remedy)
+    return replace(check, reason=reason, measured=check.measured + single)
 
 
 def _names(colmap_model: str) -> list[str]:
@@ -98,6 +96,24 @@ def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
     """Returns :meth:`~stcal.sfm.adjust.network.Network.score` of parameters that all groups have in common."""
     normal, right = zip(*(n.score(columns(n)) for n in networks), strict=True)
     return np.sum(normal, axis=0), np.sum(right, axis=0)
+
+
+def tested(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[ScoreTest, float]:
+    """Returns the score test of parameters that all groups have in common, and its degrees of freedom of noise. Where
+    images scatter about the common estimate by more than their pixels do (Cochran's Q), its squares count by as many
+    times less, as those of σ from how photographs differ."""
+    test = solve_score(*summed(networks, columns))
+    scatter, freedom = 0.0, -test.freedom
+    for network in networks:
+        for normal, right in zip(*network.score_by_image(columns(network)), strict=True):
+            own = solve_score(normal, right - normal @ test.estimate)
+            scatter, freedom = scatter + own.statistic, freedom + own.freedom
+    redundancy = float(sum(n.redundancy.sum() for n in networks))
+    times = scatter / freedom if freedom > 0 else 1.0
+    if times <= 1:
+        return test, redundancy
+    fewer = replace(test, covariance=times * test.covariance, statistic=test.statistic / times)
+    return fewer, min(redundancy, float(freedom))
 
 
 def field_check(networks: Sequence[Network], camera: Camera) -> Check:
@@ -113,9 +129,8 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
         field = np.stack([np.hstack([terms, zeros]), np.hstack([zeros, terms])], axis=1)
         return network.model.whiten(field)
 
-    test = solve_score(*summed(networks, columns))
+    test, redundancy = tested(networks, columns)
     count = sum(n.residual.size for n in networks)
-    redundancy = sum(n.redundancy.sum() for n in networks)
     sigma = np.sqrt(np.mean(np.concatenate([n.model.sigma_px() ** 2 for n in networks])))
     value = float(sigma * np.sqrt(max(test.statistic, 0) / count))
     allowed = 1 + count * (FIELD_FLOOR_PX / sigma) ** 2 / max(test.freedom, 1)

@@ -21,7 +21,7 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, image_sigma_factors, with_sigma
-from stcal.sfm.adjust.network import Network, free_network, solve_score
+from stcal.sfm.adjust.network import Network, free_network
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
@@ -45,7 +45,7 @@ from stcal.sfm.checks.images import (
     moved_check,
     sharpness_check,
     sigma_check,
-    summed,
+    tested,
 )
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
@@ -169,8 +169,9 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     of_group = any(check.key == GROUPS and check.verdict == "failed" and len(check.names) == 1 for check in checks)
     most_left = BESIDE_A_GROUP if of_group else 1.0
     cause = evidence.cause
-    if cause is None and failed:
+    if cause is None and any(check.verdict in ("failed", "suspicious") for check in checks):
         cause = whole_set_cause(networks, camera, moved, evidence.camera_given, most_left)
+        cause = replace(cause, verdict="failed" if failed else "suspicious") if cause else None
     return (cause, *checks) if cause else tuple(checks)
 
 
@@ -202,10 +203,9 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
         return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
-    test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
+    test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None]))
     if not test.freedom:
         return impossible(key, CONTROL, "poses and circles explain any eccentricity", "add tilted views of the faces")
-    redundancy = sum(n.redundancy.sum() for n in networks)
     remedy = (
         "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
         "values or of contours need another correction"

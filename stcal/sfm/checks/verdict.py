@@ -32,6 +32,9 @@ FAILED = 1e-5
 BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"
 KNOWN = 1e9
 """Degrees of freedom of a σ that is stated, not estimated."""
+MOST_ENLARGED = 3.0
+"""Factor on σ up to which contradictions of parts of the photographs are errors that σ can cover, as differences
+between laboratories are (Birge 1932, Phys. Rev. 40); beyond it something is wrong."""
 MOST_SIGMAS = 4.0
 """Residuals over the centres' own σ from which the model does not describe the images."""
 SHOWN = 8
@@ -77,6 +80,8 @@ class Check(Brief):
         Names of the values beyond their limits, the worst first.
     remedy : str
         What to do about it; empty if there is nothing to do.
+    enlarges : float
+        Factor on the σ of the result by which they cover what the check found; 1 if it found nothing, or too much.
     """
 
     key: str
@@ -87,6 +92,7 @@ class Check(Brief):
     tested: int
     names: tuple[str, ...]
     remedy: str
+    enlarges: float = 1.0
 
     def __post_init__(self):
         require_fields(self, f"check {self.key}", tested=0)
@@ -136,7 +142,15 @@ class Trial:
 
 
 @require_arguments
-def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str, worst: Verdict = "failed") -> Check:
+def judge(
+    key: str,
+    title: str,
+    trials: Sequence[Trial],
+    what: str,
+    remedy: str,
+    worst: Verdict = "failed",
+    covered: bool = False,
+) -> Check:
     """Returns the check with its verdict over all trials.
 
     Parameters
@@ -151,6 +165,9 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
         What to do if it is not passed.
     worst : str
         Worst possible verdict, for faults that do no harm.
+    covered : bool
+        Whether σ of the result that are up to :data:`MOST_ENLARGED` times as large cover what is found: it is then
+        suspicious at most, and enlarges them by the largest ratio of a value to its σ (Birge's).
 
     Returns
     -------
@@ -170,6 +187,11 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
     verdict: Verdict = "passed"
     if significant:
         verdict = worst if probability[significant[0]] * count < FAILED else "suspicious"
+    ratio = max((float(np.sqrt(statistic[i] / freedom[i])) for i in significant), default=1.0) if covered else 1.0
+    if 1 < ratio <= MOST_ENLARGED:
+        verdict = "suspicious"
+    elif ratio > MOST_ENLARGED:
+        ratio = 1.0
     measured = tuple(
         Measured(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
         for i in order[:SHOWN]
@@ -180,7 +202,7 @@ def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str,
     else:
         reason = f"{largest}" if count == 1 else f"{count} {what} within chance, largest {largest}"
     names = tuple(trials[i].name for i in significant)
-    return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "")
+    return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "", ratio)
 
 
 def without_image(name: str) -> str:

@@ -99,8 +99,8 @@ class Centres:
     noise: np.ndarray  # (n,) robust σ of a pixel about the model, grey values
     rim: np.ndarray  # (n,) share of the rim that follows the model
     uneven_px: np.ndarray  # (n, 2) shift that uneven brightness would have caused
-    # (n, 3) by which share of the contrast a disc is brighter in its middle than at its rim, σ of that (0: unknown), and
-    # the share of its radius by which a dome of the whole contrast makes it look smaller
+    # (n, 3) by which share of the contrast a disc is brighter in its middle than at its rim, σ of that (0: unknown),
+    # and the share of its radius by which a dome of the whole contrast makes it look smaller
     domes: np.ndarray
     ok: np.ndarray  # (n,) True if the ellipse is usable
 

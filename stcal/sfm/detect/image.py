@@ -165,7 +165,9 @@ def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> C
     n = len(xy_px)
     zero, one = np.zeros(n), np.ones(n)
     flat, centre = np.zeros((n, 2, 2)), camera.normalised_from_pixel(xy_px)
-    return Centres(xy_px, centre, flat, covariance_px2, zero, zero, zero, one, np.zeros((n, 2)), np.ones(n, bool))
+    return Centres(
+        xy_px, centre, flat, covariance_px2, zero, zero, zero, one, np.zeros((n, 2)), np.zeros((n, 3)), np.ones(n, bool)
+    )
 
 
 def _detect_circles(

@@ -9,6 +9,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from stcal.geometry.clusters import NOTED
 from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.text import join, number, significant
@@ -23,6 +24,9 @@ PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0
 """Relative σ, in ppm, from which it is stated in %."""
+SHARP_PX = 1.5
+"""σ of the blur of edges above which it limits a result: σ of centres are about twice those at 0.75 px, as of a sharp
+lens and the pixels' own size."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 QUESTIONS = {
@@ -31,7 +35,7 @@ QUESTIONS = {
     "limit": "What limits it?",
     "next": "What to do next?",
 }
-Use = Literal["yes", "with care", "no"]
+Use = Literal["yes", "with care", "part", "no"]
 CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
 GENERAL = ("centres", "agreement", "halves")
@@ -79,7 +83,7 @@ INVALIDATES: dict[str, tuple[str, ...]] = {
 class Judgement(Part):
     """Section ``judgement`` of ``report.json``."""
 
-    verdict: Use = Field(description="`yes`; `with care`; `no`")
+    verdict: Use = Field(description="`yes`; `with care`; `part`: faces of the design are missing; `no`")
     use: str = Field(description="whether the result may be used, in words")
     quality: str = Field(description="how good is it: largest σ of position and rotation, and of the size")
     limit: str = Field(description="what limits it")
@@ -128,7 +132,7 @@ def judgement_of(report: dict) -> Judgement:
         use=use,
         quality=_unknown(report, invalid) if verdict == "no" else _quality(report, position, rotation),
         limit=cause.limit,
-        next=" ".join([cause.remedy, *_more(report, verdict)]),
+        next=" ".join([*([cause.remedy] if cause.remedy else []), *_more(report, verdict)]),
         position_sigma_um=position and position[0],
         position_face=position and position[1],
         rotation_sigma_mdeg=rotation and rotation[0],
@@ -173,14 +177,12 @@ def _use(report: dict) -> tuple[Use, str]:
     gaps = _gaps(report)
     if not gaps or not report["faces"]:
         return verdict, answer
-    missing = _missing_faces(report)
-    if verdict != "no" and missing:
-        return "no", f"No: {'; '.join(gaps)}."
-    open_ = [] if report["summary"].get("faces_expected") else _absent(report)  # the photographs may have meant them
-    if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, face) for face in open_)):
+    if verdict == "yes" and _lost_groups(report):
         verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
-    elif verdict == "yes" and _absent(report):
-        answer = f"Yes, for {_faces(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
+    if verdict != "no" and (absent := _lacking(report)):
+        care, (_, _, reasons) = ", with care" if verdict == "with care" else "", answer.partition(": ")
+        n, of = len(report["faces"]), len(report["faces"]) + len(absent)
+        verdict, answer = "part", f"Part{care}: {n} of {of} faces; {reasons}"
     return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
 
 
@@ -207,14 +209,19 @@ def _by_result(report: dict) -> tuple[Use, str]:
     made = len(checks) - counts["not possible"]
     missing = sum(c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"]) for c in checks)
     n = counts["failed"]
-    if cause := [check for check in report.get("checks", []) if check["key"] == CAUSE]:
-        name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
+    cause = [check for check in report.get("checks", []) if check["key"] == CAUSE]
+    name = cause[0]["title"].removeprefix(OF_WHOLE_SET) if cause else ""
+    if cause and cause[0]["verdict"] == "failed":
         of = f"; that is the likely cause of {n} of {made} checks that failed" if n else ""
         return "no", f"No: {name}{of}."
     if n:
         return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
     if different := report.get("crosscheck", {}).get("differences"):
         return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
+    if words := _larger(report, checks):
+        return "with care", f"With care: {words}{f'; the likely cause: {name}' if cause else ''}."
+    if cause:
+        return "with care", f"With care: {name}, by no more than σ cover."
     if n := counts["suspicious"]:
         message = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
         first = _first(report, "suspicious")
@@ -236,6 +243,17 @@ def _by_result(report: dict) -> tuple[Use, str]:
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
     return "yes", f"Yes: {passed}{open_}."
+
+
+def _larger(report: dict, checks: list[dict]) -> str:
+    """Returns by how much σ are larger than pixels explain, and why; empty if they are not."""
+    words = []
+    if (differ := report["summary"].get("photographs_differ") or 1.0) > NOTED:
+        words.append(f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that")
+    if (larger := report["summary"].get("sigma_enlarged") or 1.0) > 1:
+        first = max(checks, key=lambda check: check.get("enlarges", 1.0))
+        words.append(f"all σ are {larger:.1f} times as large, to cover what is beyond chance: {first['title']}")
+    return "; ".join(words)
 
 
 FEW_IMAGES = 6
@@ -261,6 +279,12 @@ def _faces(names: list[str]) -> str:
 def _absent(report: dict) -> list[str]:
     """Returns the faces of the design, and of those expected, that are not in the result."""
     return list(report["summary"]["faces_not_seen"])
+
+
+def _lacking(report: dict) -> list[str]:
+    """Returns the faces without which the result is a part: of the design, or of those that the user expects."""
+    wanted = report["options"].get("expect_faces")
+    return [face for face in _absent(report) if not wanted or face in wanted]
 
 
 def _missing_faces(report: dict) -> list[str]:
@@ -344,7 +368,7 @@ def _unknown(report: dict, invalid: list[str]) -> str:
         return f"That is unknown: {join(invalid)} are not valid before the cause of the failure is removed."
     if _control(report):
         return "That is unknown: biased faces have no valid σ."
-    return "No σ are given for a part: what was to be measured is not all there."
+    return "That is unknown."
 
 
 def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
@@ -440,6 +464,9 @@ def _by_gaps(report: dict) -> _Cause | None:
             f"Face {join(missing)} should have been photographed, and is not in the result.",
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
+    if report["faces"] and (absent := _lacking(report)):
+        n, of = len(report["faces"]), len(report["faces"]) + len(absent)
+        return _Cause(f"The photographs: they give {n} of the {of} faces of the design.", "")
     return None
 
 
@@ -503,6 +530,13 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
         return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")
     centre = summary.get("circle_sigma_px")
     of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
+    blurs = [(row["nearest_blur_px"] + row["farthest_blur_px"]) / 2 for row in report.get("focus", [])]
+    if blurs and (blur := median(blurs)) > SHARP_PX:
+        return _Cause(
+            f"The sharpness: edges are blurred by {number(blur, 1)} px, {number(SHARP_PX / 2, 1)} px are usual, and σ of "
+            f"centres{of_centres} grow with that; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
+            f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
+        )
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
     return _Cause(
         f"The centring of circles{of_centres} in {summary['images_mapped']} images: "
@@ -550,7 +584,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
         unseen = [face for face in missing if face not in read]
         if unseen:
             seen = "in no image that was used" if report["left_out"]["images"] else "not seen in any image"
-            body = "" if verdict == "yes" else "; if they are in the images, check that target.toml is of this body"
+            body = "" if verdict == "part" else "; if they are in the images, check that target.toml is of this body"
             advice.append(f"Photograph {_faces(unseen)} together with one of the others: {seen}{body}.")
         if read:
             was, it = ("was", "it") if len(read) == 1 else ("were", "them")
@@ -558,7 +592,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
     open_ = [
         c for c in report.get("checks", []) if c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"])
     ]
-    if verdict == "yes" and open_:
+    if verdict in ("yes", "part") and open_:
         remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")
         same = sum(check["remedy"] == open_[0]["remedy"] for check in open_)
         advice.append(f"For {same} more check{'s' * (same > 1)}: {remedy}.")

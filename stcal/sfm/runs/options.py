@@ -54,8 +54,8 @@ class RunOptions:
     exclude : tuple of str
         Images that are not used, by their names in results, such as ``12/IMG_1003.jpg``.
     expect_faces : tuple of str
-        Faces that the photographs were to show: the answer is "no" where one is not in the result. If empty, the names
-        of the groups tell, where all of them are made of ids of faces, such as ``12`` or ``front-right``.
+        Faces that the photographs were to show: the command ends with 4 where one is missing. If empty, the names of
+        the groups tell, where all of them are made of ids of faces, such as ``12`` or ``front-right``.
 
     Raises
     ------

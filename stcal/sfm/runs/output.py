@@ -35,6 +35,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "frame": result.options.frame,
                 "eccentricity": result.options.eccentricity,
                 "refine_camera": result.options.refine_camera,
+                "expect_faces": list(result.options.expect_faces),
                 "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
             },
             "camera": {
@@ -74,6 +75,8 @@ def report_of(result: RunResult) -> ReportFile:
                 "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
                 "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
                 "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
+                "photographs_differ": joint.differ if joint else None,
+                "sigma_enlarged": joint.enlarged if joint else None,
                 "rim_mm": float(np.mean(rims)) if (rims := list(result.calibration.rim_mm.values())) else None,
                 "rim_sigma_mm": result.calibration.rim_sigma_mm if rims else None,
                 "dot_rim_mm": result.board_design.rim_mm or None,

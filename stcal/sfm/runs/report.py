@@ -24,6 +24,7 @@ class ReportOptions(Part):
     eccentricity: bool
     refine_camera: bool
     max_pair_angle_deg: float
+    expect_faces: list[str] = Field(default=[])
 
 
 class ReportCamera(Part):
@@ -53,6 +54,8 @@ class Summary(Part):
     sigma0: float | None
     redundancy: int | None
     last_move_px: float | None
+    photographs_differ: float | None = None
+    sigma_enlarged: float | None = None
     rim_mm: float | None = None
     rim_sigma_mm: float | None = None
     dot_rim_mm: float | None = None
@@ -122,6 +125,7 @@ class CheckRow(Part):
     tested: int = Field(description="how many things were")
     names: list[str] = Field(description="all that are beyond the limit, the worst first")
     remedy: str = Field(description="what to do about it; empty where nothing is")
+    enlarges: float = Field(default=1.0, description="factor on the σ of the result by which they cover what was found")
 
 
 class PairRow(Part):
@@ -250,7 +254,7 @@ class ReportFile(ResultFile):
     target: str = Field(description="name of the design")
     reference_face: str = Field(description="face id")
     options: ReportOptions = Field(
-        description="`solve`, `frame`, `eccentricity`, `refine_camera`, `max_pair_angle_deg`"
+        description="`solve`, `frame`, `eccentricity`, `refine_camera`, `expect_faces`, `max_pair_angle_deg`"
     )
     camera: ReportCamera = Field(
         description="COLMAP `model`, `size_px`, `focal_px`, `centre_px` (OpenCV pixel origin), `distortion` k1, k2, "
@@ -264,7 +268,9 @@ class ReportFile(ResultFile):
         "of the circles of the faces (not below 1), `dot_sigma_factor` of the dots and `printed_sigma_factor` of "
         "printed corners (not below 1; null without printed faces), which multiply these σ; `scale_sigma_ppm`: σ of "
         "the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
-        "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
+        "moved a projection at most (settled: less than 1e-6), `photographs_differ` by how much photographs differ "
+        "more than their pixels explain, as a ratio of σ, and `sigma_enlarged` by which all σ are larger so that they "
+        "cover how groups, ways and halves differ (both in the σ); these six are null with `chain` and `paper`; "
         "`rim_mm` mean height of the rims behind which the faces lie, `rim_sigma_mm` its σ (0 where stated), null "
         "where they are as seen; `dot_rim_mm` stated height of the rims before the board's dots, null without them; "
         "`scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners "

@@ -5,7 +5,7 @@ import csv
 import io
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -330,7 +330,8 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     )
     prior = camera_prior(run.camera) if run.options.refine_camera else None
     state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
-    return AdjustedRun(with_differences(state, start, run.target_design, run.faces.frame), start, prior)
+    state = with_differences(state, start, run.target_design, run.faces.frame)
+    return AdjustedRun(replace(state, enlarged=run.report["summary"].get("sigma_enlarged") or 1.0), start, prior)
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,6 +72,15 @@ def test_photographs_that_differ_are_what_is_counted(saved, plain, monkeypatch):
         assert images <= after.freedom < before.freedom
 
 
+def test_sigma_that_checks_enlarged_are_larger_here_too(saved, plain):
+    summary = saved.report["summary"] | {"sigma_enlarged": 1.5}
+    told = budget_of_run(replace(saved, report=saved.report | {"summary": summary}))
+    for before, after in zip(plain.rows, told.rows, strict=True):
+        assert after.standard == pytest.approx(
+            1.5 * before.standard, rel=0.02
+        )
+
+
 def test_contributions_add_up_as_squares(plain):
     assert len(plain.rows) == 3 + 3 + 5
     for row in plain.rows:
@@ -256,7 +265,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     assert file["faces"]["5"]["position_mm"] == pytest.approx(pose[:3, 3] * (1 - 14e-6), abs=1e-9)
     turn = Rotation.from_rotvec(file["faces"]["5"]["rotation_vector_deg"], degrees=True)
     assert np.allclose(turn.as_matrix(), pose[:3, :3], atol=1e-9)
-    assert (file["reference_temperature_c"], file["use"][:4]) == (20.0, "Yes,")
+    assert (file["reference_temperature_c"], file["use"][:4]) == (20.0, "Part")
     row = next(line for line in text.splitlines() if line.startswith("combined standard uncertainty u"))
     assert row.split()[-1] == f"{file['faces']['5']['position_um']['standard']:.2f}"
 

@@ -375,6 +375,17 @@ def test_verdicts_are_tests_of_significance():
     assert [check.remedy for check in at] == ["", "do"]
 
 
+@pytest.mark.parametrize(
+    ("ratio", "verdict", "enlarges"), [(1.0, "passed", 1.0), (2.5, "suspicious", 2.5), (3.1, "failed", 1.0)]
+)
+def test_what_larger_sigma_cover_enlarges_them(ratio, verdict, enlarges):
+    """As between laboratories, up to three times; without ``covered`` it fails."""
+    trial = Trial("face 2", 1.0, "µm", 6 * ratio**2, 6)
+    check = judge("groups", "t", [trial], "faces", "do", covered=True)
+    assert (check.verdict, check.enlarges) == (verdict, pytest.approx(enlarges))
+    assert judge("groups", "t", [trial], "faces", "do").verdict == ("failed" if ratio > 1 else "passed")
+
+
 def test_a_group_that_tells_nothing_of_a_face_is_no_trial():
     """Without it the face's covariance is the same but for rounding, so that no change of it can be tested."""
     covariance = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6])

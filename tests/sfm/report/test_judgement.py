@@ -173,6 +173,28 @@ def test_the_board_alone_and_one_face():
     assert "only one face" in judgement_of(own).limit
 
 
+def test_sigma_that_are_larger_than_pixels_explain_are_said():
+    own = report(check("groups", "suspicious") | {"enlarges": 1.8})
+    own["summary"] |= {"photographs_differ": 1.4, "sigma_enlarged": 1.8}
+    told = judgement_of(own)
+    assert (told.verdict, told.position_sigma_um) == ("with care", 2.0)
+    assert "differ 1.4 times" in told.use
+    assert "1.8 times as large, to cover what is beyond chance: Check groups" in told.use
+    own["summary"] |= {"photographs_differ": 1.1, "sigma_enlarged": 1.0}
+    own["checks"] = [check("cause", "suspicious") | {"title": "Cause of the whole set: focus changed"}]
+    assert judgement_of(own).use == "With care: focus changed, by no more than σ cover."
+
+
+def test_blur_that_limits_is_said_before_more_images():
+    own = report()
+    own["focus"] = [{"nearest_blur_px": 2.5, "farthest_blur_px": 1.5}]
+    told = judgement_of(own)
+    assert told.limit.startswith("The sharpness: edges are blurred by 2.0 px")
+    assert "Nothing has to be done" not in told.next
+    own["focus"][0]["nearest_blur_px"] = 1.0
+    assert "sharpness" not in judgement_of(own).limit
+
+
 def test_a_difference_from_the_native_program_calls_for_care():
     found = judgement_of(report() | {"crosscheck": {"differences": ["face 2 is 9 µm off"]}})
     assert found.verdict == "with care"
@@ -183,8 +205,9 @@ def test_what_is_missing_is_said_too():
     own = report(*[check(key, "not possible", remedy="to be able to make it, add a group") for key in "ab"])
     own["summary"]["faces_not_seen"] = ["5", "6"]
     told = judgement_of(own)
-    assert told.use.startswith("Yes, for faces 1, 2, 3, 4: nothing was checked, 2 were not possible; faces 5, 6")
-    assert "Photograph faces 5, 6" in told.next
+    assert told.use.startswith("Part: 4 of 6 faces; nothing was checked, 2 were not possible; faces 5, 6")
+    assert "4 of the 6 faces" in told.limit
+    assert told.next.startswith("Photograph faces 5, 6")
     assert told.next.endswith("For 2 more checks: add a group.")
 
 
@@ -212,28 +235,28 @@ def test_photographs_that_do_not_test_one_another_are_no_yes():
     assert judgement_of(report(*(check(k, v) for k, v in keys.items()))).verdict == "yes"
 
 
-def test_a_missing_face_that_was_expected_is_a_no():
+def test_a_missing_face_that_was_expected_is_named():
     own = report()
     own["summary"] |= {"faces_not_seen": ["5", "6"], "faces_expected": ["1", "6"]}
     told = judgement_of(own)
-    assert (told.verdict, told.missing, told.position_sigma_um) == ("no", ["6"], None)
+    assert (told.verdict, told.missing, told.position_sigma_um) == ("part", ["6"], 2.0)
     assert "faces 5, 6" in told.use
-    assert "µm" not in told.quality
+    assert "Face 6 should have been photographed" in told.limit
     own["checks"] = [check("a", "failed", remedy="x")]
     assert "the first: Check a; faces 5, 6 " in judgement_of(own).use
 
 
-def test_a_face_that_was_read_and_left_out_calls_for_care():
+def test_a_face_that_was_read_and_left_out_is_missing():
     own = report()
     own["summary"]["faces_not_seen"] = ["5"]
     note = "a pattern like face 5: not where other groups see that face against the others; left out"
     own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "note": note} for i in range(3)]
     told = judgement_of(own)
-    assert (told.verdict, "face 5 was read in 3 images" in told.use) == ("with care", True)
+    assert (told.verdict, "face 5 was read in 3 images" in told.use) == ("part", True)
     assert "Read why face 5 was left out" in told.next
     own["summary"]["faces_expected"] = ["1", "2"]  # the photographs were not to show it, but it is said
     told = judgement_of(own)
-    assert (told.verdict, told.missing, "face 5 was read in 3 images" in told.use) == ("yes", [], True)
+    assert (told.verdict, told.missing, "face 5 was read in 3 images" in told.use) == ("part", [], True)
 
 
 def test_a_group_that_was_left_out_calls_for_care_and_says_why():

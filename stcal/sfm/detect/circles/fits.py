@@ -208,8 +208,8 @@ class Fits:
         return many & (chi2 > UNEVEN_CHI2) & matters
 
     def domes(self) -> np.ndarray:
-        """Returns (n, 3): by which share of the contrast a disc is brighter in its middle than at its rim, σ of that, and
-        by which share it then looks too small. They are of one more step with a dome of light; it moves no centre."""
+        """Returns (n, 3): by which share of the contrast a disc is brighter in its middle than at its rim, σ of that,
+        and which share of its radius a dome of all its light hides. Of one more step; a dome moves no centre."""
         bell = np.exp(np.maximum(-0.5 * self.reduced * self.reduced, np.float32(-18)))
         gradient = self.inverse_shape.astype(np.float32) @ self.on_unit
         # (1 − ρ²) D, blurred with its disc as a slope is.
