@@ -30,6 +30,7 @@ from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
+from stcal.sfm.checks.causes import cause_of_drawing
 from stcal.sfm.checks.suite import run_checks, shows_rim
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, misplaced_images, not_as_drawn
@@ -201,10 +202,11 @@ def run_on_files(
         evidence = result.evidence(camera_prior(result.camera))
         if options.rim is None:
             evidence = replace(evidence, rim=shows_rim(evidence))
+        cause = cause_of_drawing(result.target.target_from_face, target_design)
         is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
         if is_misfit and result.camera_given and not options.refine_camera:
-            evidence = replace(evidence, cause=wrong_file(result.observations(), result.camera, result.board_design))
-        made = run_checks(evidence, progress)
+            cause = wrong_file(result.observations(), result.camera, result.board_design) or cause
+        made = run_checks(replace(evidence, cause=cause), progress)
         larger = result.calibration.with_larger_sigma(max(check.enlarges for check in made))
         result = replace(result, checks=made, calibration=larger)
         result = replace(result, calibration=_on_surface(result, evidence.rim))

@@ -10,6 +10,7 @@ from stcal.boards.target import body_toml
 from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
+from stcal.sfm.checks.causes import cause_of_drawing
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.body import Corners, wrong_sizes
@@ -62,6 +63,17 @@ def seen(group: str, *faces: str) -> list[ImageObservations]:
     n = len(labels)
     empty = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2))
     return [ImageObservations(f"{group}/{i}", group, labels, *empty) for i in range(3)]
+
+
+@pytest.mark.parametrize(("turned", "named"), [(30.0, False), (60.0, True)])
+def test_a_face_on_another_side_is_not_the_one_drawn(turned, named):
+    faces = found(seed=1) | {}
+    faces["4"] = faces["4"] @ Rigid.exp([np.radians(turned), 0, 0, 0, 0, 0])
+    cause = cause_of_drawing(faces, CUBE)
+    assert bool(cause) is named
+    if cause:
+        assert (cause.verdict, cause.names) == ("failed", ("4",))
+        assert "face 4 is not where its rough_pose has it" in cause.title
 
 
 def test_groups_that_show_other_faces_than_their_names_say():

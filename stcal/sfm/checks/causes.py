@@ -1,18 +1,20 @@
 """Causes of the whole set: further parameters of the free networks (score test). The hypothesis that explains most of
 the squared residuals beyond chance with fewest parameters is named first."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri, fdtrc
 
+from stcal.design import TargetDesign
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.images import summed
 from stcal.sfm.checks.verdict import FAILED, MOVED, MOVED_REMEDY, Check, Measured
+from stcal.sfm.data.as_drawn import turned_faces
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8
@@ -31,6 +33,8 @@ FEW = 0.25
 ALONE = 0.93
 """Share of what all images explain at which a few explain it alone; of random changes in all of them they have 0.5 to
 0.87."""
+FAR_DEG = 45.0
+"""Angle from which a face is not the one that was drawn: half of that between two sides of a box."""
 LEAST_SHIFT_PX = 3.0
 """Smallest change of the principal point that reveals photographs turned by 180°."""
 
@@ -124,6 +128,20 @@ def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_
     size = cause.size(test.estimate, np.sqrt(np.maximum(np.diag(test.covariance), 0)))
     share = Measured(cause.name, -100 * explained / square, None, "% explained", None)
     return Check(CAUSE, f"{OF_WHOLE_SET}{cause.name}", "failed", size, (share,), len(fitted), (), cause.remedy)
+
+
+def cause_of_drawing(target_from_face: Mapping[str, Rigid], design: TargetDesign) -> Check | None:
+    """Returns a failed check that names faces on another side of the body than their rough poses, which reflections and
+    other patterns look like; None if none is. Notes say what is turned by less."""
+    rough = {face: pose for face, pose in design.rough_poses().items() if face in target_from_face}
+    turned = turned_faces({face: target_from_face[face] for face in rough}, rough) if len(rough) > 1 else {}
+    far = tuple(face for face, angle in turned.items() if angle > FAR_DEG)
+    if not far:
+        return None
+    name = f"face {', '.join(far)} is not where its rough_pose has it"
+    reason = f"turned by {turned[far[0]]:.0f}°, {FAR_DEG:.0f}° possible: a reflection, another pattern, or another name"
+    remedy = "look at the overlays; leave out images that show a reflection, or correct names, ids or rough_pose"
+    return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), len(rough), far, remedy)
 
 
 def _redundancy(networks: Sequence[Network]) -> float:

@@ -40,14 +40,14 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
             f"{NOT_AS_DRAWN}faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has "
             "them: check the sizes that it states (size_mm, radius_mm, pitch_mm), and that of the board"
         )
-    turned = _turned(found, rough)
+    turned = turned_faces(found, rough)
     if not turned:
         return notes
     what = ", ".join(f"face {face} is turned by {angle:.0f}°" for face, angle in turned.items())
     what += " against rough_pose in target.toml"
     for a, b in combinations(turned, 2):
         exchanged = rough | {a: rough[b], b: rough[a]}
-        if not {a, b} & _turned(found, exchanged).keys():
+        if not {a, b} & turned_faces(found, exchanged).keys():
             what += f", as if the names of faces {a} and {b} were exchanged"
             break
     folders = (
@@ -66,7 +66,7 @@ def _size_ratio(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> float
     return float(np.median(ratios)) if ratios else 1.0
 
 
-def _turned(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
+def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
     """Returns the faces that are turned against most others, with their angles, degrees."""
     off = {face: found[face].rotation @ rough[face].rotation.T for face in rough}
     angles = {anchor: {face: _angle_deg(own.T @ off[face]) for face in off} for anchor, own in off.items()}

@@ -533,8 +533,8 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
     blurs = [(row["nearest_blur_px"] + row["farthest_blur_px"]) / 2 for row in report.get("focus", [])]
     if blurs and (blur := median(blurs)) > SHARP_PX:
         return _Cause(
-            f"The sharpness: edges are blurred by {number(blur, 1)} px, {number(SHARP_PX / 2, 1)} px are usual, and σ of "
-            f"centres{of_centres} grow with that; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
+            f"The sharpness: edges are blurred by {number(blur, 1)} px, {number(SHARP_PX / 2, 1)} px are usual, and "
+            f"the σ of centres{of_centres} grow with that; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
             f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
         )
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))

@@ -76,9 +76,7 @@ def test_sigma_that_checks_enlarged_are_larger_here_too(saved, plain):
     summary = saved.report["summary"] | {"sigma_enlarged": 1.5}
     told = budget_of_run(replace(saved, report=saved.report | {"summary": summary}))
     for before, after in zip(plain.rows, told.rows, strict=True):
-        assert after.standard == pytest.approx(
-            1.5 * before.standard, rel=0.02
-        )
+        assert after.standard == pytest.approx(1.5 * before.standard, rel=0.02)
 
 
 def test_contributions_add_up_as_squares(plain):
