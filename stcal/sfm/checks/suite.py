@@ -21,7 +21,7 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate, image_sigma_factors, with_sigma
-from stcal.sfm.adjust.network import Network, free_network
+from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
@@ -45,7 +45,7 @@ from stcal.sfm.checks.images import (
     moved_check,
     sharpness_check,
     sigma_check,
-    tested,
+    summed,
 )
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
@@ -203,9 +203,10 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
         return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
-    test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None]))
+    test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
     if not test.freedom:
         return impossible(key, CONTROL, "poses and circles explain any eccentricity", "add tilted views of the faces")
+    redundancy = sum(n.redundancy.sum() for n in networks)
     remedy = (
         "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
         "values or of contours need another correction"
