@@ -24,9 +24,9 @@ PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
 MOST_PPM = 1000.0
 """Relative σ, in ppm, from which it is stated in %."""
-SHARP_PX = 1.5
-"""σ of the blur of edges above which it limits a result: σ of centres are about twice those at 0.75 px, as of a sharp
-lens and the pixels' own size."""
+SHARP_PX = 1.2
+"""σ of the blur of edges above which it limits a result: σ of centres are 1.6 times those at 0.75 px, of a sharp lens
+and the pixels' own size, which 2.5 times the images would make up for."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 QUESTIONS = {
@@ -533,8 +533,8 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
     blurs = [(row["nearest_blur_px"] + row["farthest_blur_px"]) / 2 for row in report.get("focus", [])]
     if blurs and (blur := median(blurs)) > SHARP_PX:
         return _Cause(
-            f"The sharpness: edges are blurred by {number(blur, 1)} px, {number(SHARP_PX / 2, 1)} px are usual, and "
-            f"the σ of centres{of_centres} grow with that; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
+            f"The sharpness: edges are blurred by {number(blur, 1)} px, half of that is usual, and σ of centres grow "
+            f"with it; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
             f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
         )
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))

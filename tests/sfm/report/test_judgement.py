@@ -191,7 +191,7 @@ def test_blur_that_limits_is_said_before_more_images():
     told = judgement_of(own)
     assert told.limit.startswith("The sharpness: edges are blurred by 2.0 px")
     assert "Nothing has to be done" not in told.next
-    own["focus"][0]["nearest_blur_px"] = 1.0
+    own["focus"][0] |= {"nearest_blur_px": 0.9, "farthest_blur_px": 0.8}
     assert "sharpness" not in judgement_of(own).limit
 
 
