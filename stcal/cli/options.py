@@ -288,16 +288,19 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
         warn_if_quiet(verdict or f"failed: {', '.join(failed)}")
 
 
-def require_usable(strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "") -> None:
+def require_usable(
+    strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "", but: str = "do not use them"
+) -> None:
     """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given.
 
     Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, the reasons.
+    ``but`` : what is to be said of the results that are written all the same.
     """
     if strict and reasons:
         where = f"; see {page}" if page else ""
         raise ChecksFailed(
             "E-CHECKS-FAILED",
-            f"{'; '.join(reasons)}; results are written, do not use them; --no-strict ends with 0{where}",
+            f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0{where}",
         )
     if verdict or reasons:
         warn_if_quiet(verdict or "; ".join(reasons))

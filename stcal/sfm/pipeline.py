@@ -207,10 +207,12 @@ def run_on_files(
         if is_misfit and result.camera_given and not options.refine_camera:
             cause = wrong_file(result.observations(), result.camera, result.board_design) or cause
         made = run_checks(replace(evidence, cause=cause), progress)
-        larger = result.calibration.with_larger_sigma(max(check.enlarges for check in made))
-        result = replace(result, checks=made, calibration=larger)
+        factor = max(check.enlarges for check in made)
+        result = replace(result, checks=made, calibration=result.calibration.with_larger_sigma(factor))
         result = replace(result, calibration=_on_surface(result, evidence.rim))
-        result = replace(result, checks=(*result.checks, *own_checks(result, checks)))
+        own = own_checks(result, checks)
+        more = max([factor, *(check.enlarges for check in own)]) / factor
+        result = replace(result, checks=(*made, *own), calibration=result.calibration.with_larger_sigma(more))
         return replace(result, judgement=write_run(result, folder.stage, progress))
 
 

@@ -116,7 +116,8 @@ def run(
         verdict = f"may I use it? {result.judgement.use.removesuffix('.')}"
         unmet = {face.id for face in result.target_design.faces}.intersection(result.judgement.missing)
         reasons = [verdict] if result.judgement.verdict == "no" or unmet else []
-        shared.require_usable(strict, reasons, out / "report.html", verdict)
+        but = "do not use them" if result.judgement.verdict == "no" else "without faces that were expected"
+        shared.require_usable(strict, reasons, out / "report.html", verdict, but)
 
 
 @app.command()

@@ -14,7 +14,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.images import summed
 from stcal.sfm.checks.verdict import FAILED, MOVED, MOVED_REMEDY, Check, Measured
-from stcal.sfm.data.as_drawn import turned_faces
+from stcal.sfm.data.as_drawn import FAR_DEG, turned_faces
 from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8
@@ -33,8 +33,6 @@ FEW = 0.25
 ALONE = 0.93
 """Share of what all images explain at which a few explain it alone; of random changes in all of them they have 0.5 to
 0.87."""
-FAR_DEG = 45.0
-"""Angle from which a face is not the one that was drawn: half of that between two sides of a box."""
 LEAST_SHIFT_PX = 3.0
 """Smallest change of the principal point that reveals photographs turned by 180°."""
 

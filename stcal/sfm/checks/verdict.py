@@ -166,8 +166,8 @@ def judge(
     worst : str
         Worst possible verdict, for faults that do no harm.
     covered : bool
-        Whether σ of the result that are up to :data:`MOST_ENLARGED` times as large cover what is found: it is then
-        suspicious at most, and enlarges them by the largest ratio of a value to its σ (Birge's).
+        Whether σ of the result that are up to :data:`MOST_ENLARGED` times as large cover what is found. It is then
+        suspicious, and enlarges them by the ratio of all values to their σ (Birge's), or of the worst to its limit.
 
     Returns
     -------
@@ -187,11 +187,12 @@ def judge(
     verdict: Verdict = "passed"
     if significant:
         verdict = worst if probability[significant[0]] * count < FAILED else "suspicious"
-    ratio = max((float(np.sqrt(statistic[i] / freedom[i])) for i in significant), default=1.0) if covered else 1.0
-    if 1 < ratio <= MOST_ENLARGED:
-        verdict = "suspicious"
-    elif ratio > MOST_ENLARGED:
-        ratio = 1.0
+    enlarges = 1.0
+    if covered and significant:
+        limits = [trials[i].limit(count) or np.inf for i in significant]
+        beyond = [abs(trials[i].value) / own for i, own in zip(significant, limits, strict=True)]
+        ratio = max(float(np.sqrt(statistic.sum() / freedom.sum())), *beyond)
+        verdict, enlarges = ("suspicious", ratio) if ratio <= MOST_ENLARGED else ("failed", 1.0)
     measured = tuple(
         Measured(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
         for i in order[:SHOWN]
@@ -202,7 +203,7 @@ def judge(
     else:
         reason = f"{largest}" if count == 1 else f"{count} {what} within chance, largest {largest}"
     names = tuple(trials[i].name for i in significant)
-    return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "", ratio)
+    return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "", enlarges)
 
 
 def without_image(name: str) -> str:

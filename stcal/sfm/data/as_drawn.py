@@ -17,6 +17,8 @@ the last colon."""
 MOST_TURNED_DEG = 25.0
 """Largest angle of a face to its rough pose. A rough pose is good to a few degrees; a face on the wrong side of the
 body, or drawn turned, is off by far more."""
+FAR_DEG = 45.0
+"""Angle from which a face is not the one that was drawn: half of that between two sides of a box."""
 LIKE_DRAWN = 1.3
 """Largest factor between distances of faces and those of their rough poses."""
 LIKE_A_FACE = re.compile(r"a pattern like face ([^:]+):")

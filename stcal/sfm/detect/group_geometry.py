@@ -12,6 +12,7 @@ from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import BOARD, Label
+from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.sightings import PlaneView, Readings
@@ -21,8 +22,6 @@ MAX_SHIFT_PITCHES = 0.3
 the board deviates by a whole step."""
 MAX_SEEDS = 8
 """Largest number of start images, until one explains everything."""
-MAX_TURN_RAD = np.radians(45)
-"""Largest angle of a face from its rough pose, which is stated by eye: half of that between the sides of a box."""
 MAX_OFF_PITCHES = 0.12
 """Largest median deviation of a reading's circles after the adjustment, in steps of the pattern: 3 mm for the reference
 target. A design deviates by tenths of a step, a wrong numbering by a whole one."""
@@ -72,12 +71,12 @@ def arrange(images: Sequence[list[Readings]], step_mm: float, focal_px: float) -
 
 
 def as_drawn(found: Arrangement, rough_poses: Mapping[str, Rigid]) -> Arrangement:
-    """Arrangement without faces turned by more than ``MAX_TURN_RAD`` against most others from their rough poses."""
+    """Arrangement without faces turned by more than ``FAR_DEG`` against most others from their rough poses."""
     circles = Counter(view.plane for views in found.views.values() for view in views for _ in view.rows)
     turn = {
         p: (pose @ rough_poses[p].inverse()).rotation for p, pose in found.group_from_plane.items() if p in rough_poses
     }
-    agreed = {p: {q for q in turn if Rigid(turn[p].T @ turn[q]).angle_rad() <= MAX_TURN_RAD} for p in turn}
+    agreed = {p: {q for q in turn if Rigid(turn[p].T @ turn[q]).angle_rad() <= np.radians(FAR_DEG)} for p in turn}
     most = max(agreed.values(), key=lambda planes: sum(circles[p] for p in planes), default=set())
     return found.without(turn.keys() - most)
 

@@ -23,6 +23,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
+from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -30,7 +31,6 @@ from stcal.sfm.detect.defocus import Focus, correct_defocus
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.group_geometry import (
     MAX_SHIFT_PITCHES,
-    MAX_TURN_RAD,
     Arrangement,
     across_groups,
     arrange,
@@ -450,7 +450,7 @@ def _open(views: Readings) -> str:
 def _foreign(view: PlaneView) -> str:
     return (
         f"a pattern like face {view.plane}: not where other groups see that face against the others, or turned from "
-        f"its rough_pose by more than {np.degrees(MAX_TURN_RAD):.0f}°; left out, it is a reflection or another object, "
+        f"its rough_pose by more than {FAR_DEG:.0f}°; left out, it is a reflection or another object, "
         "the image is mirrored, or rough_pose is wrong"
     )
 

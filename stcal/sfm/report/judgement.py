@@ -221,7 +221,7 @@ def _by_result(report: dict) -> tuple[Use, str]:
     if words := _larger(report, checks):
         return "with care", f"With care: {words}{f'; the likely cause: {name}' if cause else ''}."
     if cause:
-        return "with care", f"With care: {name}, by no more than σ cover."
+        return "with care", f"With care: {name}, though no check failed."
     if n := counts["suspicious"]:
         message = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
         first = _first(report, "suspicious")
@@ -579,7 +579,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
     used, given = (report["summary"][key] for key in ("images_mapped", "images"))
     if report["faces"] and _are_few(report):
         advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
-    if report["faces"] and (missing := report["summary"]["faces_not_seen"]):
+    if report["faces"] and (missing := _lacking(report)):
         read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
         unseen = [face for face in missing if face not in read]
         if unseen:

@@ -20,7 +20,7 @@ from stcal.sfm.checks import faces
 from stcal.sfm.checks.board import board_checks
 from stcal.sfm.checks.images import moved_check
 from stcal.sfm.checks.suite import Evidence, run_checks
-from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, culprits, judge
+from stcal.sfm.checks.verdict import FAILED, MOST_ENLARGED, SUSPICIOUS, Trial, culprits, judge
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.sections import checks_section, count_verdicts
 from stcal.sfm.runs.options import RunOptions
@@ -384,6 +384,22 @@ def test_what_larger_sigma_cover_enlarges_them(ratio, verdict, enlarges):
     check = judge("groups", "t", [trial], "faces", "do", covered=True)
     assert (check.verdict, check.enlarges) == (verdict, pytest.approx(enlarges))
     assert judge("groups", "t", [trial], "faces", "do").verdict == ("failed" if ratio > 1 else "passed")
+
+
+@pytest.mark.parametrize(("moved_um", "verdict"), [(10, "suspicious"), (100, "failed")])
+def test_a_face_that_moves_a_little_in_one_group_enlarges_sigma_and_more_fails(lab, moved_um, verdict):
+    """Face 5 in the last of three groups that close a loop."""
+    scene = make_scene(SceneOptions(seed=3, images_per_group=6, groups=(("1", "2"), ("2", "5"), ("1", "5"))))
+    shift = np.array([1e-3 * moved_um, 0, 0])
+    faces, circles = dict(scene.target_from_face), scene.circles_target
+    faces["5"] = Rigid(faces["5"].rotation, faces["5"].translation + shift)
+    other = {label: xyz + shift if label.face == "5" else xyz for label, xyz in circles.items()}
+    moved = lab.observe(replace(scene, target_from_face=faces, circles_target=other))
+    images = [b if b.group == "15" else a for a, b in zip(lab.observe(scene), moved, strict=True)]
+    checks = lab.check(scene, images, solve="joint")
+    assert checks["groups"].verdict == verdict
+    larger = max(check.enlarges for check in checks.values())
+    assert (1.2 < larger <= MOST_ENLARGED) == (verdict == "suspicious")
 
 
 def test_a_group_that_tells_nothing_of_a_face_is_no_trial():

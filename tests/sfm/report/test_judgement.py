@@ -182,7 +182,7 @@ def test_sigma_that_are_larger_than_pixels_explain_are_said():
     assert "1.8 times as large, to cover what is beyond chance: Check groups" in told.use
     own["summary"] |= {"photographs_differ": 1.1, "sigma_enlarged": 1.0}
     own["checks"] = [check("cause", "suspicious") | {"title": "Cause of the whole set: focus changed"}]
-    assert judgement_of(own).use == "With care: focus changed, by no more than σ cover."
+    assert judgement_of(own).use == "With care: focus changed, though no check failed."
 
 
 def test_blur_that_limits_is_said_before_more_images():
