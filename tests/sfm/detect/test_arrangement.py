@@ -21,19 +21,8 @@ def centres_of(centre_px, centre) -> Centres:
     """Circles at these places that are alike in all else."""
     n = len(centre)
     one, two = np.ones(n), np.tile(np.eye(2), (n, 1, 1))
-    return Centres(
-        centre_px,
-        centre,
-        0.01 * two,
-        1e-4 * two,
-        one,
-        one,
-        one,
-        one,
-        np.zeros((n, 2)),
-        np.zeros((n, 3)),
-        one.astype(bool),
-    )
+    domes = np.zeros((n, 3))
+    return Centres(centre_px, centre, 0.01 * two, 1e-4 * two, *[one] * 4, np.zeros((n, 2)), domes, one.astype(bool))
 
 
 class Seen:
