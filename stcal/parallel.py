@@ -1,4 +1,5 @@
-"""Parallel execution of one function over many jobs, on all cores or by an executor, with BLAS on one thread."""
+"""Parallel execution of one function over many jobs, on all cores or by an executor, with BLAS on one thread, and
+folders that end with their process."""
 
 import contextlib
 import itertools
@@ -9,13 +10,16 @@ import os
 import shutil
 import signal
 import sys
+import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextvars import ContextVar
 from functools import cache
 from multiprocessing import resource_tracker
+from pathlib import Path
 from typing import TypeVar
 
 from stcal.errors import InputNote
@@ -31,6 +35,32 @@ AT_ONCE = 4
 """Number of jobs that are handed over for each process, so that the next ones are there when one is done."""
 _limited = threading.Lock()
 _one_starts = threading.Lock()
+
+
+LOCK = ".lock"
+"""File of a scratch folder; the system releases it when its process ends, in whatever way."""
+YOUNG_S = 1.0
+"""Age below which such a file may not be locked yet."""
+
+
+@contextlib.contextmanager
+def scratch_folder(name: str) -> Iterator[Path]:
+    """Yields a new folder in the temporary folder, and removes it, and those of processes that were killed."""
+    import filelock
+
+    for left in Path(tempfile.gettempdir()).glob(f"stcal-*/{LOCK}"):
+        with contextlib.suppress(OSError, filelock.Timeout):
+            if time.time() - left.stat().st_mtime > YOUNG_S:
+                with filelock.FileLock(left, timeout=0):
+                    shutil.rmtree(left.parent, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=f"stcal-{name}-"))
+    try:
+        with filelock.FileLock(folder / LOCK):
+            own = folder / name  # empty, as the lock lies beside it
+            own.mkdir()
+            yield own
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def counted(progress: Progress, stage: str, total: int) -> Callable[[object], None]:
@@ -159,8 +189,7 @@ class _Processes:
     def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
         if self._pool is None:
             with _starting():
-                sockets = multiprocessing.util.get_temp_dir()
-                self._pool = ProcessPoolExecutor(self.workers, _context(), _follow_parent, (sockets,))
+                self._pool = ProcessPoolExecutor(self.workers, _context(), _follow_parent, (_sockets(),))
         return hand_over(self._pool, function, jobs, AT_ONCE * self.workers)
 
     def __enter__(self) -> "_Processes":
@@ -215,6 +244,7 @@ def load_ahead(workers: int | None = None) -> None:
 
 def _context() -> multiprocessing.context.BaseContext:
     """Returns the way to start processes, a server that loads the libraries, or spawn; within :func:`_starting`."""
+    _sockets()
     if "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing.forkserver import ensure_running
 
@@ -225,6 +255,19 @@ def _context() -> multiprocessing.context.BaseContext:
             ensure_running()
             return context
     return multiprocessing.get_context("spawn")
+
+
+@cache
+def _sockets() -> str:
+    """Returns the folder of the server's sockets, one that the next process removes if this one is killed."""
+    kept = contextlib.ExitStack()
+    folder = kept.enter_context(scratch_folder("mp"))
+    multiprocessing.util.Finalize(None, kept.close, exitpriority=-200)  # after multiprocessing has removed its own
+    before, tempfile.tempdir = tempfile.tempdir, str(folder)
+    try:
+        return multiprocessing.util.get_temp_dir()
+    finally:
+        tempfile.tempdir = before
 
 
 @contextlib.contextmanager

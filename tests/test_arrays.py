@@ -15,7 +15,7 @@ from stcal.io.images import decode
 from stcal.robot.kinematics.model import mh80
 from stcal.sfm.detect.files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
-from tests.outcome import fails_with, refuses
+from tests.outcome import fails_with
 
 MATRIX = np.array([[900.0, 0, 640.3], [0, 905.0, 355.8], [0, 0, 1]])
 SIZE = (1280, 720)
@@ -157,8 +157,21 @@ class Result:
 
 def test_checks_of_ones_own_have_their_own_names():
     assert [each.verdict for each in own_checks(Result(), [lambda _: check("mine")])] == ["failed"]  # 5 σ
-    refuses("E-CHECK-OWN … 'camera' is already used", own_checks, Result(), [lambda _: check("camera")])
-    refuses("E-CHECK-OWN … bool", own_checks, Result(), [lambda _: True])
+
+
+@pytest.mark.parametrize(
+    ("make", "fault"),
+    [
+        (lambda _: check("camera"), "it has the key 'camera' of another"),
+        (lambda _: True, "it returned bool, a Check needed"),
+        (lambda _: [][1], "it raised IndexError: list index out of range"),
+    ],
+)
+def test_a_check_that_cannot_be_made_loses_no_result(make, fault):
+    first, second = own_checks(Result(), [make, make])
+    assert (first.verdict, second.verdict) == ("suspicious", "suspicious")
+    assert first.reason.startswith(fault)
+    assert first.key != second.key
 
 
 def test_the_repr_of_a_large_result_is_a_line():

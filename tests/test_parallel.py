@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD, kept_processes, run_in_order, run_parallel
+from stcal.parallel import ONE_THREAD, kept_processes, run_in_order, run_parallel, scratch_folder
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -282,3 +283,34 @@ with one_thread():
 """
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=20, check=True)
     assert done.stdout == "(300, 300) (300, 300)\n"
+
+
+HELD = """
+import sys, time
+from stcal.parallel import _sockets, scratch_folder
+with scratch_folder("run") as folder:
+    (folder / "image.npz").touch()
+    _sockets()
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_the_next_process_removes_what_a_killed_one_left(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    with subprocess.Popen([sys.executable, "-c", HELD], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.kill()
+    left = [path.parent for path in tmp_path.glob("stcal-*/.lock")]
+    assert len(left) == 2
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with scratch_folder("other"):  # too young: it might not be locked yet
+        assert all(folder.exists() for folder in left)
+    for folder in left:
+        os.utime(folder / ".lock", (0, 0))
+    with scratch_folder("one") as one:
+        os.utime(one.parent / ".lock", (0, 0))
+        with scratch_folder("two"):
+            assert one.exists()  # its process lives
+    assert not list(tmp_path.iterdir())

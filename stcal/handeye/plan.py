@@ -1,8 +1,6 @@
 """Robot poses to take next: those that would lower the worst σ of a hand-eye transform most, and their report."""
 
-import csv
-import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,7 +16,7 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.result import HandEye
 from stcal.io.json import Part, Pose, ResultFile
-from stcal.io.table import POSE, pose_cells
+from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.report.document import Document, Section, Table
 from stcal.report.text import NONE, number
 
@@ -313,15 +311,15 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
         CSV with base_from_flange and camera_from_board, mm (form: ``data_layout.md``).
     """
     joints = joints or {}
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}
-    writer.writerow(["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)])
+    rows: list[Sequence] = [
+        ["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)]
+    ]
     for k, turn in enumerate(planned.turn_rad):
         values = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
         cells = [repr(float(value)) for value in values]
-        writer.writerow([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
-    return stream.getvalue()
+        rows.append([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
+    return csv_text(rows)
 
 
 def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:

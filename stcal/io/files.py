@@ -23,6 +23,8 @@ SETTINGS_BYTES = 10 * MB
 """Largest size of a file that people write: camera, designs, robot, layout."""
 TABLE_BYTES = 100 * MB
 """Largest size of tables and result files."""
+COMPACT_FROM = TABLE_BYTES // 10
+"""Length from which JSON is written without line breaks."""
 IMAGE_BYTES = 500 * MB
 """Largest size of an image file: 80 megapixels, 16 bit, colour, uncompressed."""
 MODEL_BYTES = 1000 * MB
@@ -241,7 +243,18 @@ def require_unchanged(path: str | Path) -> None:
 def json_text(content) -> str:
     """Return the text of a JSON file in the package's form; ``content`` : dict or ``stcal.io.json.ResultFile``."""
     plain = content if isinstance(content, dict) else content.content()
-    return _indented(plain, "\n") + "\n"
+    text = _indented(plain, "\n")
+    return require_readable((text if len(text) < COMPACT_FROM else _encode(plain)) + "\n")
+
+
+def require_readable(text: str) -> str:
+    """Return a text to be written; refuse one that no command would read again."""
+    if len(text) > TABLE_BYTES:
+        raise InputError(
+            "E-OUTPUT-SIZE",
+            f"a result would have {len(text) / MB:.0f} MB, at most {TABLE_BYTES // MB} MB are read; give fewer rows",
+        )
+    return text
 
 
 _encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode

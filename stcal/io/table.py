@@ -3,16 +3,17 @@
 import csv
 import io
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
-from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
+from stcal.io.files import TABLE_BYTES, read_bytes, require_readable, require_written, text_of
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}
@@ -316,7 +317,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     except ValueError:
         pass  # there is text among the numbers: parse row by row
     try:
-        cells = list(csv.reader(rows))
+        cells = [[plain(cell) for cell in row] for row in csv.reader(rows)]
     except csv.Error:  # an unclosed cell, longer than any may be
         cells = []
     if len(cells) != len(rows):
@@ -373,7 +374,40 @@ def cells_of(line: str, between: str) -> list[str]:
     """Return the cells of a line, without surrounding white space; ``between`` : comma, ``;``, tab or space."""
     if between == " ":
         return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=between))]
+    return [plain(cell.strip()) for cell in next(csv.reader([line], delimiter=between))]
+
+
+FORMULA = re.compile(r"'*[=+\-@\t\r]")
+"""Text that a spreadsheet takes as a formula, or does not because of an apostrophe."""
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Return CSV of rows; an apostrophe keeps a spreadsheet from running names that begin as formulas do."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([_shown(cell) for cell in row] for row in rows)
+    return require_readable(out.getvalue())
+
+
+def _shown(cell: object) -> str:
+    text = str(cell)
+    if FORMULA.match(text) is None:
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return "'" + text
+    return text
+
+
+def plain(cell: str) -> str:
+    """Return the text of a cell that :func:`csv_text` wrote."""
+    return cell[1:] if cell[:1] == "'" and FORMULA.match(cell) else cell
+
+
+def csv_rows(text: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of CSV by the names of its columns; a row that is cut has None, as of ``csv.DictReader``."""
+    for row in csv.DictReader(io.StringIO(text)):
+        yield {name and plain(name): cell and plain(cell) for name, cell in row.items()}
 
 
 def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:

@@ -1,8 +1,6 @@
 """Reports of located tags and of a layout's calibration: page, table, text, and the files that ``--json`` writes."""
 
 import base64
-import csv
-import io
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -15,7 +13,7 @@ from stcal.geometry.print_modes import stretch_in_words
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.io.json import Finite, Matrix, Matrix6, Pair, Part, Pose, ResultFile
-from stcal.io.table import COVARIANCE, POSE, pose_cells
+from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
 from stcal.locate.calibration import CalibratedLayout
 from stcal.locate.chain import GoalChain, accepted, camera_from_obj, uncertain
 from stcal.locate.estimate import ObjPose, Shift
@@ -69,15 +67,14 @@ def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str
     str
         CSV with camera_from_obj, mm, and its covariance (form: ``data_layout.md``).
     """
-    out = io.StringIO()
+    refused = ""
     for scene in results:
         if scene.verdict.decision != "accept":
-            out.write(f"# {scene.name}: {scene.verdict.decision}: {'; '.join(scene.verdict.reasons)}\n")
-    write = csv.writer(out, lineterminator="\n")
+            refused += f"# {scene.name}: {scene.verdict.decision}: {'; '.join(scene.verdict.reasons)}\n"
     full = all(scene.pose is not None for scene in accepted(results))
     columns = [*POSE, *(COVARIANCE if full else ())]
     base = [BASE + column for column in columns] if chain else []
-    write.writerow(["scene", "tags", "exposures", *columns, "rms_px", "chi2_per_dof", *base])
+    rows: list[Sequence] = [["scene", "tags", "exposures", *columns, "rms_px", "chi2_per_dof", *base]]
     for scene in accepted(results):
         pose = uncertain(scene)
         cells = pose_cells(pose.rigid, pose.covariance if full else None)
@@ -90,8 +87,8 @@ def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str
         if chain:
             goal = chain.base_from_goal(scene.name, pose)
             row += pose_cells(goal.rigid, goal.covariance if full else None)
-        write.writerow(row)
-    return out.getvalue()
+        rows.append(row)
+    return refused + csv_text(rows)
 
 
 WIDE_PX, SMALL_PX = 900, 215

@@ -22,6 +22,8 @@ NAMES = {
     12: tuple(f"m{row}{column}" for row in "123" for column in "1234"),
 }
 UNIT = {"r": "rad", "s": "1", "m": "1"}
+DIGITS = 9
+"""Decimals of residuals, mm: there may be a million."""
 GRID = 7
 """Number of places along each side of the grid of the field."""
 MARGIN = 0.25
@@ -205,7 +207,7 @@ class RegistrationFile(ResultFile):
         result, lines = findings.registration, findings.lines
         names = NAMES[len(result.covariance)]
         same = ("model", "method", "covariance", "sigma_mm", "sigma_factor", "scaled", "threshold_mm", "ambiguous")
-        same += ("notes", "seed", "samples", "residuals")
+        same += ("notes", "seed", "samples")
         return cls.model_validate(
             {name: getattr(result, name) for name in same}
             | {
@@ -223,6 +225,7 @@ class RegistrationFile(ResultFile):
                 **dict(MeanRmsMax.model_validate(result.inlier_errors)),
                 "held_out": result.held_out and _held_out(result.held_out, lines),
                 "alternative": result.alternative and _alternative(result.alternative, lines),
+                "residuals": np.round(result.residuals, DIGITS),
                 "lines": lines,
                 "inliers": result.inliers.tolist(),
                 "outliers": _outliers(findings),
@@ -263,9 +266,9 @@ def _alternative(other: Alternative, lines: Sequence[int]) -> OtherTransform:
 def _outliers(findings: Findings) -> list[WrongPairRow]:
     """Returns the rows of outliers without validation: residuals are finite, and there may be many thousands."""
     rows = findings.registration.outliers
-    residuals, lengths = findings.registration.residuals[rows], findings.length_mm[rows].tolist()
+    residuals, lengths = findings.registration.residuals[rows], np.round(findings.length_mm[rows], DIGITS).tolist()
     return [
-        WrongPairRow.model_construct(line=findings.lines[row], residual_mm=residual, length_mm=length)
+        WrongPairRow.model_construct(line=findings.lines[row], residual_mm=np.round(residual, DIGITS), length_mm=length)
         for row, residual, length in zip(rows.tolist(), residuals, lengths, strict=True)
     ]
 

@@ -1,6 +1,6 @@
 """The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
-import tempfile
+import itertools
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext, suppress
@@ -23,7 +23,7 @@ from stcal.io.files import save
 from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, require_common_size
 from stcal.io.video import AUTO, write_frames
 from stcal.labels import DotLabel
-from stcal.parallel import Progress, kept_processes, one_thread
+from stcal.parallel import Progress, kept_processes, one_thread, scratch_folder
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
@@ -135,7 +135,7 @@ def run(
     if camera is None:
         options = replace(options, refine_camera=True)
     if out is None:
-        with tempfile.TemporaryDirectory(prefix="stcal-run-") as scratch:
+        with scratch_folder("run") as scratch:
             result = run(images, camera, scratch, target, board, options, progress, checks, every)
             return replace(result, out=None)
     if isinstance(images, str | Path) and Path(images).is_file():
@@ -217,17 +217,23 @@ def run_on_files(
 
 
 def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
-    """Returns the checks of a caller's own on a result; an error if one is none, or has the key of another."""
+    """Returns the checks of a caller's own on a result. One that could not be made is suspicious: the result stays."""
     checks: list[Check] = []
     for make in makers:
-        check = make(result)
-        name = getattr(make, "__name__", repr(make))
-        if not isinstance(check, Check):
-            raise InputError(
-                "E-CHECK-OWN", f"check {name}: returns {type(check).__name__}; a Check needed, such as judge returns"
-            )
-        if check.key in {other.key for other in (*result.checks, *checks)}:
-            raise InputError("E-CHECK-OWN", f"check {name}: key {check.key!r} is already used; choose another")
+        known = {other.key for other in (*result.checks, *checks)}
+        try:
+            check = make(result)
+            fault = f"returned {type(check).__name__}, a Check needed, such as judge returns"
+            if isinstance(check, Check):
+                fault = f"has the key {check.key!r} of another" if check.key in known else ""
+        except Exception as error:
+            fault = f"raised {type(error).__name__}: {error}"
+        if fault:
+            name = getattr(make, "__name__", repr(make))
+            keys = (f"{name}_{number}" if number else name for number in itertools.count())
+            key = next(key for key in keys if key not in known)
+            remedy = "mend this check; the result does not depend on it"
+            check = Check(key, f"Check {name}", "suspicious", f"it {fault}", (), 0, (), remedy)
         checks.append(check)
     return checks
 
@@ -505,7 +511,7 @@ def detect_images(
         An input cannot be used, or the folder holds a finished calibration.
     """
     if out is None:
-        with tempfile.TemporaryDirectory(prefix="stcal-detect-") as scratch:
+        with scratch_folder("detect") as scratch:
             return detect_images(images, camera, scratch, target, board, options, progress)
     options, progress = options or RunOptions(), progress or (lambda *_: None)
     target_design = body_of(target)

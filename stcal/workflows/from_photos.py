@@ -4,7 +4,6 @@ The steps are measure, axes, identify, compensate. It is the method of Zhang & W
 step are those of its own command, so that each step can be repeated by itself.
 """
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from stcal.io.images import find_images
 from stcal.io.join import join_tables
 from stcal.io.json import ResultFile, require_result_written
 from stcal.io.table import POSE, Table, read_table
-from stcal.parallel import Progress
+from stcal.parallel import Progress, scratch_folder
 from stcal.report.document import Block, Document, Section, bullets, links, listed, plot, tiles
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, log_limits
@@ -411,8 +410,8 @@ def from_measured(
 ) -> FromPhotos:
     """Perform the steps after measuring, for the table of :func:`read_joints`; otherwise as
     :func:`robot_from_photos`."""
-    with tempfile.TemporaryDirectory(prefix="stcal-photos-") as folder:
-        poses_file = Path(folder) / POSES
+    with scratch_folder("photos") as folder:
+        poses_file = folder / POSES
         save(poses_file, poses_csv(measured)[0])
         joined = join_tables(replace(read_table(poses_file, "poses"), where=PHOTOGRAPHS), values, IMAGE)
     data = read_measurements(joined.table, nominal)

@@ -1,5 +1,6 @@
 """No file is read beyond what its kind can have, and links that lead nowhere are an error like any other."""
 
+import json
 import os
 import tracemalloc
 from pathlib import Path
@@ -8,11 +9,12 @@ import pytest
 
 from stcal.boards.file import load_flat_board
 from stcal.errors import InputError
+from stcal.io import files
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board
 from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, keep_apart, read_bytes
 from stcal.io.json import read_json
-from stcal.io.table import read_table
+from stcal.io.table import csv_text, read_table
 from tests.outcome import fails_with
 
 READERS = {
@@ -66,3 +68,15 @@ def test_a_file_is_read_in_memory_of_its_own_size(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 3 * MB
     finally:
         tracemalloc.stop()
+
+
+def test_no_result_is_larger_than_what_is_read_again(monkeypatch):
+    rows = {"residuals": [[0.25, -1.5, 3.0]] * 400}
+    wide = len(files.json_text(rows))
+    monkeypatch.setattr(files, "COMPACT_FROM", wide // 2)
+    assert len(files.json_text(rows)) < wide // 2
+    assert json.loads(files.json_text(rows)) == rows
+    monkeypatch.setattr(files, "TABLE_BYTES", wide // 4)
+    for write in (lambda: files.json_text(rows), lambda: csv_text([["a" * wide]])):
+        with fails_with("E-OUTPUT-SIZE … give fewer rows"):
+            write()

@@ -1,10 +1,13 @@
 """Tables of other programs: separators, decimal commas, units in brackets, SpatialAnalyzer."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import stcal
 from stcal.io.join import join_tables
-from stcal.io.table import COVARIANCE, LENGTHS, read_table
+from stcal.io.table import COVARIANCE, LENGTHS, csv_rows, csv_text, read_table
 from tests.outcome import fails_with
 
 POINTS = np.array([[-594.288, -1.155, 162.397], [1616.584, -790.796, 506.870], [0.125, 2.0, -3.5]])
@@ -135,3 +138,19 @@ def test_a_covariance_is_whole_or_there_is_none(tmp_path):
     with fails_with("E-TABLE-COLUMN-MISSING … tool_cov_ry_z"):
         found.pose_covariances("tool_")
     assert found.pose_covariances("other_") is None
+
+
+def test_names_that_a_spreadsheet_would_run_are_guarded_and_read_back(tmp_path):
+    """CWE-1236; figures stay figures."""
+    names = ["=1+11/a.jpg", "+a", "-b", "@c", "'=d", "'e", "f"]
+    text = csv_text([["image", "=x"], *([name, "-0.5"] for name in names)])
+    assert [line.split(",") for line in text.splitlines()[1:3]] == [["'=1+11/a.jpg", "-0.5"], ["'+a", "-0.5"]]
+    assert [row["image"] for row in csv_rows(text)] == names
+    assert {row["=x"] for row in csv_rows(text)} == {"-0.5"}
+    assert list(read_table(table(tmp_path, text), "t").text("image")) == names
+
+
+def test_no_other_place_writes_csv():
+    package = Path(stcal.__file__).parent
+    found = {path for path in package.rglob("*.py") if "csv.writer(" in path.read_text(encoding="utf-8")}
+    assert found == {package / "io" / "table.py"}

@@ -77,7 +77,7 @@ def test_json_is_the_result(model):
     assert np.shape(content["covariance"]) == (p, p)
     assert len(content["covariance_of"]) == len(content["units"]["covariance"]) == p
     assert content["inliers"] == result.inliers.tolist()
-    np.testing.assert_allclose(content["residuals"], result.residuals)
+    np.testing.assert_allclose(content["residuals"], result.residuals, atol=1e-9)
     assert content["lines"] == list(range(2, 42))
     assert [o["line"] for o in content["outliers"]] == [19, 5]
     assert content["held_out"]["inliers"]["mean_mm"] == result.held_out.of_inliers.mean_mm

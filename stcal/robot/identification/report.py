@@ -1,8 +1,6 @@
 """Text, page and result file of an identified robot, and the table of mastering offsets for its controller."""
 
-import csv
-import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
@@ -14,7 +12,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.io.files import require_written
 from stcal.io.json import Matrix, Part, ResultFile
 from stcal.io.poses.columns import fixed
-from stcal.io.table import read_table
+from stcal.io.table import csv_text, read_table
 from stcal.report.document import Block, Document, Notes, Section, Table, fold, listed, page_only, plot, subheading
 from stcal.report.svg import COLOURS, Axes, Drawing, limits
 from stcal.report.text import NONE, number
@@ -568,21 +566,19 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
     """
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     change, change_sigma, known = zeros(result, nominal)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(HEAD)
+    rows: list[Sequence] = [HEAD]
 
     def row(joint: int, name: str, old: float, new: float, deviation: float, unit: str, told: bool) -> None:
         shown = [fixed(v, DIGITS[unit]) for v in (old, new, new - old)]
         sigma_text = fixed(deviation, DIGITS[unit]) if told else ""
-        writer.writerow([joint, name, *shown, sigma_text, unit, "yes" if told else "no"])
+        rows.append([joint, name, *shown, sigma_text, unit, "yes" if told else "no"])
 
     for i, slides in enumerate(nominal.prismatic):
         for name, unit, old, new, deviation in zip(DH, UNITS, before[i], values[i], sigma[i], strict=True):
             row(i + 1, name, old, new, deviation, unit, deviation > 0)
         factor, unit = (1.0, "mm") if slides else (float(np.degrees(1.0)), "deg")
         row(i + 1, ZERO, 0.0, factor * change[i], factor * change_sigma[i], unit, bool(known[i]))
-    return stream.getvalue()
+    return csv_text(rows)
 
 
 def require_offsets_written(path: str | Path, result: Identified, nominal: Robot) -> None:

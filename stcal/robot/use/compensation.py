@@ -1,7 +1,6 @@
 """Joint values of an identified arm that reach the programmed poses, in the programmed configuration."""
 
-import csv
-import io
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +13,7 @@ from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.json import Part, ResultFile, Vector, Vector3
-from stcal.io.table import pose_values, read_table
+from stcal.io.table import csv_text, pose_values, read_table
 from stcal.parallel import one_thread
 from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import (
@@ -443,14 +442,12 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
     str
         CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     columns = joint_columns(robot)
     names = result.targets.names
     head = [*names, "line", "target", *columns, "status", "error_mm", "error_deg"]
     if result.nominal:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
-    writer.writerow(head)
+    rows: list[Sequence] = [head]
     none = [""] * len(columns)
     for i, line in enumerate(result.targets.lines):
         found = result.found
@@ -466,8 +463,8 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
             row += joint_cells(robot, result.nominal.q[i]) if usable else none
             row.append(result.nominal.status[i])
             row += [f"{result.before_mm[i]:.6f}", f"{np.degrees(result.before_rad[i]):.6f}"] if usable else ["", ""]
-        writer.writerow(row)
-    return stream.getvalue()
+        rows.append(row)
+    return csv_text(rows)
 
 
 def require_compensated_written(path: str | Path, result: Compensated, robot: Robot) -> None:

@@ -4,8 +4,7 @@ A greedy choice is followed by exchanges of single poses while they help (Fedoro
 inverse information matrix is updated by the few rows of a pose (Sherman, Morrison & Woodbury).
 """
 
-import csv
-import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,7 +17,7 @@ from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, requi
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.json import ResultFile
-from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
+from stcal.io.table import POSE, csv_text, pose_cells, pose_values, read_table, require_pose_table_written
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
     SEEN,
@@ -340,12 +339,10 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
     str
         CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
     """
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)])
+    rows: list[Sequence] = [["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)]]
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):
-        writer.writerow([i, *joint_cells(robot, q), *pose_cells(pose)])
-    return stream.getvalue()
+        rows.append([i, *joint_cells(robot, q), *pose_cells(pose)])
+    return csv_text(rows)
 
 
 def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, tool: str = "") -> None:

@@ -1,7 +1,5 @@
 """Text and pages of compensation, verification, evaluation and pose design."""
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
-from stcal.io.table import QUATERNION, read_table
+from stcal.io.table import QUATERNION, csv_text, read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
 from stcal.report.svg import COLOURS, DASH, INK, Axes, Box, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
@@ -375,8 +373,7 @@ def evaluated_csv(result: Evaluation) -> str:
     str
         CSV in mm and degrees (form: ``data_layout.md``).
     """
-    data, robots, stream = result.seen.data, result.robots, io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
+    data, robots = result.seen.data, result.robots
     turned, points = len(robots[0].rotation_rad) > 0, data.positions is not None
     head = ["line", "target", *joint_columns(robots[0].robot)]
     measured = ("x_mm", "y_mm", "z_mm") if points else ("distance_mm", "from_row")
@@ -391,7 +388,7 @@ def evaluated_csv(result: Evaluation) -> str:
             head.append(f"{name}_residual_mm")
         head += [f"{name}_error_mm", *([f"{name}_error_deg"] if turned else [])]
         modelled.append(tips_of(evaluated.state, data).translation)
-    writer.writerow(head)
+    table: list[Sequence] = [head]
     turns = Poses(data.rotations, data.points()).quaternions() if data.rotations is not None else None
     place_of = {int(row): i for i, row in enumerate(result.seen.first)}
     for row in range(len(data)):
@@ -408,8 +405,8 @@ def evaluated_csv(result: Evaluation) -> str:
             residual = np.zeros(evaluated.residuals.shape[1]) if at is None else evaluated.residuals[at]
             cells += [*(_cells(there[row]) if points else ()), *_cells(residual), *_cells([np.linalg.norm(residual)])]
             cells += _cells(np.degrees(evaluated.rotation_rad[[row]])) if turned else []
-        writer.writerow(cells)
-    return stream.getvalue()
+        table.append(cells)
+    return csv_text(table)
 
 
 def require_evaluated_written(path: str | Path, result: Evaluation) -> None:

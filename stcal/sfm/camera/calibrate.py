@@ -1,6 +1,5 @@
 """Calibration of an unknown camera from photographs of the dot board: the calls in order, and their result."""
 
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from stcal.geometry.camera import COLMAP_MODELS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, unseen_lines
-from stcal.parallel import Progress, counted, one_thread
+from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.camera.checks import (
     AUTO,
     MIN_REACH,
@@ -126,7 +125,7 @@ def calibrate_camera(
     camera = start_camera(*require_common_size(files)[0], colmap_model)
     before: Intrinsics | None = None
     settled = of_perspective = False
-    with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
+    with scratch_folder("camera") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
             # No size is given: it comes from most of the images, and messages should say so.
             lens = camera.focal, camera.centre, camera.distortion

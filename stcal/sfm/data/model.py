@@ -1,7 +1,5 @@
 """The model of one group: camera poses, labelled points, and the centres measured in its images."""
 
-import csv
-import io
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -14,6 +12,7 @@ from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, Similarity
+from stcal.io.table import csv_text
 from stcal.labels import CircleLabel, Label, parse_labels
 
 
@@ -77,13 +76,11 @@ def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageO
 
 def detections_csv(observations: list[ImageObservations]) -> str:
     """Returns the text of ``detections.csv``."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["image", "label", "x_px", "y_px", "sigma_px"])
+    rows: list[Sequence] = [["image", "label", "x_px", "y_px", "sigma_px"]]
     for image in observations:
         for label, (x, y), sigma in zip(image.labels, image.centre_px, image.sigma_px(), strict=True):
-            writer.writerow([image.name, label, f"{x:.5f}", f"{y:.5f}", f"{sigma:.5f}"])
-    return stream.getvalue()
+            rows.append([image.name, label, f"{x:.5f}", f"{y:.5f}", f"{sigma:.5f}"])
+    return csv_text(rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

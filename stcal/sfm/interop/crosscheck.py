@@ -1,6 +1,5 @@
 """Cross-check against the native COLMAP: same database, same initial pairs, same thresholds; result file and text."""
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import require_arguments, rms
 from stcal.geometry.rigid import Poses, Rigid, align_similarity
 from stcal.io.json import read_json
-from stcal.parallel import Progress
+from stcal.parallel import Progress, scratch_folder
 from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import Calibration, calibrate, on_luminous_surface, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -123,8 +122,7 @@ def _compared(
     ids = image_ids(run.observations)
     native_models, pycolmap_models, adjusted = [], [], []
     groups = run.groups()
-    with tempfile.TemporaryDirectory(prefix="stcal-crosscheck-") as scratch:
-        folder = Path(scratch)
+    with scratch_folder("crosscheck") as folder:
         copy_database(run.database, folder / "native.db", schema, run)
         copy_database(run.database, folder / "ours.db", "4.2", run)
         for index, (name, group) in enumerate(groups.items()):

@@ -1,7 +1,5 @@
 """Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
-import csv
-import io
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
@@ -28,7 +26,7 @@ from stcal.io.poses.programs import (
     ros2_launch,
     static_of_joint,
 )
-from stcal.io.table import require_poses_written
+from stcal.io.table import csv_rows, csv_text, require_poses_written
 from stcal.io.toml import load_yaml, opencv_matrix
 from stcal.sfm.interop import gltf
 from stcal.sfm.interop.export_content import Content, content_of
@@ -42,9 +40,7 @@ COLUMNS = (
 
 def table(content: Content) -> str:
     """Returns CSV with a row per face and circle, target frame. Circles have the axes and normals of their faces."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows: list[Sequence] = [COLUMNS]
     for face, pose in content.faces.items():
         x, y, z, w = Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True).tolist()
         turned = [w, x, y, z, *pose.rotation[:, 2].tolist()]
@@ -52,14 +48,14 @@ def table(content: Content) -> str:
         sigma_cells = (
             [""] * 6 if sigma is None else [_digits(v) for v in (*(1e3 * sigma[1]), *(1e3 * np.degrees(sigma[0])))]
         )
-        writer.writerow(["face", face, "", *pose.translation.tolist(), *turned, "", *sigma_cells])
+        rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *sigma_cells])
         for circle in content.of_face(face):
             sigma_cells = [""] * 3 if circle.sigma_mm is None else [_digits(1e3 * v) for v in circle.sigma_mm]
             place = circle.xyz_mm.tolist()
-            writer.writerow(
+            rows.append(
                 ["circle", face, circle.label.circle, *place, *turned, circle.radius_mm, *sigma_cells, "", "", ""]
             )
-    return stream.getvalue()
+    return csv_text(rows)
 
 
 def opencv(content: Content) -> str:
@@ -185,7 +181,7 @@ def read_urdf(text: str) -> list[Static]:
 def read_table(text: str) -> list[Static]:
     """Returns the frames in a text of :func:`table`."""
     frames: list[Static] = []
-    for row in csv.DictReader(io.StringIO(text)):
+    for row in csv_rows(text):
         turn, place = ([float(row[name]) for name in COLUMNS[at]] for at in (slice(6, 10), slice(3, 6)))
         pose = Poses.from_quaternions([turn], [place])[0]
         if row["kind"] == "face":

@@ -1,7 +1,5 @@
 """Export of the final model for other programs: COLMAP's two forms, NVM and Bundler, checked against the run."""
 
-import csv
-import io
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,6 +15,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import TARGET_MODEL
 from stcal.io.json import Part
+from stcal.io.table import csv_text
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.interop.export_content import BOARD_RGB, colours
@@ -300,16 +299,14 @@ def _views(run: SavedRun, reconstruction: pycolmap.Reconstruction, points: Seque
 def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
     """Returns ``labels.csv``. Its first column is the point's id in COLMAP's files, in others its index from 0."""
     covariance = faces.circle_covariance_mm2
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(LABEL_COLUMNS)
+    rows: list[Sequence] = [LABEL_COLUMNS]
     for place, point in enumerate(points):
         sigma = [""] * 3
         if point.label in covariance:
             sigma = [f"{1e3 * s:.3f}" for s in np.sqrt(np.diag(covariance[point.label]))]
         name = point.id if kind.startswith("colmap") else place
-        writer.writerow([name, point.group, point.label, *map(repr, point.xyz), *sigma])
-    return stream.getvalue()
+        rows.append([name, point.group, point.label, *map(repr, point.xyz), *sigma])
+    return csv_text(rows)
 
 
 def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float) -> str:

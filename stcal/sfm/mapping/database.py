@@ -1,7 +1,5 @@
 """The COLMAP database: one camera, one frame for each image, labelled keypoints, and matches."""
 
-import csv
-import io
 import os
 import re
 from collections.abc import Sequence
@@ -11,6 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.io.table import csv_text
 from stcal.labels import CircleLabel
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
@@ -129,20 +128,16 @@ def labels_csv(
     observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray], residual_px: Sequence[np.ndarray]
 ) -> str:
     """``labels.csv``, a row for each keypoint; residuals outside of the result are nan, and their cells empty."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
     columns = (
         "image_id keypoint image group label x_px y_px corrected_x_px corrected_y_px var_x_px2 cov_xy_px2 var_y_px2 "
         "residual_x_px residual_y_px"
     )
-    writer.writerow(columns.split())
+    rows: list[Sequence] = [columns.split()]
     ids = image_ids(observations)
     for image, corrected, residual in zip(observations, corrected_px, residual_px, strict=True):
         covariance = image.covariance_px2.reshape(-1, 4)[:, [0, 1, 3]]
         values = np.column_stack([image.centre_px, corrected, covariance]).tolist()
         for k, label in enumerate(image.labels):
             residual_cells = ["" if np.isnan(v) else repr(v) for v in residual[k].tolist()]
-            writer.writerow(
-                [ids[image.name], k, image.name, image.group, label, *map(repr, values[k]), *residual_cells]
-            )
-    return stream.getvalue()
+            rows.append([ids[image.name], k, image.name, image.group, label, *map(repr, values[k]), *residual_cells])
+    return csv_text(rows)

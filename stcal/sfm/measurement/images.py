@@ -1,7 +1,6 @@
 """Measurement of camera_from_target in each image of a folder, with a calibrated target."""
 
 import hashlib
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model, read_camera
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images
-from stcal.parallel import Progress, counted, one_thread
+from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -145,8 +144,7 @@ def measure(
     if options.sequence:
         result = follow_files(files, camera, replace(target, design=design), board, options, step)
     else:
-        with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
-            cache = Path(scratch)
+        with scratch_folder("measure") as cache:
             detection = detect_files(
                 files,
                 camera,

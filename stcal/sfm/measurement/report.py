@@ -1,7 +1,6 @@
 """Result file, table and report of measured poses."""
 
-import csv
-import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
-from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells, require_pose_table_written
+from stcal.io.table import COVARIANCE, POSE, Table, common_columns, csv_text, pose_cells, require_pose_table_written
 from stcal.report.document import Block, Document, Printed, Section, alarms, fold, legend, plot, plots
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, count_ticks, limits, round_below
@@ -124,16 +123,14 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
     where, joint_columns, rows = "", [], None
     if joints is not None:
         where, (joint_columns, rows) = joints.where, _joint_cells(joints, header + common)
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header + joint_columns + common)
+    table: list[Sequence] = [header + joint_columns + common]
     unmatched = []
     for image, common_error in zip(result.images, result.common, strict=True):
         if rows is not None and image.name not in rows:
             unmatched.append(f"{image.name}: measured, but not in {where}")
             continue
         pose = image.pose
-        writer.writerow(
+        table.append(
             [image.name, "+".join(pose.faces), len(pose.labels), pose.status]
             + pose_cells(pose.camera_from_target, pose.covariance)
             + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_redundancy():.4f}"]
@@ -148,7 +145,7 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
                 "E-IMAGES-UNMATCHED",
                 f"{where}: none of its images was measured; names are like {result.images[0].name}",
             )
-    return stream.getvalue(), tuple(unmatched)
+    return csv_text(table), tuple(unmatched)
 
 
 def require_table_written(path: str | Path, result: MeasureResult, joints: Table | None = None) -> None:

@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import hashlib
-import io
 import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -35,6 +34,7 @@ from stcal.io.files import (
     save,
 )
 from stcal.io.json import checked, read_json
+from stcal.io.table import csv_rows
 from stcal.labels import Label
 from stcal.parallel import Progress
 from stcal.report.document import pdf_of, require_pdf
@@ -239,7 +239,7 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
     path = run / "labels.csv"
     rows: dict[str, list[list[float]]] = {name: [] for name in names}
     try:
-        for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+        for row in csv_rows(read_bytes(path, TABLE_BYTES).decode()):
             if row["image"] in rows and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
                 rows[row["image"]].append(values)

@@ -2,7 +2,6 @@
 with the hashes stored at its end."""
 
 import csv
-import io
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -35,6 +34,7 @@ from stcal.io.files import (
     require_unchanged,
 )
 from stcal.io.json import Part, checked, read_json
+from stcal.io.table import csv_rows
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -268,7 +268,7 @@ def _as_written(path: Path) -> Iterator[None]:
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
     """Observations and corrected centres from ``labels.csv``; ``names``: (name, group, circles) of the images."""
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
-    for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+    for row in csv_rows(read_bytes(path, TABLE_BYTES).decode()):
         if None in row.values():
             raise ValueError(f"image {row['image']}: keypoint {row['keypoint']}: its row is cut")
         rows[row["image"]].append(row)
