@@ -9,13 +9,14 @@ from scipy.spatial.transform import Rotation
 
 import stcal
 from stcal import handeye, robot, sfm
+from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
 from stcal.io.images import decode
 from stcal.robot.kinematics.model import mh80
 from stcal.sfm.detect.files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
-from tests.outcome import fails_with
+from tests.outcome import fails_with, refuses
 
 MATRIX = np.array([[900.0, 0, 640.3], [0, 905.0, 355.8], [0, 0, 1]])
 SIZE = (1280, 720)
@@ -181,3 +182,20 @@ def test_the_repr_of_a_large_result_is_a_line():
     assert repr(result).startswith("Registration(")
     assert len(repr(result)) < 1000
     assert "\n" not in repr(result)
+
+
+def test_masked_values_are_refused_where_arrays_are_taken():
+    pair = np.random.default_rng(0).uniform(-100, 100, (20, 3))
+    other = np.ma.array(pair + 1.0, mask=np.zeros_like(pair, bool))
+    stcal.register.register(pair, other)  # nothing is masked
+    other.mask[4] = True
+    for call in (lambda: stcal.register.register(pair, other), lambda: frozen(other)):
+        refuses("E-ARRAY-NOT-FINITE … 3 values are masked; leave out their rows", call)
+
+
+def test_a_repr_tells_the_notes():
+    pair = np.random.default_rng(0).uniform(-100, 100, (20, 3))
+    off = pair + np.eye(20, 3) * 9.0
+    result = stcal.register.register(pair, off, method="least-squares")
+    assert result.notes
+    assert result.notes[0] in repr(result)

@@ -92,7 +92,17 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         ),
     ),
     **dict.fromkeys(
-        ("check_raises", "csv_formula", "live_rebinding", "pymp_left", "reg_million_pairs"), ()
+        (
+            "api_handeye_swapped",
+            "api_limits_degrees",
+            "api_masked",
+            "check_raises",
+            "csv_formula",
+            "live_rebinding",
+            "pymp_left",
+            "reg_million_pairs",
+        ),
+        (),
     ),  # have tests of their own
     "name_choice": (Typed(says=("OPENCV", "written")), Typed(says=("written",)), Typed(says=("written",))),
     "opencv_fisheye_model": (
@@ -223,7 +233,7 @@ OPEN = set(
     re.findall(
         r"\S+",
         """
-    anamorphic_calibrate api_handeye_swapped api_limits_degrees api_masked board_pitch_3_percent
+    anamorphic_calibrate board_pitch_3_percent
     drawing_y_down he_drift_1.7mm he_franka_column_major he_mobile_planar_4dof
     he_scara_4dof_noise he_tcp_set_halfway isoluminant_circles keem_cube_folds
     loc_motion_blur_6px principal_point_outside rob_orientation_by_controller

@@ -52,14 +52,19 @@ else:
 class Brief:
     """Base of results with many values, made with ``@dataclass(repr=False)``.
 
-    Their ``repr`` is one short line with plain values, and the size of everything else.
+    Their ``repr`` is one line with plain values, notes, and the size of everything else.
     """
 
     __slots__ = ()
 
     def __repr__(self) -> str:
         values = ((field.name, getattr(self, field.name)) for field in fields(self))  # type: ignore[arg-type]
-        return f"{type(self).__name__}({', '.join(f'{name}={_brief(value)}' for name, value in values)})"
+        shown = (f"{name}={list(value) if name in TOLD and value else _brief(value)}" for name, value in values)
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+TOLD = {"notes", "doubts"}
+"""Fields whose sentences a ``repr`` has in full."""
 
 
 def _brief(value: object) -> str:
@@ -174,12 +179,19 @@ def require_arguments(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def judged(*args: P.args, **kwargs: P.kwargs) -> R:
         for name, value in bind(*args, **kwargs).arguments.items():
+            _require_unmasked(value, f"{function.__name__}: {name}")
             (admits, words), is_choice = rules().get(name, NO_RULE)
             if not admits(value):
                 _refuse(function.__name__, name, value, words, is_choice)
         return function(*args, **kwargs)
 
     return judged
+
+
+def _require_unmasked(value: object, what: str) -> None:
+    """Refuse masked entries, whose values NumPy's functions would take."""
+    if np.ma.isMaskedArray(value) and (masked := int(np.ma.count_masked(value))):
+        raise InputError("E-ARRAY-NOT-FINITE", f"{what}: {masked} values are masked; leave out their rows")
 
 
 def _holds_text(values: object) -> bool:
@@ -199,6 +211,7 @@ def frozen(
     ``shape`` : the required one, if any; ``None`` in it admits any length; ``what`` : name of the values in messages;
     ``finite`` : whether floats must be finite; if not, NaN stands for values that are not known.
     """
+    _require_unmasked(values, what)
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")
     try:

@@ -14,6 +14,7 @@ from stcal.handeye import solve
 from stcal.handeye.choose import Choice, choose
 from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
 from stcal.handeye.data.views import Views
+from stcal.handeye.judge.remarks import of_setup
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions
@@ -165,5 +166,7 @@ def handeye(
     prior = None if views is None else options.camera
     choosing = method is None and not options.names_unknowns
     found = validated(pairs, asked, method, views, options, prior, rows, choosing=choosing)
-    outcome = Outcome("", found.result, found.held_out, notes=found.notes, choice=found.choice, pairs=pairs)
-    return replace(found.result, judgement=judged(outcome))
+    x, z = found.result.mount_from_camera, found.result.stand_from_board
+    notes = (*found.notes, *of_setup(x, z, asked, setup is not None))
+    outcome = Outcome("", found.result, found.held_out, notes=notes, choice=found.choice, pairs=pairs)
+    return replace(found.result, judgement=judged(outcome), notes=outcome.all_notes())

@@ -16,8 +16,8 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
-from stcal.handeye.judge.mistakes import HALL_MM, repair
-from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt
+from stcal.handeye.judge.mistakes import repair
+from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
 from stcal.handeye.pipeline import Validated, validated
 from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.result import HandEye
@@ -134,31 +134,6 @@ def _of_no_covariance(given: HandEyeInput, result: HandEye) -> tuple[str, ...]:
     )
 
 
-FAR_MM, TOO_FAR_MM = 600.0, 1000.0
-"""Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
-stated; brackets are shorter."""
-LONG_MM, NEARER = 250.0, 0.5
-"""Distance of a camera from the flange, and share of it within which the board lies of the base's origin, from which
-on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""
-
-
-def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, ...]:
-    """Returns a note if a setup that nobody stated puts the camera where no flange carries it. Poses of the other setup
-    that were inverted before fit as well, so that no residual tells."""
-    away, board = (float(np.linalg.norm(t.translation)) for t in (result.mount_from_camera, result.stand_from_board))
-    exchanged = away > LONG_MM and board < NEARER * away
-    if setup != "eye-in-hand" or given.setup is not None or (away < FAR_MM and not exchanged):
-        return ()
-    why = f"and the board only {board:.0f} mm off the base's origin" if exchanged else "farther than brackets reach"
-    said = (
-        f"the camera is {away:.0f} mm off the flange, {why}, and residuals are the same in both setups: "
-        f"{'name the columns x_mm … if lengths are mm that stand in columns of metres; ' if away > HALL_MM else ''}"
-        "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
-        + ("; or both sides are the inverses of what they are named: rename both, or give --poses-are" * exchanged)
-    )
-    return (Grave(said) if away > TOO_FAR_MM else said,)
-
-
 def calibrate(
     given: HandEyeInput,
     setup: Setup,
@@ -194,7 +169,8 @@ def calibrate(
         result, options, notes = solution.result, solution.options, solution.notes
         if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
             notes = (*notes, meant)
-        notes = (*notes, *_of_setup(given, setup, result), *_of_no_covariance(given, result))
+        meant = () if given.setup else of_setup(result.mount_from_camera, result.stand_from_board, setup)
+        notes = (*notes, *meant, *_of_no_covariance(given, result))
         if not offset_known:
             result, lagging = lag_tried(given, setup, options, result)
             notes = (*notes, *lagging)

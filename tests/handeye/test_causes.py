@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import stcal.handeye
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.pairs import HandEyePoses
@@ -155,3 +156,25 @@ def test_a_board_at_the_base_needs_its_setup_stated():
     assert any("off the base's origin" in note and "--setup eye-to-hand" in note for note in outcome.notes)
     right = calibrate(HandEyeInput("poses", pairs), "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
     assert not any("--setup" in note for note in right.notes)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        (lambda a, b: (a, b), ""),
+        (lambda a, b: (b, a), "the two sides are exchanged"),
+        (lambda a, b: (a.inverse(), b.inverse()), "both are the inverses of what they are named"),
+    ],
+)
+@pytest.mark.parametrize("setup", [None, "eye-in-hand"])
+def test_sides_that_are_exchanged_are_doubted(given, told, setup):
+    """No residual tells; the camera is then as far off the flange as the board is off the base."""
+    pairs = simulated_stream(np.random.default_rng(5), 15, "eye-in-hand", 0.0).pairs
+    result = stcal.handeye.handeye(*given(pairs.base_from_flange, pairs.camera_from_board), setup=setup)
+    assert any(told in note for note in result.notes) if told else not result.notes
+
+
+def test_lengths_of_a_hall_are_doubted():
+    pairs = simulated_stream(np.random.default_rng(5), 15, "eye-in-hand", 0.0).pairs
+    result = stcal.handeye.handeye(pairs.base_from_flange, pairs.camera_from_board, setup="eye-in-hand", unit="m")
+    assert any("mm from the camera" in note and isinstance(note, Grave) for note in result.notes)

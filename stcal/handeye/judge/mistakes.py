@@ -19,7 +19,7 @@ from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.record import FRAMES
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge.remarks import Aside, Grave, of_still, spoken
+from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still, spoken
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
 from stcal.io.poses.rotations import INVERTED as CONJUGATED
@@ -40,8 +40,6 @@ NAMED = "rename them in the file, or give --poses-are where the file does not na
 NAMED_ORDER = "name the columns so; for a file without names of columns give --rotation {side}={order}"
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
-HALL_MM = 5e4
-"""Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 

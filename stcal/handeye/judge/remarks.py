@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from stcal.errors import StcalError
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import STALE, HandEyePoses, Loop, Setup, apart
 from stcal.handeye.judge.observability import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
 from stcal.handeye.methods.closed_form import robust
@@ -121,6 +121,8 @@ STILL = 0.005
 feedback at rest repeats to micrometres."""
 FEW = 200
 """Largest number of poses of which all pairs are compared for what is usual."""
+HALL_MM = 5e4
+"""Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
 NEAR_MM = 20.0
 """Distance, in mm, below which no camera sees a board."""
 
@@ -249,11 +251,41 @@ def _is_other(scale: float, sigma: float, sigmas: float) -> bool:
 def of_distance(loop: Loop) -> tuple[str, ...]:
     """Returns a note if all lengths are in another unit, which no equation shows."""
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
+    if away > HALL_MM:
+        remedy = "if lengths are in mm, name the columns x_mm …, or give the unit mm"
+        return (Grave(f"the board is {away:.0f} mm from the camera (median): {remedy}"),)
     if away >= NEAR_MM:
         return ()
     remedy = "name the columns x_m … or x_in …, or give --length-unit m where none states a unit"
     message = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres or inches, {remedy}"
     return (Grave(message),)
+
+
+FAR_MM, TOO_FAR_MM = 600.0, 1000.0
+"""Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
+stated; brackets are shorter."""
+LONG_MM, NEARER = 250.0, 0.5
+"""Distance of a camera from the flange, and share of it within which the board lies of the base's origin, from which
+on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""
+
+
+def of_setup(x: Rigid, z: Rigid, setup: Setup, stated: bool = False) -> tuple[str, ...]:
+    """Returns a note if the camera is where no flange carries it, unless the setup was ``stated``, or if X and Z seem
+    to be exchanged. Poses of the other setup, or sides that were exchanged or inverted, fit as well: no residual
+    tells."""
+    away, board = float(np.linalg.norm(x.translation)), float(np.linalg.norm(z.translation))
+    exchanged = away > LONG_MM and board < NEARER * away
+    if setup != "eye-in-hand" or not (exchanged or (away >= FAR_MM and not stated)):
+        return ()
+    why = f"and the board only {board:.0f} mm off the base's origin" if exchanged else "farther than brackets reach"
+    said = (
+        f"the camera is {away:.0f} mm off the flange, {why}, and residuals are the same in both setups: "
+        f"{'name the columns x_mm … if lengths are mm that stand in columns of metres; ' if away > HALL_MM else ''}"
+        "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
+        + "; or the two sides are exchanged, or both are the inverses of what they are named: rename both, or give "
+        "--poses-are" * exchanged
+    )
+    return (Grave(said) if away > TOO_FAR_MM and not stated else said,)
 
 
 def of_rounds(settled: bool) -> tuple[str, ...]:

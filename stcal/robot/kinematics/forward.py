@@ -8,9 +8,10 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.robot.kinematics.conditions import USUAL, Conditions, loaded
-from stcal.robot.kinematics.model import Chain, Elasticity, Robot
+from stcal.robot.kinematics.model import Chain, Elasticity, Robot, warn_of_degrees
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
@@ -44,7 +45,7 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
     InputError
         Joint values of another shape or not finite; an unknown tool; a mass that no arm carries.
     """
-    values = _joint_vectors(q, len(robot.rows))
+    values = _joint_vectors(q, robot)
     return flange_poses(_from_base_to_tool(robot, tool), values, loaded(payload_kg, len(values)))
 
 
@@ -67,7 +68,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     InputError
         Joint values of another shape or not finite; an unknown tool.
     """
-    values = _joint_vectors(q, len(robot.rows))
+    values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)
     axes, origins = joint_frames(chain, values)
     z = axes[..., 2]  # (n, m, 3)
@@ -344,10 +345,11 @@ def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
     return replace(chain, last_from_flange=chain.last_from_flange @ robot.tool(tool))
 
 
-def _joint_vectors(q: ArrayLike, n: int) -> np.ndarray:
-    values = np.atleast_2d(np.asarray(q, float))
+def _joint_vectors(q: ArrayLike, robot: Robot) -> np.ndarray:
+    values, n = np.atleast_2d(frozen(q, None, "joint values", finite=False)), len(robot.rows)
     if values.ndim != 2 or values.shape[1] != n:
         raise InputError("E-ARRAY-SHAPE", f"joint values: shape {values.shape}, (m, {n}) needed for {n} joints")
     if not np.isfinite(values).all():
         raise InputError("E-ARRAY-NOT-FINITE", "joint values: hold values that are not finite")
+    warn_of_degrees(values, ~robot.prismatic, f"robot {robot.name}: joint values")
     return values

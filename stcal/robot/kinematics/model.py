@@ -1,6 +1,7 @@
 """The model of a robot arm: Denavit-Hartenberg rows, joints, elasticity, tools; and an example."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Real
@@ -9,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
@@ -19,6 +20,18 @@ Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
 MOST_RAD = 2 * np.pi + 1e-6
 """Largest angle of a row, except the joint's own, rad. A larger one is taken to be in degrees."""
+
+
+MOST_TURNS = 4.0
+"""Number of turns, as an angle, that joints are not expected to reach: 1440°, or 25 rad where degrees were meant."""
+
+
+def warn_of_degrees(values: np.ndarray, turns: np.ndarray, what: str) -> None:
+    """Warns if values (m, n) of joints that turn, a mask (n,), are of many turns, as degrees taken for rad are."""
+    largest = float(np.abs(values[:, turns]).max(initial=0.0))
+    if largest > 2 * np.pi * MOST_TURNS:
+        note = f"{what}: {largest:.4g} rad are {largest / (2 * np.pi):.0f} turns; if it is degrees, give np.radians(…)"
+        warnings.warn(note, InputNote, stacklevel=3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,6 +318,11 @@ class Robot(Brief):
         ------
         InputError
             Arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+
+        Warns
+        -----
+        InputNote
+            Limits of many turns, which seem to be degrees.
         """
         rows = frozen(table, None, f"robot {name}: D-H table")
         if rows.ndim != 2 or rows.shape[1] not in (4, 5):
@@ -320,6 +338,9 @@ class Robot(Brief):
                 f"robot {name}: limits of shape {ends.shape}, types of {len(kinds)} joints; ({n}, 2) and {n} needed",
             )
         joints = tuple(Joint(kind, *pair) for kind, pair in zip(kinds, ends.tolist(), strict=True))
+        warn_of_degrees(
+            np.where(np.isfinite(ends), ends, 0.0).T, np.array(kinds) == "revolute", f"robot {name}: limits"
+        )
         return cls(name, convention, tuple(DHRow(*row) for row in rows.tolist()), joints)
 
     @property

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import (
@@ -144,3 +144,15 @@ def test_forward_kinematics_is_about_as_fast_as_products_of_matrices():
         taken.append((middle - start, time.process_time() - middle))
     own, products = np.min(taken, axis=0)
     assert own < 6 * products
+
+
+def test_degrees_that_are_taken_for_radians_are_told():
+    table = [[25, -np.pi / 2, 400, 0], [455, 0, 0, -np.pi / 2], [35, -np.pi / 2, 0, 0]]
+    with pytest.warns(InputNote, match="limits: 100 rad are 16 turns"):
+        Robot.from_dh(table, "standard", np.tile([-100.0, 100.0], (3, 1)))
+    arm = Robot.from_dh(table, "standard", np.tile([-100.0, np.inf], (3, 1)), types=["prismatic"] * 3)
+    forward(arm, [90.0, 30.0, -45.0])  # mm
+    arm = Robot.from_dh(table, "standard", np.tile([-6.3, 6.3], (3, 1)))
+    for call in (forward, jacobian):
+        with pytest.warns(InputNote, match=r"joint values: 90 rad are 14 turns; if it is degrees, give np.radians"):
+            call(arm, [90.0, 30.0, -45.0])
