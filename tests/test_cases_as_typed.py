@@ -74,6 +74,13 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "he_repeated_4x": (Typed(says=("its errors there count once in σ",), never=("the board moved",)),),
     "interactive": (Typed(values=camera(*SAMPLES[0], *SAMPLES[1])),),
     "json_tabs": (Typed(values=camera(800, 801, 320.5, 240.5, -0.1, 0.02, 1e-4, -2e-4)),),
+    "he_drift_1.7mm": (Typed(says=("with care", "the board drifts from the first pose to the last, by 1.6 mm")),),
+    "he_franka_column_major": (Typed(says=("verdict: good",)),),
+    "he_mobile_planar_4dof": (Typed(says=("flange_from_camera is not known along (0, 0, 1)",), never=("scatter",)),),
+    "he_scara_4dof_noise": (Typed(says=("flange_from_camera is not known along (0, 0, 1)",), never=("scatter",)),),
+    "he_tcp_set_halfway": (
+        Typed(INPUT, "", ("before line 10, and those from it on, fit by themselves", "tool (TCP)")),
+    ),
     "kitti": (Typed(INPUT, "E-CAMERA-CONTENT", ("COLMAP, OpenCV, ROS", "camera_matrix")),),
     "kuka_semicolon_comma": (Typed(says=("use with care", "pose 2 contradicts the others")),),
     "loc_apriltag_ros_yaml": (Typed(COMPUTATION, says=(*HALF_A_TURN, "upright: true"), never=("accept ",)),),
@@ -234,8 +241,8 @@ OPEN = set(
         r"\S+",
         """
     anamorphic_calibrate board_pitch_3_percent
-    drawing_y_down he_drift_1.7mm he_franka_column_major he_mobile_planar_4dof
-    he_scara_4dof_noise he_tcp_set_halfway isoluminant_circles keem_cube_folds
+    drawing_y_down
+    isoluminant_circles keem_cube_folds
     loc_motion_blur_6px principal_point_outside rob_orientation_by_controller
     rob_ur5_file_for_ur5e ros_coefficients scale_distance_wrong tag_twice_single tags_mirrored
     video_rotation_180
@@ -314,6 +321,7 @@ def located(folder: Path) -> None:
 
 HAND_EYE = {
     "aruco_flips_30pc": in_hand_or_eye("flange_from_camera", 0.25, 1.1),
+    "he_franka_column_major": in_hand_or_eye("flange_from_camera", 0.15, 1.4),
     "kuka_semicolon_comma": in_hand_or_eye("flange_from_camera", 0.13, 0.8),
     "ur_pendant": in_hand_or_eye("flange_from_camera", 0.13, 0.8),
 }

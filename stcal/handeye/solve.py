@@ -453,7 +453,8 @@ def _remarks(
     tilted = flipped(task.loop, x, z, outliers)
     notes = remarks.of_still(task.pairs) + remarks.of_outliers(task.pairs.names, outliers, residuals, tilted)
     notes += flip_note(task.pairs.names, tilted)
-    moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
+    apart = places(task.loop) is None
+    moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12], apart)
     notes += moved or remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):
         notes += remarks.of_size(task.loop[~outliers], hint, task.options.noise)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
 
 from stcal.cross_validation import repeated_splits
 from stcal.errors import DegenerateError, InputError, StcalError
@@ -422,8 +423,13 @@ def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
     m, k = len(result.names), held_out.rows.shape[1]
     matrices = held_out.mount_from_camera
     solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
-    differences = solutions.difference(Poses.of([result.mount_from_camera] * len(solutions)))
-    squared = np.einsum("sa,ab,sb->s", differences, generalised_inverse(result.covariance), differences)
+    differences, told = solutions.difference(Poses.of([result.mount_from_camera] * len(solutions))), np.eye(6)
+    seen = result.observability
+    if seen is not None and seen.one_axis:  # along it X is set, not estimated
+        told = null_space(np.concatenate([np.zeros(3), seen.mount_axis])[None])
+    differences = differences @ told
+    inverse = generalised_inverse(told.T @ result.covariance @ told)
+    squared = np.einsum("sa,ab,sb->s", differences, inverse, differences)
     out = k / m
     dof = 6 * m * (1 - out) - UNKNOWNS - 1
     return float(np.sqrt(squared.mean() / differences.shape[1] * dof / (6 * m * out)))

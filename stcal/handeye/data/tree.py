@@ -98,11 +98,16 @@ def _all_numbers(value: Any) -> bool:
 def _matrix(value: Any) -> tuple[np.ndarray, str] | None:
     """Returns the matrix (4, 4) in a value and its name, empty where it has none; None for any other value."""
     array = numbers(value)
+    if array is not None and array.shape == (16,):
+        square = array.reshape(4, 4)  # by rows, or by columns as of Franka and OpenGL: the last row is 0 0 0 1
+        by_columns = not square[:3, 3].any() and square[3, :3].any()
+        return square.T if by_columns else square, ""
     if array is not None:
-        return (array.reshape(4, 4), "") if array.shape in ((4, 4), (16,)) else None
+        return (array, "") if array.shape == (4, 4) else None
     if not isinstance(value, Mapping):
         return None
-    inside = [value[key] for key in WRAPPED if key in value]
+    named = [each for each in value.values() if isinstance(each, list) and np.size(numbers(each)) == 16]
+    inside = [value[key] for key in WRAPPED if key in value] or named
     found = _matrix(inside[0]) if len(inside) == 1 else None
     return found and (found[0], found[1] or _name_in(value))
 

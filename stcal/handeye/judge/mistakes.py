@@ -79,6 +79,13 @@ def check_conventions(
             turn, shift = typical_of_variant[convention]
             but = f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm "
             raise InputError("E-HANDEYE-CONVENTION", f"{but}{_with_its_like(convention, typical_of_variant)}")
+        if (row := _other_from(loop, guess, with_scale, as_read)) is not None:
+            raise InputError(
+                "E-HANDEYE-CONVENTION",
+                f"{contradict}, but those before {pairs.names[row]}, and those from it on, fit by themselves: another "
+                "tool (TCP) or base was set in the controller there, or camera or board were moved; solve them "
+                "separately",
+            )
         inverted = next(each for each in variants if each.startswith(INVERTED))
         if gain[inverted] > DOUBTFUL and as_read[1] > typical_of_variant[inverted][1]:
             turn, shift = typical_of_variant[inverted]
@@ -123,6 +130,22 @@ def check_conventions(
     if behind.any():
         return (*notes, f"the board lies behind the camera in {pairs.names[int(behind.argmax())]}: check its pose")
     return notes
+
+
+LEAST_PART, PART_BETTER = 6, 10.0
+"""Least number of poses that fit by themselves, and how much better than all together, in rotation and translation."""
+
+
+def _other_from(loop: Loop, guess: Guess, with_scale: bool, as_read: tuple[float, float]) -> int | None:
+    """Returns the row from which on poses fit by themselves, as those before it do; None if there is no such row."""
+
+    def misfit(row: int) -> float:
+        parts = [_typical_or_far(part, guess, with_scale, np.mean) for part in (loop[:row], loop[row:])]
+        return float(np.max(np.divide(parts, as_read)))
+
+    each = {row: misfit(row) for row in range(LEAST_PART, len(loop) - LEAST_PART + 1)}
+    best = min(each, key=each.__getitem__, default=None)
+    return best if best is not None and each[best] < 1 / PART_BETTER else None
 
 
 def _typical_of(variants: dict[str, Loop], guess: Guess, with_scale: bool) -> dict[str, tuple[float, float]]:
@@ -319,17 +342,17 @@ def _differ(loop: Loop) -> tuple[float, float]:
     return float(np.sqrt((angle**2).mean())), float(max(np.sqrt((shift**2).mean()) for shift in shifts))
 
 
-def _typical(loop: Loop, guess: Guess, with_scale: bool) -> tuple[float, float]:
-    """Returns the median residuals of a first solution, rad and mm."""
+def _typical(loop: Loop, guess: Guess, with_scale: bool, middle: Callable = np.median) -> tuple[float, float]:
+    """Returns the median residuals of a first solution, or another ``middle``, rad and mm."""
     residuals = loop.residuals(*guess(loop, with_scale)).reshape(-1, 2, 3)
-    turn, shift = np.median(np.linalg.norm(residuals, axis=2), axis=0)
+    turn, shift = middle(np.linalg.norm(residuals, axis=2), axis=0)
     return float(turn), float(shift)
 
 
-def _typical_or_far(loop: Loop, guess: Guess, with_scale: bool) -> tuple[float, float]:
+def _typical_or_far(loop: Loop, guess: Guess, with_scale: bool, middle: Callable = np.median) -> tuple[float, float]:
     """Returns :func:`_typical`, infinite where the poses give no solution."""
     try:
-        return _typical(loop, guess, with_scale)
+        return _typical(loop, guess, with_scale, middle)
     except DegenerateError:
         return np.inf, np.inf
 

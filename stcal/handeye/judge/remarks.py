@@ -115,7 +115,9 @@ LEAST_IN_GROUPS, APART = 10, 0.9
 """Least number of poses, and the share of their scatter along its main direction that two groups must explain. Two
 halves of normal errors explain 0.64 (2/π), and at most 0.8 of a dozen of them."""
 MOVED_LEVEL, MOVED_SHARE = 0.01, 0.5
-"""Probability that a move along the order of sound poses is named, and least share of the squares that it explains."""
+SURE_LEVEL, SURE_SHARE = 1e-6, 0.25
+"""Probability that a move along the order of sound poses is named, and least share of the squares that it explains;
+the same where each pose is at a place of its own, so that errors common to a place are no move."""
 STILL = 0.005
 """Share of the usual turn, and of the usual way, between two poses, below both of which a side did not move: a robot's
 feedback at rest repeats to micrometres."""
@@ -197,9 +199,12 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
     return ()
 
 
-def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray) -> tuple[str, ...]:
+def of_order(
+    names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray, apart: bool = False
+) -> tuple[str, ...]:
     """Returns a note if camera or board moved or drifted, by residuals (m, 6) in order, outliers too, and their
-    jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals."""
+    jacobian (m, 6, 12). As errors may vary with the order, a move must explain most of the residuals, or be beyond
+    chance where the poses are ``apart``."""
     parts = residuals.reshape(-1, 2, 3)
     sigma = np.repeat(np.median(np.linalg.norm(parts, axis=2), axis=0), 3)
     if not (sigma > 0).all():
@@ -211,7 +216,8 @@ def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray
     if not found:
         return ()
     what, change = min(found, key=lambda each: each[1].log_p)
-    if len(moves) * change.p > MOVED_LEVEL or change.share < MOVED_SHARE:
+    level, share = (SURE_LEVEL, SURE_SHARE) if apart and change.share < MOVED_SHARE else (MOVED_LEVEL, MOVED_SHARE)
+    if len(moves) * change.p > level or change.share < share:
         return ()
     turn, shift = np.degrees(np.linalg.norm(change.motion[:3])), np.linalg.norm(change.motion[3:])
     size = f"{shift:.2g} mm and {turn:.2g}° ({change.share:.0%} of the squared residuals)"

@@ -73,6 +73,10 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     motions = Motions.all(loop)
     motions = motions[motions.has_log()]
     camera_axis = (motions.alpha @ mount_axis) @ motions.beta
+    if not np.linalg.norm(camera_axis) > LEAST_LENGTH:
+        raise DegenerateError(
+            "E-HANDEYE-AXES", "hand-eye: the flange turns, and the board does not turn with it in the camera"
+        )
     turn = Rotation.align_vectors(mount_axis[None], camera_axis[None])[0]
     board = eye.translation @ turn.as_matrix().T
     along = (board @ mount_axis)[:, None] * mount_axis

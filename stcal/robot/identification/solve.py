@@ -4,10 +4,11 @@ from dataclasses import replace
 from typing import get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stcal.cross_validation import dealt
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import require_arguments, rms
 from stcal.geometry.clusters import by_clusters
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import skew
@@ -85,6 +86,13 @@ REPEATED = "joint values were measured several times: what the model lacks there
 MOST_OF_IT = 0.5
 """Share of the squared residuals that a jump along the rows must explain to be named before parameters that stay
 open."""
+ROUNDED_RAD, BEYOND = 2e-5, 20.0
+"""Difference of a turn of the tool from that of the robot file, as rounding leaves it; and how many times what it does
+across the range of positions these must err, for the orientations to be computed by the controller."""
+COMPUTED = (
+    "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
+    "Positions alone are used, as with --observe position; with --observe pose orientations count as measured"
+)
 TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 REPEATS, FEW_ROWS = 5, 300
 """Number of divisions of the cross-validation for few rows, and largest number of few rows; one division does for
@@ -133,9 +141,10 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     1996.
     """
     options = options or IdentifyOptions()
-    observations = observed(data, options.observe)
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
+    computed = options.observe is None and _turns_as_computed(first, data)
+    observations = observed(data, "position" if computed else options.observe)
     rows = NominalRows.about(first, parameter_units(jacobian(first, observations)), robot, options.adjust)
     _enough(observations, first, rows)
     adjusted, held_out, gain = _modelled(robot, first, observations, options, rows)
@@ -179,6 +188,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         gain=gain,
         all_held_out=_with_all(robot, first, observations, options) if rows.fixed.any() else None,
         notes=data.notes
+        + ((COMPUTED,) if computed else ())
         + adjusted.rows.notes(identified)
         + adjusted.notes
         + ((REPEATED,) if _places(observations) is not None else ())
@@ -222,6 +232,20 @@ def _elasticity_sigma(state: State, covariance: np.ndarray) -> Elasticity | None
         return None
     template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
     return with_values(template, np.sqrt(np.diag(covariance))[-state.elastic_count :])
+
+
+def _turns_as_computed(first: State, data: Measurements) -> bool:
+    """True if the tool turns from row to row exactly as the robot file says, although its positions are elsewhere."""
+    if data.rotations is None or data.positions is None:
+        return False
+    same = np.flatnonzero(np.array(data.targets[1:]) == np.array(data.targets[:-1]))
+    measured, modelled = (
+        Rotation.from_matrix(np.swapaxes(turn[same], 1, 2) @ turn[same + 1]).magnitude()
+        for turn in (data.rotations, tips_of(first, data).rotation)
+    )
+    turned = rms(measured - modelled) if len(same) else np.inf
+    away = rms(position_errors(residuals(first, observed(data, "position"))))
+    return turned < ROUNDED_RAD and away > BEYOND * turned * float(np.abs(np.ptp(data.positions, axis=0)).max())
 
 
 def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
