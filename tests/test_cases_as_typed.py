@@ -121,6 +121,11 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "reg_german_csv": (Typed(says=("24 inliers, 0 outliers",)),),
     "reg_sa_two_exports": (Typed(says=("24 inliers, 0 outliers",)),),
     "rob_coupling_unstated": (Typed(INPUT, "", ("joint 3 were coupled to joint 2 by -1", "give coupling")),),
+    "rob_orientation_by_controller": (
+        Typed(says=("Positions alone are used, as with --observe position",)),
+        Typed(says=("200 positions",)),
+    ),
+    "rob_ur5_file_for_ur5e": (Typed(says=("d of joint 4 by +23.5 mm, d of joint 5 by +6.0 mm", "is of this type")),),
     "rob_std_as_modified": (Typed(INPUT, "", ("standard convention", 'give convention = "standard"')),),
     "rob_tracker_moved_halfway": (
         Typed(says=("the instrument or the robot's base elsewhere from line 32 on: 13 mm", "another station")),
@@ -243,8 +248,8 @@ OPEN = set(
     anamorphic_calibrate board_pitch_3_percent
     drawing_y_down
     isoluminant_circles keem_cube_folds
-    loc_motion_blur_6px principal_point_outside rob_orientation_by_controller
-    rob_ur5_file_for_ur5e ros_coefficients scale_distance_wrong tag_twice_single tags_mirrored
+    loc_motion_blur_6px principal_point_outside
+    ros_coefficients scale_distance_wrong tag_twice_single tags_mirrored
     video_rotation_180
     """,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
-from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, other_dictionaries, view_of_tags
+from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, seen_otherwise, view_of_tags
 from stcal.boards.target import tags_on
 from stcal.design import FaceDesign
 from stcal.errors import StcalError
@@ -153,7 +153,6 @@ def why_unseen(files: Sequence[ImageFile], faces: Sequence[FaceDesign]) -> str:
             return f"{reason}: {file.name} shows tags {names}, too small or too steep; go nearer, or turn the target"
         if read:
             return f"{reason}, and {file.name} shows tags {names} of its dictionaries; correct the ids in target.toml"
-        if others := other_dictionaries(grey, known):
-            name, count = others[0]
-            return f"{reason}, and {file.name} shows {count} tags of {name}; correct the dictionary in target.toml"
+        if shown := seen_otherwise(grey, own, "target.toml"):
+            return f"{reason}, and {file.name} shows {shown}"
     return f"{reason}; look at overlays (`stcal-sfm detect`), and check dictionary, ids and the exposure"

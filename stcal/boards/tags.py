@@ -1,6 +1,6 @@
 """Detection of tags (through ``cv2.aruco``; families that it lacks through ``pupil_apriltags``)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -155,22 +155,35 @@ def _inside(place: np.ndarray, other: np.ndarray) -> bool:
     return cv2.pointPolygonTest(other, (x, y), False) > 0
 
 
-def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[str, int]]:
-    """Return the dictionaries, except ``known`` ones, of which the image shows tags, and the numbers of tags.
+def seen_otherwise(image: np.ndarray, own: Collection[tuple[str, int]], place: str) -> str:
+    """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing.
 
-    The dictionary with most tags is first; of dictionaries that contain one another, the smaller one is first.
+    Tags of ``own`` (dictionary, id) may be in view twice, mirrored, or white on black; or others, of which the
+    dictionary with most is named; of dictionaries that contain one another, the smaller one. ``place`` : of what must
+    be corrected.
     """
-    grey = grey_8bit(image)
-    names = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_") and name not in known)
+    grey, known = grey_8bit(image), sorted({name for name, _ in own})
+    if twice := [tag for tag in find_tags(grey, known).repeated if tag in own]:
+        return f"tag {twice[0][1]} more than once; cover what is not the target, and mirrors"
+    ways = {
+        "mirrored; use the files that the camera wrote, or print them anew": grey[:, ::-1].copy(),
+        "white on black; print them black on white": 255 - grey,
+    }
+    counts = {way: len(set(find_tags(each, known).tags) & set(own)) for way, each in ways.items()}
+    names = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
     # Some dictionaries have two names; and one of the second names finds tags everywhere.
     names = [name for name in names if name.upper() == name or name.upper() not in names]
-    counts = []
+    others = []
     for name in names:
         dictionary = dictionary_of(name)
         _, ids, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings(name)).detectMarkers(grey)
-        if ids is not None:
-            counts.append((-len(ids), len(dictionary.bytesList), name))
-    return [(name, -count) for count, _, name in sorted(counts)]
+        if ids is not None and name.upper() not in map(str.upper, known):
+            others.append((-len(ids), len(dictionary.bytesList), name))
+    most, _, name = min(others, default=(0, 0, ""))
+    best = max(counts, key=counts.__getitem__)
+    if counts[best] >= max(1, -most):
+        return f"{counts[best]} of its tags {best}"
+    return f"{-most} of {name}; correct dictionary in {place}" if most else ""
 
 
 def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:

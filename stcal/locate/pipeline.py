@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.boards.design import TagLayout
 from stcal.boards.faces import shift_by_curves
-from stcal.boards.tags import other_dictionaries
+from stcal.boards.tags import seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
@@ -303,7 +303,5 @@ def _why_no_tag(located: Located, merged: Merged, image: np.ndarray, layout: Tar
         names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
         return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
     reason = f"no tag of {', '.join(dictionaries)}; 1 of the layout needed"
-    if other_tags := other_dictionaries(image, dictionaries):
-        name = located.tags.readable()[0].name
-        reason += f", and {name} shows {other_tags[0][1]} of {other_tags[0][0]}; correct dictionary in the layout file"
-    return reason
+    shown = seen_otherwise(image, layout.rows(), "the layout file")
+    return f"{reason}, and {located.tags.readable()[0].name} shows {shown}" if shown else reason

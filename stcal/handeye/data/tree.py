@@ -106,7 +106,7 @@ def _matrix(value: Any) -> tuple[np.ndarray, str] | None:
         return (array, "") if array.shape == (4, 4) else None
     if not isinstance(value, Mapping):
         return None
-    named = [each for each in value.values() if isinstance(each, list) and np.size(numbers(each)) == 16]
+    named = [each for each in value.values() if (own := numbers(each)) is not None and own.size == 16]
     inside = [value[key] for key in WRAPPED if key in value] or named
     found = _matrix(inside[0]) if len(inside) == 1 else None
     return found and (found[0], found[1] or _name_in(value))

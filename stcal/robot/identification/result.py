@@ -266,6 +266,10 @@ class Identified(Brief):
         return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
 
+OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
+"""Change of a length beyond what workshops make of one type of arm, and most lengths to be shown."""
+
+
 def misgivings(result: Identified, nominal: Robot) -> tuple[str, ...]:
     """Returns notes on stated σ that residuals contradict, no gain over ``nominal``, or lengths that differ by one
     factor."""
@@ -290,6 +294,14 @@ def misgivings(result: Identified, nominal: Robot) -> tuple[str, ...]:
                 "this is the scale of the instrument, or of a board or target by which positions were measured; check "
                 "a known length"
             )
+            return tuple(notes)
+    far = np.flatnonzero(np.abs(changes) > OTHER_TYPE_MM)
+    if len(far):
+        which = ", ".join(f"{'ad'[i % 2]} of joint {i // 2 + 1} by {changes[i]:+.1f} mm" for i in far[:SHOWN_LENGTHS])
+        notes.append(
+            f"lengths are not those of the robot file: {which}; arms of one type differ by less than 2 mm: check that "
+            "the file is of this type, and its units"
+        )
     return tuple(notes)
 
 
