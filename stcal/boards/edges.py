@@ -21,6 +21,7 @@ from stcal.boards.area import (
     solved,
     told_by_lines,
 )
+from stcal.geometry.arrays import rms
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.robust import median_length
 
@@ -55,6 +56,10 @@ START_VARIANCE, MIN_VARIANCE = 0.4, 0.01
 """Variance of the blur at the start, and its lower limit, px²."""
 MOST_MOVED_PX = 1.0
 """Largest distance of an edge from where its profiles have it; one that ends farther away stays with the profiles."""
+SMEAR_SHARE, SMEAR_POWER = 0.08, 3
+"""Error of an edge's place that motion over one cell causes, as a share of the cell, and how it grows with the way."""
+TOLD, LONG_SMEAR = 4.0, 0.4
+"""Difference of two directions' blur, in RMS of what is left, from which it is motion; way that is named, in cells."""
 ROUNDING = 1 / 12
 """Variance of rounding to whole grey values."""
 BLURS, LEAST_INSIDE_PX = 2.5, 1.0
@@ -80,12 +85,14 @@ class EdgeCorners:
     Two corners share the errors of the edge between them: they move together with its offset, against each other with
     its slope.
 
-    ``seen`` : (n,) True if all four edges of a tag are visible; otherwise its values are meaningless.
+    ``seen`` : (n,) True if all four edges of a tag are visible; otherwise its values are meaningless; ``smear_px`` :
+    way by which motion during the exposure blurs the edges; 0 where it is short beside a cell.
     """
 
     corners_px: np.ndarray
     covariance_px2: np.ndarray
     seen: np.ndarray
+    smear_px: float = 0.0
 
 
 def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
@@ -107,7 +114,7 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
         covariance = _meet(frame, area.lines(rough, variance))[1]
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
-    return EdgeCorners(meeting, covariance, seen.all(1))
+    return EdgeCorners(meeting, covariance, seen.all(1), area.smear_px)
 
 
 def _told_by_lines(
@@ -278,6 +285,7 @@ class _Area:
     by_sampling: np.ndarray  # (m, 2, 2) their derivatives by its two harmonics, in columns
     passed: np.ndarray  # (m,) share of it that the blur passes
     told: Displacement  # of the offset, by the profiles along rotated edges
+    smear_px: float  # way of motion, 0 where it is short
 
     def lines(self, rough: _Lines, variance: SamplingVariance) -> _Lines:
         """Return the lines with their covariances, where sampling displaces them by ``variance``."""
@@ -329,13 +337,31 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
     pull = products(design, weight, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
     by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
+    smear = _smear(normal, value[:, 2], good)
+    by_noise[:, 0, 0] += (SMEAR_SHARE * smear * (smear / frame.cell.reshape(m)) ** SMEAR_POWER) ** 2
+    smeared = float(smear.max()) if (smear > LONG_SMEAR * frame.cell.reshape(m)).any() else 0.0
     value[:, :2] -= shift
     told = _told_along(residual, harmonic, passed, weight, factor, good)
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
     levels = value[:, [3, 5]]
-    return _Area(offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], passed, told)
+    return _Area(
+        offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], passed, told, smeared
+    )
+
+
+def _smear(normal: np.ndarray, blur: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Return by what way (m,), px, motion during the exposure widens edges with these normals (m, 2) and blurs (m,)."""
+    if good.sum() < 4:
+        return np.zeros(len(blur))
+    x, y = normal.T
+    rows = np.stack([x * x, 2 * x * y, y * y], axis=1)
+    xx, xy, yy = told = np.linalg.lstsq(rows[good], blur[good], rcond=1e-3)[0]
+    least, most = np.linalg.eigvalsh([[xx, xy], [xy, yy]])
+    if most - least < TOLD * rms(blur[good] - rows[good] @ told):
+        return np.zeros(len(blur))
+    return np.sqrt(12 * np.maximum(rows @ told - max(least, MIN_VARIANCE), 0.0))
 
 
 def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:

@@ -44,7 +44,8 @@ class Tags:
     printed; ``covariance_px2`` : (n, 4, 2, 2); ``repeated`` : tags that were omitted because they occur more than once;
     ``saturated`` : (n,) share of the white around a tag that is saturated, see :meth:`edge_sigma_px`; ``joint_px2`` :
     (n, 8, 8) covariance of the four corners of a tag together, of which ``covariance_px2`` holds the blocks of single
-    corners; if None, corners are independent.
+    corners; if None, corners are independent; ``smear_px`` : way by which motion during the exposure blurs edges; 0
+    where it is short.
     """
 
     tags: tuple[tuple[str, int], ...]
@@ -53,6 +54,7 @@ class Tags:
     repeated: tuple[tuple[str, int], ...] = ()
     saturated: np.ndarray | None = None
     joint_px2: np.ndarray | None = None
+    smear_px: float = 0.0
 
     def __post_init__(self):
         freeze(self, "corners_px", (len(self.tags), 4, 2), "tags' corners")
@@ -106,15 +108,15 @@ def find_tags(
     once = {tag: places[0] for tag, places in sorted(places_of.items()) if len(places) == 1}
     cells = np.array([cells_of(name, border_bits) for name, _ in once])
     white = np.array([name in FAMILIES for name, _ in once], bool)
-    corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells, white)
-    if joined:  # places from larger and dilated images are less accurate
-        corners, covariance = _refined(grey, corners, cells, white)
+    corners = np.array(list(once.values()), float).reshape(-1, 4, 2)
+    for _ in range(1 + joined):  # places from larger and dilated images are less accurate
+        corners, covariance, smear_px = _refined(grey, corners, cells, white)
     saturated = _saturated(grey, corners, np.where(white, -cells, cells))
     # If the white is partly saturated, each edge shifts by a different amount.
     uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
     joint = covariance + uneven[:, None, None] * np.eye(8)
     repeated = tuple(sorted(tag for tag, places in places_of.items() if len(places) > 1))
-    return Tags(tuple(once), corners, corner_blocks(joint), repeated, saturated, joint)
+    return Tags(tuple(once), corners, corner_blocks(joint), repeated, saturated, joint, smear_px)
 
 
 def corner_blocks(joint: np.ndarray) -> np.ndarray:
@@ -244,14 +246,15 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
 
 def _refined(
     grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return refined corners and covariances where all edges are visible; ``white`` : (n,) white inside the edges."""
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return refined corners and covariances where all edges are visible, and the way of motion during the exposure;
+    ``white`` : (n,) white inside the edges."""
     if white.any():
-        refined, covariance = np.array(corners), np.zeros((len(corners), 8, 8))
-        for colour, picture in ((~white, grey), (white, 255 - grey)):
+        refined, covariance, smears = np.array(corners), np.zeros((len(corners), 8, 8)), [0.0, 0.0]
+        for i, (colour, picture) in enumerate(((~white, grey), (white, 255 - grey))):
             own = np.zeros(int(colour.sum()), bool)
-            refined[colour], covariance[colour] = _refined(picture, corners[colour], cells[colour], own)
-        return refined, covariance
+            refined[colour], covariance[colour], smears[i] = _refined(picture, corners[colour], cells[colour], own)
+        return refined, covariance, max(smears)
     measured = corners_from_edges(grey, corners, cells)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
     away = np.linalg.norm(np.where(measured.seen[:, None, None], measured.corners_px - corners, 0), axis=2).max(
@@ -259,7 +262,7 @@ def _refined(
     )
     good = (measured.seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
     covariance = np.where(good, measured.covariance_px2, UNREFINED_PX**2 * np.eye(8))
-    return np.where(good, measured.corners_px, corners), covariance
+    return np.where(good, measured.corners_px, corners), covariance, measured.smear_px
 
 
 KALIBR_BITS, USUAL_BITS = 2, 1

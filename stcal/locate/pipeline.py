@@ -179,7 +179,12 @@ def locate_scene(
     if troubles:
         return Located(scene, None, None, _rejected(troubles), tuple(notes))
     merged = merge([exposure.tags for exposure in used], layout, [exposure.name for exposure in used])
-    notes += _notes(merged)
+    notes += _notes(merged) + [
+        f"{each.name}: motion during the exposure blurs edges by {each.tags.smear_px:.1f} px, which σ contain; "
+        "camera and target at rest, or a shorter exposure"
+        for each in used
+        if each.tags.smear_px
+    ]
     troubles = _scene_troubles(merged, options)
     if troubles:
         return Located(scene, merged, None, _rejected(troubles), tuple(notes))

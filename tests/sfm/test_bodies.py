@@ -387,7 +387,7 @@ def test_tags_of_other_dictionaries_or_ids_are_named(tmp_path, stcal_sfm):
     other = tag_cube(60.0, "DICT_5X5_100")
     target, out = written(tmp_path, body_toml(other)), tmp_path / "run"
     words = ("run", tmp_path / "set/images", "--target", target, "--out", out)
-    assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "DICT_APRILTAG_36H11", "correct the dictionary")
+    assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "DICT_APRILTAG_36H11", "correct dictionary")
     written(tmp_path, body_toml(tag_cube(60.0, first_id=100)))
     assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "tags ", "correct the ids")
 
