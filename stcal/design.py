@@ -310,6 +310,12 @@ class BoardDesign:
         size = self.rows, self.columns, self.pitch_mm, self.radius_mm
         require_board(*size, self.corner, self.corner_radius_mm, "board")
 
+    def scaled(self, factor: float) -> "BoardDesign":
+        """Returns the board printed larger by a factor."""
+        corner = self.corner_radius_mm and factor * self.corner_radius_mm
+        size = {"pitch_mm": factor * self.pitch_mm, "radius_mm": factor * self.radius_mm, "corner_radius_mm": corner}
+        return replace(self, **size, unusual_size=True)
+
     def cells(self) -> np.ndarray:
         """Returns row and column of every dot, (rows·columns, 2), row-major."""
         return np.column_stack(np.divmod(np.arange(self.rows * self.columns), self.columns))

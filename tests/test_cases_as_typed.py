@@ -75,6 +75,11 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "he_repeated_4x": (Typed(says=("its errors there count once in σ",), never=("the board moved",)),),
     "interactive": (Typed(values=camera(*SAMPLES[0], *SAMPLES[1])),),
     "json_tabs": (Typed(values=camera(800, 801, 320.5, 240.5, -0.1, 0.02, 1e-4, -2e-4)),),
+    "board_pitch_3_percent": (
+        Typed(
+            4, says=("is 1.03 times as large as the drawing in target.toml", "would fit a pitch of 30 mm", "calliper")
+        ),
+    ),
     "he_drift_1.7mm": (Typed(says=("with care", "the board drifts from the first pose to the last, by 1.6 mm")),),
     "he_franka_column_major": (Typed(says=("verdict: good",)),),
     "he_mobile_planar_4dof": (Typed(says=("flange_from_camera is not known along (0, 0, 1)",), never=("scatter",)),),
@@ -156,6 +161,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "scara_4dof_inverted_cam": (
         Typed(INPUT, "E-HANDEYE-CONVENTION", ("board_from_camera", "rename them in the file"), {}, ("column",)),
     ),
+    "scale_distance_wrong": (Typed(4, says=("What to do next? Correct the size of distance 0:0.0 to 0:0.1",)),),
     "stale_tf_half": (
         Typed(INPUT, "", ("the flange's pose is the same to the last digit in 6 rows", "read the robot's pose anew")),
     ),
@@ -251,11 +257,11 @@ OPEN = set(
     re.findall(
         r"\S+",
         """
-    anamorphic_calibrate board_pitch_3_percent
+    anamorphic_calibrate
     drawing_y_down
     isoluminant_circles keem_cube_folds
     principal_point_outside
-    ros_coefficients scale_distance_wrong
+    ros_coefficients
     video_rotation_180
     """,
     )

@@ -390,6 +390,11 @@ class CornerBoard(LatticePart):
     x_mm: tuple[float, ...] = ()
     printed: FlatBoard | None = None
 
+    def scaled(self, factor: float) -> "CornerBoard":
+        """Return the board printed larger by a factor."""
+        y, x = (tuple(factor * each for each in places) for places in (self.y_mm, self.x_mm))
+        return replace(self, pitch_mm=factor * self.pitch_mm, radius_mm=factor * self.radius_mm, y_mm=y, x_mm=x)
+
     @classmethod
     def of(cls, board: FlatBoard) -> "CornerBoard":
         """Return the points of a board; ``cells()`` are in the order of its ``xy_mm``."""

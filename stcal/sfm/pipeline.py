@@ -30,7 +30,7 @@ from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.camera.calibrate import camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
-from stcal.sfm.checks.causes import cause_of_drawing
+from stcal.sfm.checks.causes import cause_of_drawing, cause_of_size
 from stcal.sfm.checks.suite import run_checks, shows_rim
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
 from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, misplaced_images, not_as_drawn
@@ -202,9 +202,10 @@ def run_on_files(
         evidence = result.evidence(camera_prior(result.camera))
         if options.rim is None:
             evidence = replace(evidence, rim=shows_rim(evidence))
-        cause = cause_of_drawing(result.target.target_from_face, target_design)
+        sized = cause_of_size(result.target.circles, target_design, board_design)
+        cause = sized or cause_of_drawing(result.target.target_from_face, target_design)
         is_misfit = result.calibration.sigma_factors.all > MOST_SIGMAS or lost_groups(result.notes)
-        if is_misfit and result.camera_given and not options.refine_camera:
+        if is_misfit and sized is None and result.camera_given and not options.refine_camera:
             cause = wrong_file(result.observations(), result.camera, result.board_design) or cause
         made = run_checks(replace(evidence, cause=cause), progress)
         factor = max(check.enlarges for check in made)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, fdtrc
 
-from stcal.design import TargetDesign
+from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import CircleLabel
@@ -140,6 +141,31 @@ def cause_of_drawing(target_from_face: Mapping[str, Rigid], design: TargetDesign
     reason = f"turned by {turned[far[0]]:.0f}°, {FAR_DEG:.0f}° possible: a reflection, another pattern, or another name"
     remedy = "look at the overlays; leave out images that show a reflection, or correct names, ids or rough_pose"
     return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), len(rough), far, remedy)
+
+
+OTHER_SIZE = 0.02
+"""Relative difference of the faces' size from their drawing that no print has; less is for the check of the scale."""
+
+
+def cause_of_size(
+    circles: Mapping[CircleLabel, np.ndarray], design: TargetDesign, board: BoardDesign | None
+) -> Check | None:
+    """Returns a failed check that names another size of the board than the drawing of the faces has; None if it fits.
+    ``circles`` : (3,) places found, mm."""
+    ratios = []
+    for face in design.faces if board is not None else ():
+        labels = [label for label in circles if label.face == face.id]
+        if len(labels) < 3:
+            continue
+        found, drawn = np.array([circles[label] for label in labels]), face.places_mm(each.circle for each in labels)
+        ratios.append(rms(found - found.mean(0)) / rms(drawn - drawn.mean(0)))
+    ratio = float(np.median(ratios)) if ratios else 1.0
+    if board is None or abs(ratio - 1) < OTHER_SIZE:
+        return None
+    name = f"the board in board.toml is {ratio:.4g} times as large as the drawing in target.toml has the faces"
+    reason = f"{len(ratios)} faces agree; they would fit a pitch of {board.pitch_mm / ratio:.4g} mm"
+    remedy = "measure the board over its full length with a calliper; correct pitch_mm, or the target's drawing"
+    return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), len(ratios), (), remedy)
 
 
 def _redundancy(networks: Sequence[Network]) -> float:

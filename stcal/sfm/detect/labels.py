@@ -257,6 +257,7 @@ def _label_circles(
     """Returns the labelled circles of all images, in the order of their groups."""
     camera = detection.camera
     groups = _groups(detection)
+    board = in_scale([named for _, named in groups], target, board)
     dots = None if isinstance(board, CornerBoard) else board  # corners are not searched at predicted places
     patterns = patterns_of(target, board)
     first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
@@ -290,6 +291,7 @@ def _label_circles(
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
     """Labels all images as :func:`label_images`, without a second look."""
     groups = [named for _, named in _groups(detection)]
+    board = in_scale(groups, target, board)
     focal_px = float(np.sqrt(detection.camera.focal.prod()))
     return [each for found, _ in label_groups(groups, target, board, focal_px) for each in found]
 
@@ -340,6 +342,42 @@ def _unconfirmed(group: list[LabelledImage], looks: dict[str, SecondLook]) -> li
         if expected >= MIN_EXPECTED and confirmed < MIN_CONFIRMED * expected:
             unconfirmed.append((face, confirmed, expected))
     return unconfirmed
+
+
+OTHER_SIZE, CLEARER = 0.005, 3.0
+"""Relative difference of the board's size from what the faces say, and by how many times it must put the board better
+at one place against each face, for images to be labelled with it."""
+
+
+def in_scale(
+    groups: Sequence[Sequence[tuple[str, str, ImageDetection]]], target: TargetDesign, board: BoardDesign | None
+) -> BoardDesign | None:
+    """Returns the board in the size at which its middle stays at one place against each face of a group. With another
+    size, it seems to move from image to image; that the drawing has another is for the checks to say."""
+    if board is None:
+        return None
+    middle, board_ways, face_ways = board.xy_mm().mean(0), [], []
+    for images in groups:
+        places: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+        for _, _, detection in images:
+            views = [] if detection.mirrored else [each[0] for each in readings_of(detection, target, board) if each]
+            on_board = [view.camera_from_plane @ np.append(middle, 0.0) for view in views if view.plane == BOARD]
+            for view in (each for each in views if each.plane != BOARD and each.named):
+                turn, place = view.camera_from_plane.rotation.T, view.camera_from_plane.translation
+                places.setdefault(view.plane, []).extend((turn @ seen, turn @ place) for seen in on_board[:1])
+        for seen in (each for each in places.values() if len(each) > 1):
+            first, second = np.triu_indices(len(seen), 1)
+            for ways, each in zip((board_ways, face_ways), np.swapaxes(seen, 0, 1), strict=True):
+                ways.extend(each[first] - each[second])
+    if not board_ways:
+        return board
+    way, wanted = np.array(board_ways), np.array(face_ways)
+    square = (way**2).sum(1)
+    each, order = (way * wanted).sum(1) / square, np.argsort((way * wanted).sum(1) / square)
+    factor = float(each[order][np.searchsorted(np.cumsum(square[order]), square.sum() / 2)])
+    before, after = (float(np.median(np.linalg.norm(size * way - wanted, axis=1))) for size in (1.0, factor))
+    is_other = factor > 0 and abs(factor - 1) > OTHER_SIZE and before > CLEARER * after
+    return board.scaled(factor) if is_other else board
 
 
 def label_groups(
