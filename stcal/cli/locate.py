@@ -107,7 +107,10 @@ def calibrate(
 @app.command()
 def run(
     exposures: Annotated[
-        Path, "Read one image, a folder of exposures of one scene, or a folder of such folders.", Arg()
+        Path,
+        "Read one image, a folder of exposures of one scene, a folder of such folders, or a video, each sharp frame of "
+        "which is a scene.",
+        Arg(),
     ],
     layout: shared.LayoutFile,
     camera: shared.CameraFile,
@@ -165,6 +168,7 @@ def run(
     from stcal.geometry.rigid import Poses
     from stcal.io.cameras.read import read_camera
     from stcal.io.table import require_pose_table_written
+    from stcal.io.video import images_or_frames
     from stcal.locate.chain import goal_chain, goals
     from stcal.locate.exposures import find_scenes
     from stcal.locate.layout import load_layout
@@ -197,20 +201,22 @@ def run(
         max_sigma_mm,
     )
     patent = PatentOptions(s_dis, j_lim, e_lim_px, e_ratio)
-    scenes = find_scenes(exposures)
-    if chain:
-        chain.require_poses([scene.name for scene in scenes])
-    results = list(located(scenes, target, model, LocateOptions(method, limits, patent, moved_px, workers)))
-    doubts = goals(results, chain).notes if chain else ()
-    document = run_report(results, scenes, target, model, chain)
-    say(document.text())
-    print_each("warning", doubts)
-    print_each("not used", (each for scene in scenes for each in scene.skipped))
-    write_if(out, lambda: poses_csv(results, chain))
-    if out and (poses := [uncertain(each).rigid for each in accepted(results)]):
-        require_pose_table_written(out, {"": Poses.of(poses)})
-    write_if(json_file, lambda: LocatedFile.of(results, target, chain))
-    write_if(report, document.page)
+    with images_or_frames(exposures) as folder:
+        places = [exposures] if folder == exposures else sorted(folder.iterdir())
+        scenes = [scene for place in places for scene in find_scenes(place)]
+        if chain:
+            chain.require_poses([scene.name for scene in scenes])
+        results = list(located(scenes, target, model, LocateOptions(method, limits, patent, moved_px, workers)))
+        doubts = goals(results, chain).notes if chain else ()
+        document = run_report(results, scenes, target, model, chain)
+        say(document.text())
+        print_each("warning", doubts)
+        print_each("not used", (each for scene in scenes for each in scene.skipped))
+        write_if(out, lambda: poses_csv(results, chain))
+        if out and (poses := [uncertain(each).rigid for each in accepted(results)]):
+            require_pose_table_written(out, {"": Poses.of(poses)})
+        write_if(json_file, lambda: LocatedFile.of(results, target, chain))
+        write_if(report, document.page)
     if not accepted(results):
         say(verdict := f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         warn_if_quiet(verdict)

@@ -221,7 +221,9 @@ def _device(source: int | str) -> cv2.VideoCapture:
     os.environ[FFMPEG_LEVEL] = "-8"
     try:
         with quiet_opencv():
-            return cv2.VideoCapture(source)
+            device = cv2.VideoCapture(source)
+            device.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)  # as the sensor wrote them, which the camera file describes
+            return device
     finally:
         os.environ.pop(FFMPEG_LEVEL)
         if before is not None:

@@ -12,6 +12,8 @@ import numpy as np
 from stcal.errors import InputError, InputNote
 from stcal.io.device import frames_of, png
 from stcal.io.files import save
+from stcal.io.images import SUFFIXES
+from stcal.parallel import scratch_folder
 
 AUTO = "auto"
 SMALL_PX = 240
@@ -157,3 +159,14 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
         stacklevel=2,
     )
     return [path for path, _, _ in chosen]
+
+
+@contextlib.contextmanager
+def images_or_frames(images: Path) -> Iterator[Path]:
+    """Yield a folder of images, or of one image, as it is; of a video, a folder with its chosen frames."""
+    if not images.is_file() or images.suffix.lower() in SUFFIXES:
+        yield images
+        return
+    with scratch_folder("frames") as folder:
+        write_frames(images, folder)
+        yield folder

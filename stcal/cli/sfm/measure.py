@@ -26,7 +26,8 @@ app = typer.Typer()
 def calibrate_camera(
     images: Annotated[
         Path,
-        "Read photographs that show the board from this folder, or from IMAGES/<group>/ as run does.",
+        "Read photographs that show the board from this folder, or from IMAGES/<group>/, or frames of a video, as run "
+        "does.",
         Arg(),
     ],
     out: Annotated[Path, "Write the camera to this file.", WRITES] = Path("cameras.txt"),
@@ -58,6 +59,7 @@ def calibrate_camera(
     from stcal.geometry.camera import Camera
     from stcal.io.cameras.read import save_camera
     from stcal.io.design import board_of, target_of
+    from stcal.io.video import images_or_frames
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.report import calibration_report
@@ -68,11 +70,12 @@ def calibrate_camera(
     target_design = target_of(target)
     board_design = board_of(None) if board is None else load_flat_board(board)
     dots = isinstance(board_design, BoardDesign)
-    with shared.designs_told(target, board, with_target=dots and board is None), StageProgress() as progress:
+    told = shared.designs_told(target, board, with_target=dots and board is None)
+    with told, images_or_frames(images) as folder, StageProgress() as progress:
         if isinstance(board_design, BoardDesign):
-            result = calibrate(images, target_design, board_design, model, workers=workers, progress=progress)
+            result = calibrate(folder, target_design, board_design, model, workers=workers, progress=progress)
         else:
-            result = calibrate_camera_by_corners(images, board_design, model, workers, progress)
+            result = calibrate_camera_by_corners(folder, board_design, model, workers, progress)
     intrinsics = result.intrinsics
     save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance), "colmap")
     summary = CalibrationFile.of(result)
