@@ -19,7 +19,7 @@ from stcal.boards.design import (
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.model import OF_IMAGES, CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, one_thread
@@ -92,7 +92,7 @@ def calibrate_camera_by_corners(
     camera = start_camera(*require_common_size(files)[0], colmap_model)
     rounds = ROUNDS.get(type(board), 1)
     for done in range(1, rounds + 1):
-        model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
+        model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
         detections = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
         views = _observations(files, detections.views(), grid, camera)
         skipped = (*skipped_files, *detections.skipped)

@@ -33,6 +33,10 @@ EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 """Names of ``distortion_model`` for OpenCV's fisheye."""
 
 
+OF_IMAGES = "the images"
+"""Source of a camera that is found from the images themselves, of which some may show a part of the sensor."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel:
     """A camera as its file states it.
@@ -82,7 +86,7 @@ class CameraModel:
     def require_inside(self, width: int, height: int, image: str) -> None:
         """Refuse an image without the principal point: a file that states no size may belong to another camera."""
         x, y = self.centre
-        if not (0 < x < width and 0 < y < height):
+        if self.source != OF_IMAGES and not (0 < x < width and 0 < y < height):
             raise InputError(
                 "E-CAMERA-CENTRE",
                 f"camera file {self.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {image} "

@@ -10,7 +10,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera
-from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.model import OF_IMAGES, CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, unseen_lines
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
@@ -129,7 +129,7 @@ def calibrate_camera(
         for rounds in range(1, MAX_ROUNDS + 1):
             # No size is given: it comes from most of the images, and messages should say so.
             lens = camera.focal, camera.centre, camera.distortion
-            model = CameraModel(*lens, colmap_model, None, None, "the images")
+            model = CameraModel(*lens, colmap_model, None, None, OF_IMAGES)
             step, options = counted(progress, f"detect {rounds}", len(files)), ellipses or EllipseOptions()
             detection = detect_files(files, model, target, board, options, Path(cache), workers, step, pictures=False)
             try:

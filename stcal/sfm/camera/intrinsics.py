@@ -38,30 +38,24 @@ def start_camera(width: int, height: int, colmap_model: str) -> Camera:
 
 
 def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
-    """Returns ``camera`` with the focal length by the homographies (Zhang 2000, sec. 3.1, square pixels, known
-    principal point), or else the one of :data:`TRIED_FOCALS` that fits best; unchanged for equidistant lenses, whose
-    rays depend on it."""
+    """Returns ``camera`` with the focal length by the homographies (Zhang 2000, sec. 3.1), for square pixels and the
+    principal point in the middle, or else the one of :data:`TRIED_FOCALS` that fits best; with two focal lengths and
+    the principal point by them where that fits far better. Unchanged for equidistant lenses, whose rays depend on
+    it."""
     if camera.fisheye:
         return camera
-    coefficients, constants = [], []
+    coefficients, constants, rows = [], [], []
     for image in observations:
         h = _homography(image, board, camera)
         first, second = h[:, 0], h[:, 1]
         first, second = np.array([first, second]) / np.sqrt(np.linalg.norm(first[:2]) * np.linalg.norm(second[:2]))
         coefficients += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
         constants += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
+        rows += [_conic(first, second), _conic(first, first) - _conic(second, second)]
     square = float(np.dot(coefficients, coefficients))
     inverse = float(np.dot(coefficients, constants)) / square if square else 0.0  # (assumed focal / focal)²
     low, high = FOCAL_LIMITS * np.array(max(camera.width, camera.height)) / camera.focal[0]
-    if not high**-2 < inverse < low**-2:
-        return _best_of_several(observations, board, camera)
-    return replace(camera, focal=camera.focal / np.sqrt(inverse))
-
-
-def _best_of_several(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
-    """``camera`` with the focal length of several that fits best: by the mean over views of the RMS distance."""
     largest = sorted(observations, key=len)[-TRIED_VIEWS:]
-    cameras = [replace(camera, focal=np.full(2, share * max(camera.width, camera.height))) for share in TRIED_FOCALS]
 
     def misfit_px(tried: Camera) -> float:
         off = 0.0
@@ -71,7 +65,39 @@ def _best_of_several(observations: Sequence[ImageObservations], board: BoardDesi
             off += float(np.sqrt(((seen - image.centre_px) ** 2).sum(1).mean()))
         return off
 
-    return min(cameras, key=misfit_px)
+    if high**-2 < inverse < low**-2:
+        usual = replace(camera, focal=camera.focal / np.sqrt(inverse))
+    else:  # the one of several that fits best, by the mean over views of the RMS distance
+        longer = max(camera.width, camera.height)
+        usual = min((replace(camera, focal=np.full(2, share * longer)) for share in TRIED_FOCALS), key=misfit_px)
+    free = _of_any_pixels(np.array(rows), camera, low, high) if len(observations) >= LEAST_FREE else None
+    return free if free is not None and misfit_px(free) < FAR_BETTER * misfit_px(usual) else usual
+
+
+LEAST_FREE, FAR_BETTER = 3, 0.5
+"""Fewest views for two focal lengths and the principal point, and most of the misfit that these may leave."""
+ALMOST_SQUARE = 0.05
+"""Relative difference of two focal lengths up to which pixels count as square at the start."""
+
+
+def _conic(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Returns the coefficients (5,) of B11, B22, B13, B23, B33 in firstᵀ B second (Zhang 2000, without skew)."""
+    (a, b, c), (x, y, z) = first, second
+    return np.array([a * x, b * y, a * z + c * x, b * z + c * y, c * z])
+
+
+def _of_any_pixels(rows: np.ndarray, camera: Camera, low: float, high: float) -> Camera | None:
+    """Returns ``camera`` with two focal lengths and a principal point by the rows of its views; None if there are none
+    within the limits of the ratio of a focal length and the assumed one."""
+    b11, b22, b13, b23, b33 = np.linalg.svd(rows)[2][-1]
+    with np.errstate(all="ignore"):
+        scale = b33 - b13**2 / b11 - b23**2 / b22
+        ratios, centre = np.sqrt([scale / b11, scale / b22]), np.array([-b13 / b11, -b23 / b22])
+    if not (low < ratios.min() and ratios.max() < high):
+        return None
+    if abs(np.log(ratios[0] / ratios[1])) < ALMOST_SQUARE:
+        ratios = np.full(2, np.sqrt(ratios.prod()))
+    return replace(camera, focal=camera.focal * ratios, centre=camera.centre + camera.focal * centre)
 
 
 def start_pose(image: ImageObservations, board: BoardDesign, camera: Camera) -> Rigid:

@@ -436,17 +436,21 @@ def _same_pixels(one: ImageFile, two: ImageFile) -> bool:
         return False
 
 
-def require_upright(images: tuple[DetectedImage, ...]) -> None:
-    """Raises an error if more than half of the images with a face are mirrored."""
+def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None = None) -> None:
+    """Raises an error if more than half of the images with a face are mirrored, or rather the drawing, as a board with
+    one larger dot, which is read the right way round alone, shows."""
     mirrored = [image for image in images if image.detection.mirrored]
     upright = [image for image in images if image.detection.faces and not image.detection.mirrored]
     if mirrored and len(mirrored) > len(upright):
-        first = mirrored[0]
+        first, drawing = mirrored[0], "the drawing is mirrored: change the sign of y_mm of all circles in target.toml"
+        remedy = f"flip the images back, or use the files that the camera wrote; if these are its files, {drawing}"
+        handed = board is not None and board.corner is not None and board.rows != board.columns
+        if handed and sum(bool(image.detection.boards) for image in mirrored) > len(mirrored) / 2:
+            remedy = f"as the board's dots are the right way round, {drawing}"
         raise DetectionError(
             "E-FACES-MIRRORED",
             f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
-            f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored; flip the images back, "
-            "or use the files that the camera wrote",
+            f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored; {remedy}",
         )
 
 

@@ -120,7 +120,7 @@ def detected_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, l
     detector = detect_published if published else None
     detection = detect_files(chosen, camera, target, dots, options.ellipses, cache, options.workers, step, detector)
     detection = replace(detection, skipped=(*skipped, *detection.skipped))
-    require_upright(detection.images)
+    require_upright(detection.images, task.board)
     if dots is not None and (options.board_only or is_board_alone(detection)):
         return detection, label_boards(detection, target, dots)
     if published:
