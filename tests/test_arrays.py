@@ -12,7 +12,7 @@ from stcal import handeye, robot, sfm
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
-from stcal.io.images import decode
+from stcal.io.images import decode, grey_of
 from stcal.robot.kinematics.model import mh80
 from stcal.sfm.detect.files import files_of_arrays
 from stcal.sfm.pipeline import own_checks
@@ -199,3 +199,17 @@ def test_a_repr_tells_the_notes():
     result = stcal.register.register(pair, off, method="least-squares")
     assert result.notes
     assert result.notes[0] in repr(result)
+
+
+@pytest.mark.parametrize("scale", [1, 257])
+def test_colours_of_equal_brightness_are_seen_in_the_channel_that_tells_them(scale):
+    """Red 200 and green 102 have the same grey value."""
+    image = np.zeros((40, 60, 3), np.uint8 if scale == 1 else np.uint16)
+    image[..., 1] = 102 * scale
+    image[10:30, 20:40] = (200 * scale, 0, 0)
+    png = cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+    for grey in (grey_of(image, "a"), decode(png, "a.png")):
+        assert grey[0, 0] == 0
+        assert grey[20, 30] == 200 * scale
+    image[:5] = 255 * scale  # something else is seen in grey: it stays
+    assert grey_of(image, "a")[20, 30] == pytest.approx(60 * scale, rel=0.02)

@@ -7,7 +7,7 @@ import tempfile
 import threading
 import unicodedata
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import BytesIO
@@ -288,6 +288,8 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except cv2.error:
             image = None
+        if image is not None:
+            image = _clearest(image, lambda: cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_COLOR))
     if image is None:
         raise InputError(
             "E-IMAGE-UNREADABLE",
@@ -298,6 +300,27 @@ def _decoded(data: bytes, name: str) -> np.ndarray:
             "E-IMAGE-DAMAGED", f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again"
         )
     return image
+
+
+SPARSE = 5
+"""Only one row and column in this number is looked at."""
+FLAT, CLEARER = 0.1, 3.0
+"""Range of grey values, as a share of all, below which the channels of a colour image are looked at, and how many times
+larger that of a channel must be to be taken for the image."""
+
+
+def _clearest(grey: np.ndarray, colours: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return a grey image, or the channel that shows what is flat in it: colours of equal brightness."""
+    if grey.dtype.kind != "u" or _range(grey) >= FLAT:
+        return grey
+    channel = max(cv2.split(colours()), key=_range)
+    return channel if _range(channel) > CLEARER * _range(grey) else grey
+
+
+def _range(image: np.ndarray) -> float:
+    """Return the range of all but the darkest and brightest hundredth of the pixels, as a share of all values."""
+    low, high = np.percentile(image[::SPARSE, ::SPARSE], (1, 99))
+    return float(high - low) / np.iinfo(image.dtype).max
 
 
 def _turn(data: bytes) -> int | None:
@@ -423,7 +446,7 @@ def grey_of(image: np.ndarray, name: str) -> np.ndarray:
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
     if image.ndim == 2:
         return image
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[:, :, 0]
+    return _clearest(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), lambda: image) if image.shape[2] == 3 else image[:, :, 0]
 
 
 def grey_8bit(image: np.ndarray) -> np.ndarray:

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.design import FaceDesign, TargetDesign
+from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
-from stcal.sfm.detect.sightings import mirror_images
+from stcal.sfm.detect.sightings import BoardSighting, mirror_images
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
@@ -175,6 +175,15 @@ def test_a_set_that_is_mostly_mirrored_is_refused(mirrored, upright, empty):
     words = f"{mirrored} of {mirrored + upright} images with a face are mirrored, first m0: face 2, 5 appears"
     with pytest.raises(DetectionError, match=words):
         require_upright(images(mirrored, upright, empty))
+
+
+@pytest.mark.parametrize(("corner", "said"), [((0, 0), "right way round, the drawing is mirrored"), (None, "flip the")])
+def test_a_board_that_is_read_shows_that_the_drawing_is_mirrored(corner, said):
+    board = BoardDesign(7, 9, 30.0, 7.5, "bright", 0.1, corner, 11.0 if corner else None)
+    seen = BoardSighting(np.arange(63), np.zeros((1, 63, 2), int))
+    own = [replace(i, detection=replace(i.detection, boards=(seen,))) for i in images(3, 0, 0)]
+    with pytest.raises(DetectionError, match=said):
+        require_upright(tuple(own), board)
 
 
 @pytest.mark.parametrize(("mirrored", "upright", "empty"), [(0, 0, 3), (0, 4, 0), (1, 11, 0), (2, 2, 0)])
