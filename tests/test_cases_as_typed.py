@@ -337,7 +337,6 @@ def located(folder: Path) -> None:
 
 HAND_EYE = {
     "aruco_flips_30pc": in_hand_or_eye("flange_from_camera", 0.25, 1.1),
-    "he_franka_column_major": in_hand_or_eye("flange_from_camera", 0.15, 1.4),
     "kuka_semicolon_comma": in_hand_or_eye("flange_from_camera", 0.13, 0.8),
     "ur_pendant": in_hand_or_eye("flange_from_camera", 0.13, 0.8),
 }

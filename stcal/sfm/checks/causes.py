@@ -153,7 +153,7 @@ def cause_of_size(
     """Returns a failed check that names another size of the board than the drawing of the faces has; None if it fits.
     ``circles`` : (3,) places found, mm."""
     ratios = []
-    for face in design.faces if board is not None else ():
+    for face in design.faces if board is not None and board.rows else ():
         labels = [label for label in circles if label.face == face.id]
         if len(labels) < 3:
             continue
