@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 import cv2
 import numpy as np
@@ -309,11 +310,11 @@ FLAT, CLEARER = 0.1, 3.0
 larger that of a channel must be to be taken for the image."""
 
 
-def _clearest(grey: np.ndarray, colours: Callable[[], np.ndarray]) -> np.ndarray:
+def _clearest(grey: np.ndarray, colours: Callable[[], Any]) -> np.ndarray:
     """Return a grey image, or the channel that shows what is flat in it: colours of equal brightness."""
     if grey.dtype.kind != "u" or _range(grey) >= FLAT:
         return grey
-    channel = max(cv2.split(colours()), key=_range)
+    channel = np.asarray(max(cv2.split(colours()), key=_range))
     return channel if _range(channel) > CLEARER * _range(grey) else grey
 
 

@@ -13,7 +13,7 @@ from stcal.boards.faces import tags_of_no_face, why_unseen
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
-from stcal.errors import DegenerateError, DetectionError, InputError, InputNote, StcalError
+from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
@@ -39,7 +39,7 @@ from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays
 from stcal.sfm.detect.labels import LabelledImage, is_board_alone, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
+from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, plain_lens, unknown_lens
 from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
@@ -240,7 +240,7 @@ def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
 
 
 def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -> RunResult:
-    target, options = task.target, task.options
+    target, options, camera_given = task.target, task.options, model is not None
     if model is None and target.with_faces(printed=True).faces:
         detection, labelled, model = _with_found_camera(task)
     else:
@@ -255,12 +255,30 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
             task = replace(task, target=target, board=scale_reference(None, target))
         result = _solved(task, detection, labelled, model)
+        if not (camera_given or _unfolded(result.calibration.camera)):
+            warnings.warn(PLAIN, InputNote, stacklevel=2)
+            result = _solved(task, detection, labelled, model_of(plain_lens(result.calibration.camera), PHOTOGRAPHS))
         printed = target.with_faces(printed=True).faces
         absent = [face for face in printed if face.id not in result.target.target_from_face]
         strange = [f"{NOT_AS_DRAWN}{note}" for note in tags_of_no_face(task.files[0], printed, absent)]
         result = replace(result, notes=(*result.notes, *strange))
         left_out.update(unadjusted(result))
     return result
+
+
+PLAIN = (
+    "the faces are too few or too small in these images, or in their middle alone, to tell the lens's distortion and "
+    "principal point: they are held near none, and near the middle; give --camera, or photograph the faces larger"
+)
+
+
+def _unfolded(camera: Camera) -> bool:
+    """Returns whether all corners of a camera's image have rays."""
+    try:
+        camera.normalised_from_pixel(np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], float))
+    except ConvergenceError:
+        return False
+    return True
 
 
 def _with_found_camera(task: Task) -> tuple[DetectionResult, list[LabelledImage], CameraModel]:

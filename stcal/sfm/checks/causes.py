@@ -168,6 +168,10 @@ def cause_of_size(
     return Check(CAUSE, f"{OF_WHOLE_SET}{name}", "failed", reason, (), len(ratios), (), remedy)
 
 
+MOST_SHARE = 1 / 3
+"""Largest share of the redundancy that a hypothesis may take as parameters: more would explain errors of any kind."""
+
+
 def _redundancy(networks: Sequence[Network]) -> float:
     return float(sum(n.redundancy.sum() for n in networks))
 
@@ -185,7 +189,7 @@ def _fit(cause: _Cause, networks: Sequence[Network]) -> _Fitted | None:
     square = sum(float((n.residual**2).sum()) for n in networks)
     rest = redundancy - test.freedom
     left = (square - test.statistic) / rest if rest > 0 else 0.0
-    if not test.freedom or left <= 0:
+    if not test.freedom or left <= 0 or test.freedom > MOST_SHARE * redundancy:
         return None
     probability = float(fdtrc(test.freedom, rest, test.statistic / test.freedom / left))
     return _Fitted(cause, test, test.statistic - test.freedom * left, probability, left)
