@@ -9,7 +9,6 @@ import sys
 import tempfile
 import time
 from contextlib import closing, redirect_stderr, redirect_stdout
-from dataclasses import replace
 from hashlib import sha256
 from io import StringIO
 from pathlib import Path
@@ -18,13 +17,11 @@ import pytest
 
 from stcal.cli.main import main_sfm
 from stcal.io.files import RUN_MARKER
-from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
-from stcal.sfm.interop.native import NativeColmap, find_colmap, require_listable
-from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.interop.crosscheck import mapper_options
+from stcal.sfm.interop.native import find_colmap
 from stcal.sfm.mapping.incremental import pipeline_options
-from stcal.sfm.runs.crosscheck import Tolerances
 from stcal.sfm.runs.saved import load_run, verify
-from tests.outcome import COMPUTATION, INPUT, assert_error, fails_with, lines_of
+from tests.outcome import COMPUTATION, INPUT, assert_error, lines_of
 from tests.shared import own_copy, unseal
 
 INSTALL = "install it with `sudo apt-get install colmap`"
@@ -147,22 +144,6 @@ def test_the_native_mapper_is_given_every_threshold_that_it_has(colmap):
         assert float(given[offered[key]]) == float(ours[key]), key
         assert given[offered[key]] in ("0", "1") or not isinstance(ours[key], bool), key
     assert given.keys() <= found.mapper_options
-
-
-def test_older_names_and_unknown_options():
-    names = ["Mapper.local_ba_min_tri_angle", "Mapper.ba_global_images_freq", "Mapper.tri_min_angle", "random_seed"]
-    theirs = [
-        "Mapper.num_threads",
-        "Mapper.of_tomorrow",
-        "Mapper.snapshot_path",
-        "GlobalMapper.min_num_matches",
-        "help",
-    ]
-    found = NativeColmap(Path("colmap"), "3.8", frozenset(names + theirs))
-    given = mapper_options(found, ["a"], (1, 2))
-    assert given == dict(zip(names, ("6.0", "500", "0.5", "1"), strict=True))
-    later = replace(found, mapper_options=frozenset({"default_random_seed"}))
-    assert mapper_options(later, ["a"], (1, 2)) == {"default_random_seed": "1"}
 
 
 def program(folder, mapper: str, version: str = "3.8", asked: str = "") -> Path:
@@ -409,23 +390,3 @@ def test_a_report_that_cannot_be_added_to(own_run, refused_page_and_all, tmp_pat
     spoil, part = SPOILT_REPORTS[case]
     spoil(own_run)
     refused_page_and_all(never(tmp_path), INPUT, part, "run it again")
-
-
-def test_a_name_that_a_list_cannot_hold(own_run, tmp_path):
-    saved = load_run(own_run)
-    odd = replace(saved.observations[0], name=" 12/IMG_1000.jpg")
-    with fails_with("E-IMAGE-NAME-SPACES … ' 12/IMG_1000.jpg'"):
-        crosscheck(replace(saved, observations=(odd, *saved.observations[1:])), never(tmp_path))
-    require_listable([*image_ids(saved.observations), "12/ inner space.jpg"])
-
-
-@pytest.mark.parametrize("option", ["--tolerance-um", "--tolerance-mdeg", "--camera-tolerance-um", "--timeout"])
-def test_a_limit_that_is_none(small_run, stcal_sfm, option):
-    for value in ("-1", "nan", "1e9"):
-        assert_error(stcal_sfm("crosscheck", small_run, option, value), INPUT, option, "`stcal-sfm crosscheck --help`")
-
-
-def test_a_tolerance_that_is_none():
-    for value in (-1.0, float("nan"), float("inf")):
-        with fails_with("E-OPTION-RANGE … camera_mdeg"):
-            Tolerances(camera_mdeg=value)

@@ -22,7 +22,7 @@ import pytest
 from stcal.errors import InputError, StcalError
 from stcal.sfm.interop import export_database as export
 from stcal.sfm.interop.export_database import copy_database
-from stcal.sfm.interop.schema import SCHEMAS, schema_of_version
+from stcal.sfm.interop.schema import SCHEMAS
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with
 from tests.shared import own_copy
@@ -475,20 +475,3 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(links, database, tmp_p
         copy_database(database, tmp_path / "out.db", "3.8")
     assert (tmp_path / "out.db").read_text() == "theirs"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["first.db", "out.db", "run"]
-
-
-@pytest.mark.parametrize(
-    ("version", "schema"),
-    [
-        *(("3.8", "3.8"), ("3.9.1", "3.9"), ("3.10", "3.10"), ("3.11.1", "3.11"), ("3.12.6", "3.12")),
-        *(("3.13.0", "3.13"), ("4.0.3", "4.0"), ("4.1", "4.0"), ("4.1.1", "4.0"), ("4.2.1", "4.2")),
-    ],
-)
-def test_the_schema_of_a_version(version, schema):
-    assert schema_of_version(version) == schema
-
-
-@pytest.mark.parametrize("version", ["3.7", "3.6.1", "4.3", "3.14.0", "3.12.0.dev0", "5", "", "colmap"])
-def test_a_version_whose_schema_is_not_known(version):
-    with pytest.raises(InputError, match=f"COLMAP {version}: its database schema is not known; use a release of 3.8, "):
-        schema_of_version(version)

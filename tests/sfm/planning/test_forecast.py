@@ -43,7 +43,7 @@ from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
 from tests.outcome import fails_with
-from tests.shared import own_copy, unsealed_copy
+from tests.shared import unsealed_copy
 
 NOISE = CentreNoise(0.1, 3.0)
 """Of centres: about 0.013 px, so that image and a board of 20 µm matter alike."""
@@ -380,13 +380,6 @@ def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(
     assert warning in text.splitlines()[0]
 
 
-def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
-    own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("target_model", "overlays", "cache"))
-    code, _, error = stcal_sfm("advise", tmp_path / "run")
-    assert (code, error.count("\n")) == (2, 1)
-    assert "target_model: damaged or incomplete" in error
-
-
 def plan(images=2, noise=NOISE, groups=(("1", "2"), ("2", "3"))):
     """Of faces 1, 2 and 3, the last two groups away from the first."""
     options = PlanOptions(width=2592, images=images, groups=groups, noise=noise)
@@ -421,13 +414,6 @@ def test_plan_remedies_are_plans_of_their_own():
     assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
 
 
-@pytest.mark.slow
-def test_plan_names_what_dominates():
-    one = (("1", "2"),)
-    assert plan(noise=CentreNoise(0.0, floor_px=0.05), groups=one).shares["2"]["image noise"] > 0.9
-    assert plan(noise=CentreNoise(0.0, floor_px=0.0002), groups=one).shares["2"]["board"] > 0.9
-
-
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [
@@ -458,16 +444,6 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
     path.write_text(faces or "")
     with fails_with(message):
         nominal_poses(target, path if faces else None)
-
-
-@pytest.mark.slow
-def test_plan_of_another_design_with_its_faces(tmp_path):
-    target, board, poses = second_design()
-    path = tmp_path / "faces.json"
-    path.write_text(json.dumps({"target_from_face": {face: pose.matrix().tolist() for face, pose in poses.items()}}))
-    result = make_plan(PlanOptions(width=2592, images=3), target, board, nominal_poses(target, path))
-    assert set(result.forecast.face_covariance) == {"left", "right"}
-    assert 1e-4 < result.forecast.worst()[1] < 0.02
 
 
 @pytest.mark.parametrize("size", [(None, None), (2592, None)])
