@@ -116,7 +116,8 @@ def run(
         Called with (stage, done, total).
     checks
         Additional checks: functions of the result that return a :class:`stcal.sfm.Check`, such as
-        :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others.
+        :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others. One that
+        raises is suspicious; the result stays.
     every
         Of a video: the sharpest of this many frames is used; by ``auto``, also the value if None, the sharpest of those
         between which the view hardly changes.

@@ -8,7 +8,7 @@ import typer
 from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, verbose, write, write_if
-from stcal.errors import InputError
+from stcal.errors import ChecksFailed, InputError
 from stcal.io.files import keep_apart
 
 app = typer.Typer()
@@ -142,7 +142,7 @@ def detect(
     from stcal.sfm.pipeline import detect_images
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.solve import require_no_calibration
-    from stcal.sfm.runs.text import detection_text
+    from stcal.sfm.runs.text import detection_text, found_in_all
 
     options = RunOptions(
         solve=solve,
@@ -156,6 +156,8 @@ def detect(
     print_each("note", found.notes)
     say(detection_text(found.detection, found.labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
+    if not any(len(image.observations) for image in found.labelled):
+        raise ChecksFailed("E-NOTHING-SEEN", f"{images}: {found_in_all(found.labelled)}; look at the overlays")
 
 
 @app.command()

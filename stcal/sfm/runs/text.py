@@ -1,5 +1,6 @@
 """Text for the terminal: the findings of a run or a detection in a few lines."""
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -155,7 +156,21 @@ def _rims(result: RunResult) -> Iterator[str]:
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
     """Returns faces and dots of each image, and what was left out."""
-    return "\n".join([*found_lines(labelled), *_skipped(detection.skipped)])
+    return "\n".join([*found_lines(labelled), *_skipped(detection.skipped), found_in_all(labelled)])
+
+
+def found_in_all(labelled: Sequence[LabelledImage]) -> str:
+    """Returns in how many images faces and board are, and what was left out in most of them."""
+    images, count = [each.observations for each in labelled], len(labelled)
+    faces = sum(bool(image.face_ids()) for image in images)
+    dots = sum(any(isinstance(label, DotLabel) for label in image.labels) for image in images)
+    alike: dict[str, list[str]] = {}
+    for each in labelled:
+        for note in {re.sub(r"[\d.:]+", "", note): note for note in each.notes}.items():
+            alike.setdefault(note[0], []).append(note[1])
+    most = max(alike.values(), key=len, default=[])
+    reason = f"; in {len(most)} of {count}: {most[0]}" if most else ""
+    return f"a face in {faces} of {count} images, the board in {dots}{reason}"
 
 
 def found_lines(labelled: Sequence[LabelledImage]) -> Iterator[str]:
