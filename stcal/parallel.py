@@ -259,15 +259,16 @@ def _context() -> multiprocessing.context.BaseContext:
 
 @cache
 def _sockets() -> str:
-    """Returns the folder of the server's sockets, one that the next process removes if this one is killed."""
+    """Returns the folder of the server's sockets, which workers remove, or the next process, if this one is killed."""
     kept = contextlib.ExitStack()
     folder = kept.enter_context(scratch_folder("mp"))
     multiprocessing.util.Finalize(None, kept.close, exitpriority=-200)  # after multiprocessing has removed its own
     before, tempfile.tempdir = tempfile.tempdir, str(folder)
     try:
-        return multiprocessing.util.get_temp_dir()
+        multiprocessing.util.get_temp_dir()
     finally:
         tempfile.tempdir = before
+    return str(folder.parent)
 
 
 @contextlib.contextmanager

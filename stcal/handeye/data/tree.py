@@ -107,7 +107,7 @@ def _matrix(value: Any) -> tuple[np.ndarray, str] | None:
     if not isinstance(value, Mapping):
         return None
     named = [each for each in value.values() if (own := numbers(each)) is not None and own.size == 16]
-    inside = [value[key] for key in WRAPPED if key in value] or named
+    inside = [value[key] for key in WRAPPED if key in value] or (named if _name_in(value) else [])
     found = _matrix(inside[0]) if len(inside) == 1 else None
     return found and (found[0], found[1] or _name_in(value))
 

@@ -86,9 +86,10 @@ REPEATED = "joint values were measured several times: what the model lacks there
 MOST_OF_IT = 0.5
 """Share of the squared residuals that a jump along the rows must explain to be named before parameters that stay
 open."""
-ROUNDED_RAD, BEYOND = 2e-5, 20.0
+ROUNDED_RAD, BEYOND, BEYOND_MM = 2e-5, 20.0, 0.3
 """Difference of a turn of the tool from that of the robot file, as rounding leaves it; and how many times what it does
-across the range of positions these must err, for the orientations to be computed by the controller."""
+across the range of positions these must err, and by how much at least, for the orientations to be computed by the
+controller."""
 COMPUTED = (
     "orientations are the robot file's, to rounding, and positions are not: the controller computed them. "
     "Positions alone are used, as with --observe position; with --observe pose orientations count as measured"
@@ -245,7 +246,7 @@ def _turns_as_computed(first: State, data: Measurements) -> bool:
     )
     turned = rms(measured - modelled) if len(same) else np.inf
     away = rms(position_errors(residuals(first, observed(data, "position"))))
-    return turned < ROUNDED_RAD and away > BEYOND * turned * float(np.abs(np.ptp(data.positions, axis=0)).max())
+    return turned < ROUNDED_RAD and away > max(BEYOND_MM, BEYOND * turned * float(np.ptp(data.positions, axis=0).max()))
 
 
 def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
