@@ -372,8 +372,9 @@ def in_scale(
     if not board_ways:
         return board
     way, wanted = np.array(board_ways), np.array(face_ways)
-    square = (way**2).sum(1)
-    each, order = (way * wanted).sum(1) / square, np.argsort((way * wanted).sum(1) / square)
+    square = np.maximum((way**2).sum(1), np.finfo(float).tiny)  # the camera may not have moved
+    each = (way * wanted).sum(1) / square
+    order = np.argsort(each)
     factor = float(each[order][np.searchsorted(np.cumsum(square[order]), square.sum() / 2)])
     before, after = (float(np.median(np.linalg.norm(size * way - wanted, axis=1))) for size in (1.0, factor))
     is_other = factor > 0 and abs(factor - 1) > OTHER_SIZE and before > CLEARER * after
