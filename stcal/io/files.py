@@ -244,11 +244,7 @@ def json_text(content) -> str:
     """Return the text of a JSON file in the package's form; ``content`` : dict or ``stcal.io.json.ResultFile``."""
     plain = content if isinstance(content, dict) else content.content()
     text = _indented(plain, "\n")
-    return require_readable((text if len(text) < COMPACT_FROM else _encode(plain)) + "\n")
-
-
-def require_readable(text: str) -> str:
-    """Return a text to be written; refuse one that no command would read again."""
+    text = (text if len(text) < COMPACT_FROM else _encode(plain)) + "\n"
     if len(text) > TABLE_BYTES:
         raise InputError(
             "E-OUTPUT-SIZE",

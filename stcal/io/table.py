@@ -13,7 +13,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
-from stcal.io.files import TABLE_BYTES, read_bytes, require_readable, require_written, text_of
+from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}
@@ -385,7 +385,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
     """Return CSV of rows; an apostrophe keeps a spreadsheet from running names that begin as formulas do."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([_shown(cell) for cell in row] for row in rows)
-    return require_readable(out.getvalue())
+    return out.getvalue()
 
 
 def _shown(cell: object) -> str:

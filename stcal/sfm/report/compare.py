@@ -11,7 +11,7 @@ from pydantic import Field
 from stcal.errors import DegenerateError, InputError, InputNote
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.io.files import TABLE_BYTES, read_bytes, require_unchanged
+from stcal.io.files import MODEL_BYTES, read_bytes, require_unchanged
 from stcal.io.json import ByFace, ByImage, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.io.table import FARTHEST, LENGTHS, csv_rows, read_table
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
@@ -273,7 +273,7 @@ def _require_same_unit(where: str, kind: str, true: float, measured: float, side
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
     """Counts the labels against the truth; a board's numbers are known up to its symmetry, for a whole group."""
     try:
-        rows = list(csv_rows(read_bytes(path, TABLE_BYTES).decode()))
+        rows = list(csv_rows(read_bytes(path, MODEL_BYTES).decode()))
         require_unchanged(path)
         measured: dict[str, dict[str, tuple[float, float]]] = {}
         for row in rows:

@@ -22,11 +22,11 @@ from stcal.io.files import (
     BOARD,
     CAMERA,
     DATABASE,
+    MODEL_BYTES,
     MODELS,
     REFINED_CAMERA,
     REPORT_PDF,
     RUN_MARKER,
-    TABLE_BYTES,
     TARGET,
     TARGET_MODEL,
     json_text,
@@ -239,7 +239,7 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
     path = run / "labels.csv"
     rows: dict[str, list[list[float]]] = {name: [] for name in names}
     try:
-        for row in csv_rows(read_bytes(path, TABLE_BYTES).decode()):
+        for row in csv_rows(read_bytes(path, MODEL_BYTES).decode()):
             if row["image"] in rows and row["residual_x_px"]:
                 values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
                 rows[row["image"]].append(values)

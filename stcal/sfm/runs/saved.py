@@ -24,8 +24,8 @@ from stcal.io.files import (
     BOARD,
     CAMERA,
     DATABASE,
+    MODEL_BYTES,
     RUN_MARKER,
-    TABLE_BYTES,
     TARGET,
     TARGET_MODEL,
     digest_of,
@@ -268,7 +268,7 @@ def _as_written(path: Path) -> Iterator[None]:
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
     """Observations and corrected centres from ``labels.csv``; ``names``: (name, group, circles) of the images."""
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
-    for row in csv_rows(read_bytes(path, TABLE_BYTES).decode()):
+    for row in csv_rows(read_bytes(path, MODEL_BYTES).decode()):
         if None in row.values():
             raise ValueError(f"image {row['image']}: keypoint {row['keypoint']}: its row is cut")
         rows[row["image"]].append(row)
