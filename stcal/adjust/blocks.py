@@ -145,6 +145,23 @@ class Factor:
         return found
 
 
+class Known(Protocol):
+    """Knowledge of a kept block: any cost with its equations."""
+
+    @property
+    def block(self) -> Block:
+        """The block."""
+        ...
+
+    def cost(self, values: Mapping[str, Any]) -> float:
+        """Return the cost of a state, in σ²."""
+        ...
+
+    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return normal matrix (n·dim, n·dim) and right side (n·dim,): minus half the gradient of the cost."""
+        ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
     """Knowledge of the members of a :class:`Vector` block: ``mean`` (n, dim), and inverse covariance (n·dim, n·dim)."""
@@ -161,6 +178,10 @@ class Prior:
         """Return the cost, in σ²."""
         away = self.away(values)
         return float(away @ self.weight @ away)
+
+    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return normal matrix and right side."""
+        return self.weight, -self.weight @ self.away(values)
 
 
 def numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:

@@ -15,17 +15,26 @@ from typing import Any
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from stcal.adjust.blocks import Block, Factor, Huber, Prior, Values, numbers
+from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Values, numbers
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
-from stcal.geometry.least_squares import SETTLED, Minimum, minimise
-from stcal.geometry.normal_equations import Reduction, blocks_of, generalised_inverse, reduce
+from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise
+from stcal.geometry.normal_equations import (
+    Reduction,
+    blocks_of,
+    constrained_inverse,
+    datum,
+    generalised_inverse,
+    reduce,
+)
 
 HELD = 1e-14
 """Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
 LEFT = 1e-9
 """Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 TINY = 1e-300
+AT_ONCE = 10_000
+"""Number of rows whose derivatives are multiplied at once; it bounds the memory."""
 
 
 @dataclass(eq=False)
@@ -51,7 +60,7 @@ class Adjustment:
 
     blocks: list[Block] = field(default_factory=list)
     factors: list[Factor] = field(default_factory=list)
-    priors: list[Prior] = field(default_factory=list)
+    priors: list[Known] = field(default_factory=list)
     sigma: dict[str, float] = field(default_factory=dict)
 
     def block(self, name: str, start: Values, eliminate: bool = False, fixed: Sequence[int] | np.ndarray = ()) -> Block:
@@ -104,9 +113,15 @@ class Adjustment:
 
     def prior(self, block: Block, mean: np.ndarray, weight: np.ndarray) -> None:
         """Add knowledge of a kept :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
-        if block.eliminate:
-            raise InputError("E-OPTION-COMBINATION", f"block {block.name}: eliminated, its prior must be a factor")
-        self.priors.append(Prior(block, np.asarray(mean), np.asarray(weight)))
+        self.know(Prior(block, np.asarray(mean), np.asarray(weight)))
+
+    def know(self, known: Known) -> None:
+        """Add knowledge of a kept block that has equations of its own."""
+        if known.block.eliminate:
+            raise InputError(
+                "E-OPTION-COMBINATION", f"block {known.block.name}: eliminated, its prior must be a factor"
+            )
+        self.priors.append(known)
 
     def solve(self, values: Mapping[str, Any] | None = None, **options: Any) -> "Solution":
         """Return the solution of least cost, from the start or from ``values``.
@@ -214,8 +229,9 @@ class Solution:
             rows.add(normal, right, (block, block_right, cross))
         for prior in self.problem.priors:
             at = self.places[prior.block.name]
-            normal[at, at] += prior.weight
-            right[at] -= prior.weight @ prior.away(self.values)
+            of_prior, pull = prior.equations(self.values)
+            normal[at, at] += of_prior
+            right[at] += pull
         held = np.concatenate(
             [np.repeat(b.fixed, b.start.dim) for b in self.problem.blocks if not b.eliminate] or [np.zeros(0, bool)]
         )
@@ -272,29 +288,56 @@ class Solution:
         by = self.reduction.from_kept
         return self.reduction.inverse + by @ self.inverse @ np.swapaxes(by, 1, 2)
 
+    def together(self, block: Block) -> np.ndarray:
+        """Return the covariance (k + n·dim, k + n·dim) of all kept unknowns, and of the members of a block after them.
+
+        A kept block stands in it twice.
+        """
+        by = np.eye(self.kept)[self.places[block.name]] if not block.eliminate else self._by_kept()
+        mixed = by @ self.inverse
+        own = mixed @ by.T
+        if block.eliminate:
+            own += block_diagonal(self.reduction.inverse)
+        return np.block([[self.inverse, mixed.T], [mixed, own]])
+
+    def _by_kept(self) -> np.ndarray:
+        """Return how eliminated unknowns (m·a, k) go with the kept ones."""
+        return -self.reduction.from_kept.reshape(-1, self.kept)
+
     def by_clusters(self, block: Block) -> ByClusters:
         """Return the covariance of a kept block by how the clusters of observations differ."""
         normal, along = _alone(self.normal, self.places[block.name])
         return _by_clusters(normal, self.told(along))
 
+    def effects(self, along: np.ndarray) -> "Iterator[tuple[Rows, slice, np.ndarray]]":
+        """Yield by batches the rows of each factor, the part of them that it is, and the derivatives (r, w, q) of this
+        part by changes ``along`` (k, q) of the kept unknowns."""
+        ways = self._ways(along)
+        for rows in self.rows:
+            for begin in range(0, len(rows.residual), AT_ONCE):
+                batch = slice(begin, begin + AT_ONCE)
+                yield rows, batch, rows.total(ways, batch)
+
     def told(self, along: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Yield of each factor with clusters their numbers (r,), the derivatives (r, w, q) of the rows by changes
         ``along`` (k, q) of the kept unknowns, and the residuals (r, w)."""
+        ways = self._ways(along)
         for rows in self.rows:
             if rows.factor.cluster is not None:
-                yield rows.factor.cluster, self._total(rows, along), rows.residual
+                yield rows.factor.cluster, rows.total(ways), rows.residual
 
-    def _total(self, rows: "Rows", along: np.ndarray) -> np.ndarray:
-        """Return the derivatives (r, w, q) of rows by changes ``along`` (k, q), eliminated members going with them."""
-        total = np.zeros((*rows.residual.shape, along.shape[1]))
-        for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
-            if block.eliminate:
-                by = -(self.reduction.from_kept @ along)
-                total += slope @ by[numbers(index, slope)]
-            else:
-                by = along[self.places[block.name]].reshape(len(block.start), block.start.dim, -1)
-                total += slope @ (by[0] if index is None else by[index])
-        return total
+    def _ways(self, along: np.ndarray) -> dict[str, np.ndarray]:
+        """Return by block how its members (n, dim, q) change by ``along`` (k, q), eliminated members going with it."""
+        kept = {b.name: (len(b.start), b.start.dim, along.shape[1]) for b in self.problem.blocks if not b.eliminate}
+        ways = {name: along[self.places[name]].reshape(shape) for name, shape in kept.items()}
+        if self.dropped:
+            ways[self.dropped.name] = -(self.reduction.from_kept @ along)
+        return ways
+
+    @cached_property
+    def _alone(self) -> dict[str, np.ndarray]:
+        """The ways of each kept unknown by itself."""
+        return self._ways(np.eye(self.kept))
 
     def without(self, cluster: int) -> dict[str, Any]:
         """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""
@@ -303,7 +346,7 @@ class Solution:
         for rows in self.rows:
             if rows.factor.cluster is None or not (own := rows.factor.cluster == cluster).any():
                 continue
-            totals.append(self._total(rows, np.eye(self.kept))[own].reshape(-1, self.kept))
+            totals.append(rows.total(self._alone)[own].reshape(-1, self.kept))
             residuals.append(rows.residual[own].ravel())
             by_dropped = np.zeros((*rows.residual[own].shape, *dropped))
             for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
@@ -325,7 +368,7 @@ class Solution:
         left = 0.0
         for rows in self.rows:
             if kind in (None, rows.factor.kind):
-                total = self._total(rows, np.eye(self.kept))
+                total = rows.total(self._alone)
                 taken = float(((total @ self.inverse) * total).sum())
                 for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
                     if block.eliminate:
@@ -355,7 +398,7 @@ class Solution:
             own = raw / sigma * np.sqrt(rows.weight)[:, None, None]
             normal += np.einsum("rwp,rwq->pq", own, own)
             right -= np.einsum("rwp,rw->p", own, rows.residual)
-            mixed += np.einsum("rwp,rwk->pk", own, self._total(rows, np.eye(self.kept)))
+            mixed += np.einsum("rwp,rwk->pk", own, rows.total(self._alone))
             for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
                 if block.eliminate:
                     np.add.at(by_dropped, numbers(index, slope), np.swapaxes(slope, 1, 2) @ own)
@@ -396,10 +439,14 @@ class Joined:
     shared : tuple of str
         Names of the blocks in common, the first ones of each part. What is known of them stands in one part only. All
         other unknowns are eliminated.
+    free : callable, optional
+        Returns of a state the orthonormal directions (s, f) of the shared unknowns in which nothing changes, such as
+        motions of all points; the datum is that of smallest trace over them.
     """
 
     parts: Sequence[Adjustment]
     shared: tuple[str, ...]
+    free: Callable[[Mapping[str, Any]], np.ndarray] | None = None
 
     def cost(self, values: Mapping[str, Any]) -> float:
         """Return the cost of a state, in σ²."""
@@ -407,7 +454,7 @@ class Joined:
 
     def moved(self, values: Mapping[str, Any], step: np.ndarray) -> dict[str, Any]:
         """Return the state after the steps of all parts, one after the other; shared blocks stand in each."""
-        found, at = {}, 0
+        found, at = dict(values), 0
         for part in self.parts:
             own = {block.name: values[block.name] for block in part.blocks}
             size = sum(len(each) * each.dim for each in own.values())
@@ -427,7 +474,7 @@ class JoinedSolution:
     problem: Joined
     values: dict[str, Any]
 
-    @cached_property
+    @property
     def cost(self) -> float:
         """Cost of the state, in σ²."""
         return sum(part.cost for part in self.parts)
@@ -463,11 +510,18 @@ class JoinedSolution:
     @cached_property
     def inverse(self) -> np.ndarray:
         """Covariance of the shared unknowns, of independent errors."""
-        return np.linalg.inv(self.normal)
+        return constrained_inverse(self.normal, self.free)
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Directions (s, f) in which nothing changes."""
+        return self.problem.free(self.values) if self.problem.free else np.zeros((self.count, 0))
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Return the steps of all parts, damped for the shared unknowns alone, and their predicted gain."""
-        shared = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        own = np.diag(self.normal)
+        held = self.normal + damping * np.diag(own) + datum(own, self.free)
+        shared = np.linalg.solve(held, self.right)
         gain = 2 * float(shared @ self.right) - float(shared @ self.normal @ shared)
         steps = []
         for part, reduction in zip(self.parts, self.reductions, strict=True):
@@ -522,6 +576,14 @@ class Rows:
                 slope[block.fixed[numbers(members, slope)]] = 0.0
         places = tuple(solution.places.get(block.name) for block, _ in factor.on)
         return cls(factor, places, slopes, white * root[:, None], length, weight)
+
+    def total(self, ways: Mapping[str, np.ndarray], part: slice = slice(None)) -> np.ndarray:
+        """Return the derivatives (r, w, q) of a part of the rows by changes of all blocks (n, dim, q), by name."""
+        total: Any = 0.0
+        for (block, index), slope in zip(self.factor.on, self.slopes, strict=True):
+            way = ways[block.name]
+            total = total + slope[part] @ (way[0] if index is None else way[index[part]])
+        return total
 
     def add(self, normal: np.ndarray, right: np.ndarray, dropped: "tuple[np.ndarray, np.ndarray, np.ndarray]") -> None:
         """Add the rows to the equations of kept unknowns, and to blocks, right sides, mixed parts of dropped ones."""

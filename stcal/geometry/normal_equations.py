@@ -110,8 +110,16 @@ def constrained_inverse(normal: np.ndarray, free: np.ndarray) -> np.ndarray:
 
     ``normal`` : singular in the directions ``free``, (k, f), which are orthonormal (S-transformation, Baarda 1973).
     """
-    scale = float(np.median(np.diag(normal)[np.any(free != 0, axis=1)]))
-    return np.linalg.inv(normal + scale * free @ free.T) - free @ free.T / scale
+    if not free.any():
+        return np.linalg.inv(normal)
+    held = datum(np.diag(normal), free)
+    return np.linalg.inv(normal + held) - free @ free.T / (held.trace() / free.shape[1])
+
+
+def datum(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Return what is to be added to a normal matrix of this ``diagonal`` (k,), so that its ``free`` directions stay."""
+    held = np.any(free != 0, axis=1)
+    return float(np.median(diagonal[held])) * free @ free.T if held.any() else np.zeros((len(free), len(free)))
 
 
 def generalised_inverse(normal: np.ndarray) -> np.ndarray:

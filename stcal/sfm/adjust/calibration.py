@@ -165,7 +165,7 @@ def calibrate(
         state = with_differences(state, calibrated, target, options.frame)
         joint = result_of(state)
         calibrated = calibrated_target(joint, calibrated, target, options.frame, state)
-        circle_sigma_px = joint.sigma_scale * centre_sigma_px(state.blocks, CIRCLES)
+        circle_sigma_px = joint.sigma_scale * centre_sigma_px(state, CIRCLES)
         step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
@@ -318,7 +318,7 @@ def _adjust_all(
         state = adjusted(models, board, camera, options.flatness_mm, prior, current, None, shape_factors, settled)
         own = state.setting
         shape_factors = own.print_factor, own.bend_factor, own.print_amplitude
-        models, current = [block.model for block in state.blocks], state.shared.camera
+        models, current = state.models, state.camera
         step(None)
         if prior is not None:
             unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]

@@ -1,78 +1,35 @@
-"""Normal equations: of one group, reduced to the unknowns that all groups share, and of the joint adjustment."""
+"""The joint adjustment as blocks and factors: all groups share circles, common shape of the board, and intrinsics; each
+has poses of its cameras, dots, and a pose of its board of its own."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.engine import Adjustment, Joined
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import perturbed
-from stcal.geometry.normal_equations import Reduction, blocks_of, free_motions, reduce
+from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.normal_equations import free_motions
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.print_modes import AMPLITUDES
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.faces import Shape
-from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
+from stcal.sfm.adjust.refine import placed, projection_jacobians, reproject
 from stcal.sfm.adjust.scale import known_points
 from stcal.sfm.data.model import GroupModel, MetricModel
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Shared:
-    """Unknowns that all groups share."""
-
-    xyz_model: np.ndarray  # (c, 3) circles, mm
-    shape_mm: np.ndarray  # (d, 3) deviation of the dots from the design common to all groups, board frame
-    camera: Camera
-    basis: np.ndarray  # (16, q) derivative of the camera's parameters by those that are adjusted
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
-    """One group of the joint adjustment."""
-
-    model: MetricModel
-    model_from_board: Rigid
-    design: np.ndarray  # (e, 3) of its dots, board frame
-    sigma_mm: float  # of a dot about the common shape
-    dots: np.ndarray  # indices of the model's points, as ``circles``
-    circles: np.ndarray
-    dot_place: np.ndarray  # (e,) in the common shape, empty if each group has its own
-    circle_place: np.ndarray  # of each circle among all
-    # (3p + q, 3p + q) normal matrix of points and intrinsics from images, if known
-    photographs: np.ndarray | None = None
-
-    def expected_dots(self, shared: Shared) -> np.ndarray:
-        """Returns the sum of design and common shape, (e, 3), board frame."""
-        return self.design + shared.shape_mm[self.dot_place] if len(self.dot_place) else self.design
-
-    def board_residual(self) -> np.ndarray:
-        """Returns the adjusted dots minus the design, (e, 3), board frame, mm."""
-        return self.model_from_board.inverse() @ self.model.xyz_model[self.dots] - self.design
-
-    def cost(self, shared: Shared, huber: float) -> float:
-        """Returns squared residuals over σ², Huber's cost beyond ``huber``; infinite for a point behind a camera."""
-        residual = self.board_residual() + self.design - self.expected_dots(shared)
-        return image_cost(self.model, shared.camera, huber) + float(((residual / self.sigma_mm) ** 2).sum())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reduced:
-    """Normal equations over a group's outer unknowns: its circles, dots of the common shape, intrinsics."""
-
-    normal: np.ndarray
-    right: np.ndarray
-    inner: Reduction  # gives the step of dots and board from that of the outer unknowns
-    cameras: Reduction | None  # then gives the step of the cameras, if these are moved
-
-    @property
-    def gain(self) -> float:
-        """Decrease of the cost by the eliminated unknowns alone."""
-        return self.inner.gain + (self.cameras.gain if self.cameras else 0.0)
+CIRCLES, DOTS, BOARD, SHAPE, CAMERA, POSES = "circles", "dots", "board", "shape", "camera", "poses"
+"""Names of blocks; those of a group end with its name. The first three are kinds of rows, too."""
+SHARED = CIRCLES, CAMERA, SHAPE
+"""Blocks that all groups share, the last if the board keeps its shape."""
+FREE_DIRECTIONS = 6
+"""Number of free directions: a rigid motion of the world changes nothing."""
 
 
 def normalised(model: GroupModel, camera: Camera) -> np.ndarray:
@@ -92,71 +49,6 @@ def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarra
     return huber_weights(np.linalg.norm(normalised(model, camera), axis=1), huber)
 
 
-def reduced(block: Block, shared: Shared, huber: float) -> Reduced:
-    """Eliminates cameras, dots and the board's pose."""
-    if block.photographs is None:
-        normal, right, cameras = without_cameras(block.model, shared.camera, shared.basis, huber)
-    else:  # for the covariance alone: nothing is moved
-        normal, right, cameras = block.photographs, np.zeros(len(block.photographs)), None
-    full, full_right, inner, outer = _with_board(block, shared, normal, right)
-    reduction = reduce(full[np.ix_(inner, inner)][None], full_right[None, inner], full[np.ix_(inner, outer)][None])
-    return Reduced(
-        full[np.ix_(outer, outer)] - reduction.normal, full_right[outer] - reduction.right, reduction, cameras
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseEquations:
-    """Normal equations of a model's m images over p points and s other unknowns."""
-
-    normal: np.ndarray  # (3p + s, 3p + s)
-    right: np.ndarray
-    block: np.ndarray  # (m, 6, 6) of the poses
-    block_right: np.ndarray
-    cross: np.ndarray  # (m, 6, 3p + s)
-
-
-def equations_of_poses(
-    model: GroupModel, by_pose: np.ndarray, by_point: np.ndarray, by_others: np.ndarray, residual: np.ndarray
-) -> PoseEquations:
-    """Returns the equations for derivatives (n, 2, 6), (n, 2, 3), (n, 2, s) and residuals (n, 2), all over σ."""
-    m, p, s = len(model.images), len(model.labels), by_others.shape[2]
-    at = np.swapaxes(by_pose, 1, 2)
-    cross = np.zeros((m, 6, 3 * p + s))
-    columns = 3 * model.point_index[:, None] + np.arange(3)
-    cross[model.image_index[:, None, None], np.arange(6)[:, None], columns[:, None]] = at @ by_point
-    normal, right = np.zeros((3 * p + s, 3 * p + s)), np.zeros(3 * p + s)
-    blocks, rights = blocks_of(by_point, residual, model.point_index, p)
-    place = 3 * np.arange(p)[:, None] + np.arange(3)
-    normal[place[:, :, None], place[:, None]] = blocks
-    right[: 3 * p] = rights.ravel()
-    if s:
-        np.add.at(cross[:, :, 3 * p :], model.image_index, at @ by_others)
-        coupled = np.zeros((p, 3, s))
-        np.add.at(coupled, model.point_index, np.swapaxes(by_point, 1, 2) @ by_others)
-        normal[: 3 * p, 3 * p :] = coupled.reshape(3 * p, s)
-        normal[3 * p :, : 3 * p] = normal[: 3 * p, 3 * p :].T
-        normal[3 * p :, 3 * p :] = np.einsum("nki,nkj->ij", by_others, by_others)
-        right[3 * p :] = np.einsum("nki,nk->i", by_others, residual)
-    return PoseEquations(normal, right, *blocks_of(by_pose, residual, model.image_index, m), cross)
-
-
-def without_cameras(
-    model: GroupModel, camera: Camera, basis: np.ndarray, huber: float
-) -> tuple[np.ndarray, np.ndarray, Reduction]:
-    """Returns normal equations over points (3p) and intrinsics (q), and the reduction that gives the cameras."""
-    by_pose, by_point = projection_jacobians(model, camera)
-    residual = normalised(model, camera)
-    root = np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None]
-    by_intrinsics = np.zeros((*by_pose.shape[:2], 0))
-    if basis.shape[1]:
-        by_intrinsics = model.by_parameters(camera) @ basis
-    a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_intrinsics))
-    equations = equations_of_poses(model, a, c, e, residual * root)
-    cameras = reduce(equations.block, equations.block_right, equations.cross)
-    return equations.normal - cameras.normal, equations.right - cameras.right, cameras
-
-
 def rows_of_view(
     model: GroupModel, camera: Camera, basis: np.ndarray, root: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -173,105 +65,72 @@ def rows_of_view(
     return across.T @ (weight * rows.reshape(2 * n, -1)), across
 
 
-def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndarray):
-    """Appends pose of the board and common shape with the observations dot = pose · (design + shape ± σ); returns the
-    indices of the eliminated unknowns (dots, pose) and of the rest (circles, shape, intrinsics) last."""
-    p, q, d = len(block.model.labels), shared.basis.shape[1], len(block.dots)
-    s = 3 * len(block.dot_place)
-    size = 3 * p + q
-    full, full_right = np.zeros((size + 6 + s, size + 6 + s)), np.zeros(size + 6 + s)
-    full[:size, :size], full_right[:size] = normal, right
-    rotation, weight = block.model_from_board.rotation, 1 / block.sigma_mm**2
-    turned = block.expected_dots(shared) @ rotation.T
-    gap = block.model.xyz_model[block.dots] - (turned + block.model_from_board.translation)
-    # Each dot has three rows of its own: derivatives by the dot (1), the pose, and the common shape (−rotation).
-    dot_index, pose = 3 * block.dots[:, None] + np.arange(3), slice(size, size + 6)
-    by_pose = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
-    full[dot_index, dot_index] += weight
-    full_right[dot_index] -= weight * gap
-    full[dot_index, pose] += weight * by_pose
-    full[pose, dot_index.ravel()] = full[dot_index.ravel(), pose].T
-    flat = by_pose.reshape(3 * d, 6)
-    full[pose, pose] += weight * flat.T @ flat if d else np.eye(6)  # without a board its pose stays
-    full_right[pose] -= weight * gap.ravel() @ flat
-    if s:
-        place = size + 6 + np.arange(s).reshape(d, 3)
-        full[dot_index[:, :, None], place[:, None]] = -weight * rotation
-        full[place[:, :, None], dot_index[:, None]] = -weight * rotation.T
-        full[place, place] += weight
-        full_right[place] += weight * gap @ rotation
-        full[place, pose] = -weight * rotation.T @ by_pose
-        full[pose, place.ravel()] = full[place.ravel(), pose].T
-    dots = (3 * block.dots[:, None] + np.arange(3)).ravel()
-    circles = (3 * block.circles[:, None] + np.arange(3)).ravel()
-    inner = np.concatenate([dots, size + np.arange(6)])
-    outer = np.concatenate([circles, size + 6 + np.arange(s), 3 * p + np.arange(q)]).astype(int)
-    return full, full_right, inner, outer
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """One group of the joint adjustment, with e dots."""
 
+    model: MetricModel  # at the start
+    model_from_board: Rigid
+    design: np.ndarray  # (e, 3) of its dots, board frame
+    dots: np.ndarray  # (e,) indices of the model's points, as ``circles``
+    circles: np.ndarray
+    cells: np.ndarray  # (e,) of its dots on the board
+    circle_place: np.ndarray  # of each circle among all
 
-def step_of(block: Block, reduced: Reduced, outer: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Returns the step (3p + 6m + 6,) of the group's points, cameras and board for a step of its outer unknowns."""
-    points, d = np.zeros((len(block.model.labels), 3)), len(block.dots)
-    (inner,) = reduced.inner.back(outer)
-    points[block.circles] = outer[: 3 * len(block.circles)].reshape(-1, 3)
-    points[block.dots] = inner[: 3 * d].reshape(-1, 3)
-    assert reduced.cameras is not None, "the normal matrix of the photographs alone moves no camera"
-    cameras = reduced.cameras.back(np.concatenate([points.ravel(), intrinsics]))
-    return np.concatenate([points.ravel(), cameras.ravel(), inner[3 * d :]])
+    def name(self, block: str) -> str:
+        """Returns the name of a block of its own."""
+        return f"{block} of {self.model.group}"
 
+    def values(self) -> dict[str, Any]:
+        """Returns its own unknowns at the start."""
+        return {
+            self.name(POSES): PoseStack.of(*self.model.camera_from_model),
+            self.name(DOTS): Vector(self.model.xyz_model[self.dots]),
+            self.name(BOARD): PoseStack.of(self.model_from_board),
+        }
 
-def moved(block: Block, step: np.ndarray) -> Block:
-    """Returns the group after a step of :func:`step_of`."""
-    model, p = block.model, 3 * len(block.model.labels)
-    cameras = moved_poses(model.camera_from_model, step[p:-6].reshape(-1, 6))
-    points = model.xyz_model + step[:p].reshape(-1, 3)
-    changed = replace(model, camera_from_model=cameras, xyz_model=points)
-    return replace(block, model=changed, model_from_board=perturbed(block.model_from_board, step[-6:]))
+    def at(self, values: Mapping[str, Any]) -> MetricModel:
+        """Returns its model at a state."""
+        points = np.empty_like(self.model.xyz_model)
+        points[self.circles] = values[CIRCLES].array[self.circle_place]
+        points[self.dots] = values[self.name(DOTS)].array
+        return placed(self.model, values[self.name(POSES)], Vector(points))
 
+    def board_at(self, values: Mapping[str, Any]) -> Rigid:
+        """Returns model_from_board at a state."""
+        return values[self.name(BOARD)].rigid(0)
 
-FREE_DIRECTIONS = 6
-"""Number of free directions: a rigid motion of the world changes nothing."""
+    def board_residual(self, values: Mapping[str, Any]) -> np.ndarray:
+        """Returns the adjusted dots minus the design, (e, 3), board frame, mm."""
+        return self.board_at(values).inverse() @ values[self.name(DOTS)].array - self.design
 
+    def place(self) -> np.ndarray:
+        """Returns the place (n,) of the point of each observation among all circles, or among the group's dots."""
+        place = np.zeros(len(self.model.labels), int)
+        place[self.circles], place[self.dots] = self.circle_place, np.arange(len(self.dots))
+        return place[self.model.point_index]
 
-@dataclass(frozen=True, slots=True)
-class Places:
-    """Indices of circles, common shape and intrinsics among the shared unknowns, and the number of all of them."""
-
-    circles: slice
-    shape: slice
-    intrinsics: slice
-    count: int
+    def observations(self, kind: str) -> np.ndarray:
+        """Returns the model's observations of circles or of dots."""
+        return np.flatnonzero(np.isin(self.model.point_index, self.circles if kind == CIRCLES else self.dots))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
     """Constants of one minimisation."""
 
+    groups: tuple[Group, ...]
     labels: tuple[CircleLabel, ...]
     board: BoardDesign
     common: float
     flatness_mm: float  # infinite if unknown
     given: Camera
+    basis: np.ndarray  # (16, q) derivative of the camera's parameters by those that are adjusted
     prior: np.ndarray
     huber: float
     print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
     bend_factor: float = 1.0  # off their plane
     print_amplitude: float = AMPLITUDES[0]  # of the smooth deviations of their prints
-
-    def places(self, shared: Shared) -> "Places":
-        """Returns the indices of the shared unknowns."""
-        c = 3 * len(self.labels)
-        s = c + (3 * len(shared.shape_mm) if self.common else 0)
-        count = s + shared.basis.shape[1]
-        return Places(slice(0, c), slice(c, s), slice(s, count), count)
-
-    def outer(self, block: Block, shared: Shared) -> np.ndarray:
-        """Returns the indices of a group's outer unknowns among all shared ones: circles, shape, intrinsics."""
-        places = self.places(shared)
-        circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
-        shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
-        intrinsics = np.arange(places.intrinsics.start, places.intrinsics.stop)
-        return np.concatenate([circles, shape, intrinsics]).astype(int)
 
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
@@ -279,110 +138,144 @@ class Setting:
     def shape_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(self.common))
 
+    def cells(self) -> np.ndarray:
+        """Returns the cells of the board of whose dots the common shape consists."""
+        return np.unique(np.concatenate([group.cells for group in self.groups])) if self.common else np.zeros(0, int)
+
+    def values(self, xyz: np.ndarray, start: Camera) -> dict[str, Any]:
+        """Returns all unknowns at the start, with circles (c, 3) and intrinsics of ``start``."""
+        away = np.linalg.pinv(self.basis) @ (start.parameters() - self.given.parameters())
+        own = {name: array for group in self.groups for name, array in group.values().items()}
+        return {CIRCLES: Vector(xyz), CAMERA: Vector(away[None]), **own}
+
+    def camera(self, values: Mapping[str, Any]) -> Camera:
+        """Returns the camera at a state."""
+        return self.camera_at(*(values[CAMERA],) * bool(self.basis.shape[1]))
+
+    def camera_at(self, *away: Vector) -> Camera:
+        """Returns the camera with parameters away from the given ones."""
+        moves = (self.basis @ of_basis.array[0] for of_basis in away)
+        return self.given.with_parameters(sum(moves, self.given.parameters())) if away else self.given
+
+    def joined(self, values: Mapping[str, Any]) -> Joined:
+        """Returns the problem of all groups at a state: that of :meth:`values`, and a common shape if there is one."""
+        parts = []
+        for group in self.groups:
+            a = Adjustment()
+            circles, camera = a.block(CIRCLES, values[CIRCLES]), a.block(CAMERA, values[CAMERA])
+            if self.common:
+                shape = a.block(SHAPE, values[SHAPE])
+            if not parts:
+                a.know(OfTarget(circles, self))
+                a.prior(camera, np.zeros((1, len(self.prior))), self.prior)
+                if self.common:
+                    a.factor(
+                        lambda v: v.array,
+                        [(shape, np.arange(len(shape.start)))],
+                        self.shape_sigma_mm(),
+                        lambda v: [np.broadcast_to(np.eye(3), (len(v), 3, 3))],
+                        kind=BOARD,
+                    )
+            self._add(a, group, values, circles, camera)
+            parts.append(a)
+        return Joined(parts, SHARED if self.common else SHARED[:2], free_directions)
+
+    def _add(self, a: Adjustment, group: Group, values: Mapping[str, Any], circles: Block, camera: Block) -> None:
+        """Adds the rows of a group."""
+        model, few = group.model, is_dots_first_cheaper(group)
+        poses = a.block(group.name(POSES), values[group.name(POSES)], eliminate=not few)
+        of_circles = replace(model, labels=self.labels, xyz_model=values[CIRCLES].array, point_index=group.place())
+        self._reproject(a, of_circles.observed(group.observations(CIRCLES)), (circles, poses, camera), CIRCLES)
+        if not len(group.dots):
+            return
+        dots = a.block(group.name(DOTS), values[group.name(DOTS)], eliminate=few)
+        board = a.block(group.name(BOARD), values[group.name(BOARD)])
+        of_dots = replace(
+            model,
+            labels=tuple(model.labels[i] for i in group.dots),
+            xyz_model=values[group.name(DOTS)].array,
+            point_index=group.place(),
+        )
+        self._reproject(a, of_dots.observed(group.observations(DOTS)), (dots, poses, camera), DOTS)
+        on = [(dots, np.arange(len(group.dots))), (board, None)]
+        if self.common:
+            on.append((a.blocks[SHARED.index(SHAPE)], np.searchsorted(self.cells(), group.cells)))
+        gap = _Gap(group.design, on[-1][1])
+        a.factor(gap.residuals, on, self.own_sigma_mm(), gap.derivatives, kind=BOARD)
+
+    def _reproject(self, a: Adjustment, model: MetricModel, on: tuple[Block, Block, Block], kind: str) -> None:
+        used = on if self.basis.shape[1] else on[:2]
+        reproject(a, model, used, self.camera_at, self.basis, kind=kind, loss=Huber(self.huber))
+
+
+def is_dots_first_cheaper(group: Group) -> bool:
+    """True if the cameras of a group are fewer unknowns than its dots."""
+    return 6 * len(group.model.images) < 3 * len(group.dots)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointState:
-    """All unknowns of the joint adjustment."""
+class _Gap:
+    """Dots minus their places on a board, mm: dot = pose · (design + shape)."""
 
-    blocks: tuple[Block, ...]
-    shared: Shared
+    design: np.ndarray  # (e, 3)
+    cells: np.ndarray | None  # (e,) in the common shape
 
-    def moved(self, step: np.ndarray, setting: Setting) -> "JointState":
-        """Returns the state after a step, which lists the shared unknowns and then each group's own."""
-        shared, places = self.shared, setting.places(self.shared)
-        ends = places.count + np.cumsum([0, *(_size(b) for b in self.blocks)])
-        blocks = tuple(moved(b, step[i:j]) for b, i, j in zip(self.blocks, ends[:-1], ends[1:], strict=True))
-        shape = shared.shape_mm + step[places.shape].reshape(-1, 3) if setting.common else shared.shape_mm
-        camera = shared.camera
-        if shared.basis.shape[1]:
-            camera = camera.with_parameters(camera.parameters() + shared.basis @ step[places.intrinsics])
-        xyz = shared.xyz_model + step[places.circles].reshape(-1, 3)
-        return JointState(blocks, Shared(xyz, shape, camera, shared.basis))
+    def _turned(self, board: PoseStack, shape: tuple[Vector, ...]) -> np.ndarray:
+        places = self.design + shape[0].array[self.cells] if shape else self.design
+        return places @ board.rotation[0].T
 
+    def residuals(self, dots: Vector, board: PoseStack, *shape: Vector) -> np.ndarray:
+        return dots.array - self._turned(board, shape) - board.translation
 
-def _size(block: Block) -> int:
-    """Returns the number of a group's own unknowns, including points that it shares."""
-    return 3 * len(block.model.labels) + 6 * len(block.model.images) + 6
+    def derivatives(self, dots: Vector, board: PoseStack, *shape: Vector) -> list[np.ndarray]:
+        unit = np.broadcast_to(np.eye(3), (len(self.design), 3, 3))
+        by_board = np.concatenate([skew(self._turned(board, shape)), -unit], axis=2)
+        return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SharedEquations:
-    """Normal equations over the shared unknowns, with each group's own unknowns eliminated."""
+class OfTarget:
+    """What is known of the circles: flatness of faces, faces of known shape, known distances."""
 
-    cost: float
-    state: JointState
+    block: Block
     setting: Setting
-    normal: np.ndarray
-    right: np.ndarray
-    groups: tuple[Reduced, ...]
 
-    @classmethod
-    def of(cls, state: JointState, setting: Setting) -> "SharedEquations":
-        cost = cost_of(state.blocks, state.shared, setting)
-        return cls(cost, state, setting, *normal_equations(state.blocks, state.shared, setting))
+    def cost(self, values: Mapping[str, Any]) -> float:
+        """Returns squared deviations over σ²."""
+        xyz, setting = values[CIRCLES].array, self.setting
+        cost = sum(shape.cost() for shape in shapes(xyz, setting))
+        for members, across, normal in planes(xyz, setting):
+            cost += float(((across @ (xyz[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
+        return cost + sum((off / sigma) ** 2 for _, _, off, sigma in bars(xyz, setting))
 
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step of the shared unknowns, then of each group's own, and its predicted gain."""
-        setting, shared = self.setting, self.state.shared
-        free = free_directions(len(self.normal), shared)
-        held = self.normal + damping * np.diag(np.diag(self.normal))
-        held += np.median(np.diag(self.normal)[: shared.xyz_model.size]) * free @ free.T
-        outer = np.linalg.solve(held, self.right)
-        gain = 2 * float(outer @ self.right) - float(outer @ self.normal @ outer) + sum(g.gain for g in self.groups)
-        intrinsics = outer[setting.places(shared).intrinsics]
-        group_steps = [
-            step_of(b, g, outer[setting.outer(b, shared)], intrinsics)
-            for b, g in zip(self.state.blocks, self.groups, strict=True)
-        ]
-        return np.concatenate([outer, *group_steps]), gain
-
-
-def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
-    """Returns matrix and right-hand side over circles, common shape and intrinsics, and the reduced groups."""
-    places = setting.places(shared)
-    normal, right = np.zeros((places.count, places.count)), np.zeros(places.count)
-    groups = tuple(reduced(b, shared, setting.huber) for b in blocks)
-    for b, group in zip(blocks, groups, strict=True):
-        place = setting.outer(b, shared)
-        normal[np.ix_(place, place)] += group.normal
-        right[place] += group.right
-    if setting.common:
-        shape = np.arange(places.shape.start, places.shape.stop)
-        normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
-        right[shape] -= shared.shape_mm.ravel() / setting.shape_sigma_mm() ** 2
-    add_knowledge(normal, right, shared, setting, places.intrinsics)
-    return normal, right, groups
-
-
-def add_knowledge(
-    normal: np.ndarray, right: np.ndarray | None, shared: Shared, setting: Setting, intrinsics: slice
-) -> None:
-    """Adds the prior of the intrinsics and the flatness of faces; ``right`` is None if nothing is moved."""
-    normal[intrinsics, intrinsics] += setting.prior
-    if right is not None:
-        right[intrinsics] -= setting.prior @ _away(shared, setting)
-    for members, across, normal_model in planes(shared, setting):
-        jacobian = across[:, :, None] * normal_model  # derivatives of distances from the plane by the circles
-        flat = jacobian.reshape(len(members), -1)
-        place = (3 * members[:, None] + np.arange(3)).ravel()
-        normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
-        if right is not None:
-            distance = across @ (shared.xyz_model[members] @ normal_model)
-            right[place] -= flat.T @ distance / setting.flatness_mm**2
-    for shape in shapes(shared, setting):
-        place = (3 * shape.members[:, None] + np.arange(3)).ravel()
-        normal[np.ix_(place, place)] += shape.normal()
-        if right is not None:
+    def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Returns normal matrix (3c, 3c) and right side (3c,)."""
+        xyz, setting = values[CIRCLES].array, self.setting
+        normal, right = np.zeros((xyz.size, xyz.size)), np.zeros(xyz.size)
+        for members, across, normal_model in planes(xyz, setting):
+            jacobian = across[:, :, None] * normal_model  # derivatives of distances from the plane by the circles
+            flat = jacobian.reshape(len(members), -1)
+            place = coordinates(members)
+            normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
+            right[place] -= flat.T @ (across @ (xyz[members] @ normal_model)) / setting.flatness_mm**2
+        for shape in shapes(xyz, setting):
+            place = coordinates(shape.members)
+            normal[np.ix_(place, place)] += shape.normal()
             right[place] -= shape.slope()
-    for members, along, off, sigma in bars(shared, setting):
-        place = (3 * members[:, None] + np.arange(3)).ravel()
-        row = np.concatenate([along, -along]) / sigma
-        normal[np.ix_(place, place)] += np.outer(row, row)
-        if right is not None:
+        for members, along, off, sigma in bars(xyz, setting):
+            place = coordinates(members)
+            row = np.concatenate([along, -along]) / sigma
+            normal[np.ix_(place, place)] += np.outer(row, row)
             right[place] -= row * off / sigma
+        return normal, right
 
 
-def planes(shared: Shared, setting: Setting):
+def coordinates(members: np.ndarray) -> np.ndarray:
+    """Returns the places (3n,) of the coordinates of points (n,)."""
+    return (3 * members[:, None] + np.arange(3)).ravel()
+
+
+def planes(xyz: np.ndarray, setting: Setting):
     """Yields the circles of each face of more than three, the projector from heights to distances from the best plane,
     and its normal; not of faces of known shape."""
     if not np.isfinite(setting.flatness_mm):
@@ -396,16 +289,16 @@ def planes(shared: Shared, setting: Setting):
     for indices in faces.values():
         if len(indices) > 3:
             members = np.array(indices)
-            xyz = shared.xyz_model[members]
-            normal = fit_plane(xyz).normal
+            own = xyz[members]
+            normal = fit_plane(own).normal
             base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
-            design = np.column_stack([np.ones(len(indices)), (xyz - xyz.mean(0)) @ base])
+            design = np.column_stack([np.ones(len(indices)), (own - own.mean(0)) @ base])
             yield members, np.eye(len(indices)) - design @ np.linalg.pinv(design), normal
 
 
-def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
+def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
     """Yields the faces of known shape, with their stated σ; none for a state that a step has sent to infinity."""
-    if not np.isfinite(shared.xyz_model).all():
+    if not np.isfinite(xyz).all():
         return
     off, known = setting.bend_factor * setting.flatness_mm, known_points(setting.labels, setting.board)
     # What the sizes of all prints have in common counts once: each alone may be off by more.
@@ -418,7 +311,7 @@ def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
             yield Shape.of(
                 members,
                 design,
-                shared.xyz_model[members],
+                xyz[members],
                 weight,
                 alone * face.size_sigma,
                 setting.print_amplitude,
@@ -427,116 +320,19 @@ def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
             continue
 
 
-def bars(shared: Shared, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
+def bars(xyz: np.ndarray, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
     """Yields the known distances: both points, the direction to the first, how much too long, and σ, mm."""
     place = {label: i for i, label in enumerate(setting.labels)}
     for known in known_distances(setting.board):
         if known.first in place and known.second in place:
             members = np.array([place[known.first], place[known.second]])
-            apart = shared.xyz_model[members[0]] - shared.xyz_model[members[1]]
+            apart = xyz[members[0]] - xyz[members[1]]
             length = float(np.linalg.norm(apart))
             yield members, apart / length, length - known.mm, known.sigma_mm
 
 
-def _away(shared: Shared, setting: Setting) -> np.ndarray:
-    """Returns adjusted minus given intrinsics, (q,)."""
-    return np.linalg.pinv(shared.basis) @ (shared.camera.parameters() - setting.given.parameters())
-
-
-def cost_of(blocks: Sequence[Block], shared: Shared, setting: Setting) -> float:
-    cost = sum(b.cost(shared, setting.huber) for b in blocks)
-    if setting.common:
-        cost += float(((shared.shape_mm / setting.shape_sigma_mm()) ** 2).sum())
-    if shared.basis.shape[1]:
-        away = _away(shared, setting)
-        cost += float(away @ setting.prior @ away)
-    for members, across, normal in planes(shared, setting):
-        cost += float(((across @ (shared.xyz_model[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
-    cost += sum(shape.cost() for shape in shapes(shared, setting))
-    return cost + sum((off / sigma) ** 2 for _, _, off, sigma in bars(shared, setting))
-
-
-def free_directions(count: int, shared: Shared) -> np.ndarray:
-    """Directions (count, 6) in which all circles move as one; the datum is that of smallest trace over them."""
-    free = np.zeros((count, FREE_DIRECTIONS))
-    free[: shared.xyz_model.size] = free_motions(shared.xyz_model, scale=False)
-    return free
-
-
-def is_dots_first_cheaper(blocks: Sequence[Block]) -> bool:
-    """True if the cameras of all groups are fewer unknowns than the dots of the group that has most of them."""
-    return 6 * sum(len(b.model.images) for b in blocks) < 3 * max(len(b.dots) for b in blocks)
-
-
-def circle_equations(blocks: Sequence[Block], shared: Shared, setting: Setting) -> np.ndarray:
-    """Returns the normal matrix (3c + q, 3c + q) over circles and intrinsics; no residual is down-weighted."""
-    size = 3 * len(setting.labels) + shared.basis.shape[1]
-    ends = size + np.cumsum([0, *(6 * len(b.model.images) + 6 for b in blocks)])
-    normal = np.zeros((ends[-1], ends[-1]))
-    dots = len(shared.shape_mm) if setting.common else 0
-    shape = np.zeros((dots, 3, 3)) + (np.eye(3) / setting.shape_sigma_mm() ** 2 if dots else 0.0)
-    by_shape = np.zeros((dots, 3, ends[-1]))
-    for block, start in zip(blocks, ends[:-1].tolist(), strict=True):
-        _add_group(block, shared, setting, start, normal, shape, by_shape)
-    if dots:
-        root = (np.linalg.inv(np.linalg.cholesky(shape)) @ by_shape).reshape(3 * dots, -1)
-        normal -= root.T @ root
-    add_knowledge(normal, None, shared, setting, slice(size - shared.basis.shape[1], size))
-    inner, cross = normal[size:, size:], normal[size:, :size]
-    return normal[:size, :size] - cross.T @ np.linalg.solve(inner, cross)
-
-
-def _add_group(block: Block, shared: Shared, setting: Setting, start: int, normal, shape, by_shape) -> None:
-    """Adds the equations of one group: cameras and board pose from ``start`` on, with the dots eliminated."""
-    model, q, d = block.model, shared.basis.shape[1], len(block.dots)
-    m, first = len(model.images), 3 * len(setting.labels)
-    width = 6 * m + 6 + q  # cameras, pose, intrinsics
-    parts = (slice(start, start + 6 * m + 6), slice(0, 6 * m + 6)), (slice(first, first + q), slice(6 * m + 6, width))
-    place = np.concatenate([np.arange(start, start + 6 * m + 6), np.arange(first, first + q)])
-    local = np.zeros((width, width))
-    cross = np.zeros((len(model.labels), 3, width))
-    by_pose, by_point = (model.whiten(derivative) for derivative in projection_jacobians(model, shared.camera))
-    zeros = np.zeros(by_point.shape[:2])
-    points, _ = blocks_of(by_point, zeros, model.point_index, len(model.labels))
-    cameras, _ = blocks_of(by_pose, zeros, model.image_index, m)
-    columns = 6 * model.image_index[:, None] + np.arange(6)
-    cross[model.point_index[:, None, None], np.arange(3)[:, None], columns[:, None]] = (
-        np.swapaxes(by_point, 1, 2) @ by_pose
-    )
-    index = 6 * np.arange(m)[:, None] + np.arange(6)
-    local[index[:, :, None], index[:, None]] = cameras
-    if q:
-        last = slice(6 * m + 6, width)
-        by_intrinsics = model.whiten(model.by_parameters(shared.camera) @ shared.basis)
-        np.add.at(cross[:, :, last], model.point_index, np.swapaxes(by_point, 1, 2) @ by_intrinsics)
-        coupled = np.zeros((m, 6, q))
-        np.add.at(coupled, model.image_index, np.swapaxes(by_pose, 1, 2) @ by_intrinsics)
-        local[: 6 * m, last] = coupled.reshape(6 * m, q)
-        local[last, : 6 * m] = local[: 6 * m, last].T
-        flat = by_intrinsics.reshape(-1, q)
-        local[last, last] = flat.T @ flat
-
-    circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
-    index = 3 * block.circle_place[:, None] + np.arange(3)
-    normal[index[:, :, None], index[:, None]] += points[block.circles]
-    coupled = cross[block.circles].reshape(-1, width)
-    normal[np.ix_(circles, place)] += coupled
-    normal[np.ix_(place, circles)] += coupled.T
-
-    rotation, weight = block.model_from_board.rotation, 1 / block.sigma_mm**2
-    turned = block.expected_dots(shared) @ rotation.T
-    by_board = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
-    pose = slice(6 * m, 6 * m + 6)
-    local[pose, pose] += weight * by_board.reshape(3 * d, 6).T @ by_board.reshape(3 * d, 6) if d else np.eye(6)
-    inverse, outer = np.linalg.inv(points[block.dots] + weight * np.eye(3)), cross[block.dots]
-    outer[:, :, pose] += weight * by_board
-    from_outer = inverse @ outer
-    local -= outer.reshape(3 * d, width).T @ from_outer.reshape(3 * d, width)
-    normal[np.ix_(place, place)] += local
-    if len(block.dot_place):
-        to_shape = -weight * rotation
-        shape[block.dot_place] += weight * np.eye(3) - to_shape.T @ inverse @ to_shape
-        by_shape_reduced = -to_shape.T @ from_outer
-        by_shape_reduced[:, :, pose] -= weight * rotation.T @ by_board
-        for of_all, own in parts:
-            by_shape[block.dot_place, :, of_all] += by_shape_reduced[:, :, own]
+def free_directions(values: Mapping[str, Any]) -> np.ndarray:
+    """Directions (s, 6) in which all circles move as one; the datum is that of smallest trace over them."""
+    motions = free_motions(values[CIRCLES].array, scale=False)
+    others = sum(values[name].array.size for name in SHARED[1:] if name in values)
+    return np.vstack([motions, np.zeros((others, FREE_DIRECTIONS))])

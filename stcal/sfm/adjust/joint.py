@@ -1,45 +1,47 @@
 """Joint adjustment of all groups: one target, one board with a pose per group, all cameras, intrinsics if requested.
 Dots are observations with their stated σ, so that scale is estimated; circles of a face are coplanar within theirs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from stcal.adjust.blocks import Vector
+from stcal.adjust.engine import JoinedSolution
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import ConvergenceError, ScaleError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minimum, minimise
-from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.print_modes import AMPLITUDES, found_amplitude
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, DotLabel, dot_cells
-from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.equations import (
+    CAMERA,
+    CIRCLES,
+    DOTS,
     FREE_DIRECTIONS,
-    Block,
-    JointState,
+    SHAPE,
+    Group,
     Setting,
-    Shared,
-    SharedEquations,
     bars,
-    cost_of,
-    free_directions,
-    normal_equations,
+    coordinates,
     normalised,
     planes,
     robust_weights,
     rows_of_view,
     shapes,
-    without_cameras,
 )
 from stcal.sfm.adjust.scale import MIN_DOTS
-from stcal.sfm.data.model import GroupModel, MetricModel
+from stcal.sfm.data.model import MetricModel
 
+Values = dict[str, Any]
+"""Unknowns by block."""
 ShapeFactors = tuple[float, float, float]
 """``print_factor``, ``bend_factor`` and ``print_amplitude`` of faces of known shape."""
 EXACTLY = 1e-15
@@ -110,22 +112,27 @@ class JointResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """State of a joint adjustment at its minimum."""
+    """A joint adjustment at its minimum."""
 
-    blocks: tuple[Block, ...]
-    shared: Shared
-    setting: Setting  # weights included
-    normal: np.ndarray  # over the shared unknowns
+    setting: Setting
+    solution: JoinedSolution
     move_px: float  # largest move of a projection by the next whole step
     differ: float = 1.0  # by how much photographs differ more than their pixels explain, as a ratio of σ
     enlarged: float = 1.0  # factor on all σ by which groups, ways and parts of the images agree
 
+    @property
+    def models(self) -> list[MetricModel]:
+        """The groups' models."""
+        return [group.at(self.solution.values) for group in self.setting.groups]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        return self.setting.camera(self.solution.values)
+
     def result(self) -> JointResult:
         """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``."""
-        places = self.setting.places(self.shared)
-        equations = self.normal, places.circles, places.intrinsics
-        joint = _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
-        return joint.with_larger_sigma(self.enlarged)
+        return _result(self.setting, self.solution, self.move_px).with_larger_sigma(self.enlarged)
 
 
 def adjust_jointly(models: Sequence[MetricModel], board: BoardDesign, camera: Camera) -> JointResult:
@@ -147,19 +154,14 @@ def adjusted(
 ) -> Adjusted:
     """Adjusts metric models that share one frame. The dots show whether the board kept its shape between the groups
     (one plate) or not (a film, a screen), if ``common`` is None."""
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common or 0.0)
-    shared = replace(shared, camera=start or camera)
+    setting, values = _start(models, board, camera, flatness_mm, prior, common or 0.0, start)
     if common is None:
-        setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
-    if common is None and faces_of_known_shape(board):
-        blocks, shared, setting = _with_shape_factors(blocks, shared, setting, factors)
-    if common is None:
-        near = _minimise(blocks, shared, setting, NEAR)
-        blocks, shared = list(near.blocks), near.shared
-        share = _common_share(blocks, board)
-        if share > 0:
-            blocks, setting = _with_common(blocks, setting, share)
-    return _minimise(blocks, shared, setting, settled)
+        setting = replace(setting, huber=HUBER * _robust_sigma(setting, values))
+        if faces_of_known_shape(board):
+            setting, values = _with_shape_factors(setting, values, factors)
+        near = _minimise(setting, values, NEAR).solution.values
+        setting, values = _with_common(setting, near, _common_share(setting, near))
+    return _minimise(setting, values, settled)
 
 
 def adjust_part(
@@ -168,16 +170,15 @@ def adjust_part(
     """Adjusts a part of the models of a ``whole`` joint result, with its weights, camera, factors and common share."""
     # Of a single group, the variance of its board is the same whatever share of it other groups have.
     common = whole.board_common if len(models) > 1 else 0.0
-    blocks, shared, setting = _start(models, board, whole.camera, flatness_mm, None, common)
-    huber = HUBER * _robust_sigma(blocks, shared.camera)
+    setting, values = _start(models, board, whole.camera, flatness_mm, None, common)
     setting = replace(
         setting,
-        huber=huber,
+        huber=HUBER * _robust_sigma(setting, values),
         print_factor=whole.print_factor,
         bend_factor=whole.bend_factor,
         print_amplitude=whole.print_amplitude,
     )
-    return replace(_minimise(blocks, shared, setting, NEARLY), differ=whole.differ)
+    return replace(_minimise(setting, values, NEARLY), differ=whole.differ)
 
 
 SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
@@ -188,31 +189,26 @@ LEAST_FACTOR = 0.1
 """Smallest such factor: print may be better than stated, but is never exact."""
 
 
-def _with_shape_factors(
-    blocks: list[Block], shared: Shared, setting: Setting, factors: ShapeFactors
-) -> tuple[list[Block], Shared, Setting]:
+def _with_shape_factors(setting: Setting, values: Values, factors: ShapeFactors) -> tuple[Setting, Values]:
     """Returns the state near its minimum with the σ of faces of known shape that belong to it."""
     names = ("print_factor", "bend_factor", "print_amplitude")
     setting = replace(setting, **dict(zip(names, factors, strict=True)))
     for _ in range(SHAPE_ROUNDS):
-        state = _descent(blocks, shared, setting, NEARLY).state
-        blocks, shared = list(state.blocks), state.shared
-        before, factors = factors, _shape_factors(blocks, shared, setting)
+        minimum = _descent(setting, values, NEARLY)
+        before, values, factors = factors, minimum.state, _shape_factors(setting, minimum.linear)
         setting = replace(setting, **dict(zip(names, factors, strict=True)))
         if np.abs(np.log(np.divide(factors, before))).max() < SETTLED_FACTOR:
             break
-    return blocks, shared, setting
+    return setting, values
 
 
-def _shape_factors(blocks: list[Block], shared: Shared, setting: Setting) -> ShapeFactors:
+def _shape_factors(setting: Setting, solution: JoinedSolution) -> ShapeFactors:
     """Returns print and bend factor, variance components (Förstner 1979) with the stated σ as a weak prior, and the
     amplitude of the prints' smooth deviations."""
-    normal, _, _ = normal_equations(blocks, shared, setting)
-    inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     square, freedom, prints = np.zeros(2), np.zeros(2), []
-    for shape in equations.shapes(shared, setting):
-        place = (3 * shape.members[:, None] + np.arange(3)).ravel()
-        own = inverse[np.ix_(place, place)]
+    for shape in shapes(solution.values[CIRCLES].array, setting):
+        place = coordinates(shape.members)
+        own = solution.inverse[np.ix_(place, place)]
         left = np.where(shape.weight > 0, 1 - shape.leverage(own), 0.0)
         normalised_square = shape.weight * shape.off_mm**2
         square += [normalised_square[:, :2].sum(), normalised_square[:, 2].sum()]
@@ -231,28 +227,15 @@ def covariance_of(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
-    photographs: Mapping[str, np.ndarray] | None = None,  # of :func:`photographs_of`
 ) -> JointResult:
     """Returns the result of :func:`adjust_jointly` for models at their true positions, which do not move; σ₀ is 1."""
-    blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
-    if photographs or not equations.is_dots_first_cheaper(blocks):
-        return _result(blocks, shared, setting, 0.0, 1.0)
-    normal = equations.circle_equations(blocks, shared, setting)
-    c = 3 * len(setting.labels)
-    return _result(blocks, shared, setting, 0.0, 1.0, (normal, slice(0, c), slice(c, len(normal))))
+    setting, values = _start(models, board, camera, flatness_mm, prior, common)
+    return _result(setting, setting.joined(values).at(values), 0.0, 1.0)
 
 
 def basis_of(prior: CameraPrior | None) -> np.ndarray:
     """Returns the derivative (16, q) of a camera's parameters by those that are adjusted."""
     return intrinsic_basis(prior.colmap_model) if prior else np.zeros((len(PARAMETER_NAMES), 0))
-
-
-def photographs_of(
-    models: Sequence[MetricModel], board: BoardDesign, camera: Camera, prior: CameraPrior | None
-) -> dict[str, np.ndarray]:
-    """Normal matrices (3p + q, 3p + q) of points and intrinsics from the photographs alone, by group; σ₀ is 1."""
-    blocks, shared, _ = _start(models, board, camera, None, prior)
-    return {b.model.group: without_cameras(b.model, camera, shared.basis, np.inf)[0] for b in blocks}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,97 +264,78 @@ def extensible(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
-    photographs: Mapping[str, np.ndarray] | None = None,
 ) -> Extensible:
     """Returns the :class:`Extensible` covariance of models; arguments as of :func:`covariance_of`."""
-    return _extensible(*_start(models, board, camera, flatness_mm, prior, common, photographs))
+    setting, values = _start(models, board, camera, flatness_mm, prior, common)
+    return points_of(setting, setting.joined(values).at(values))
 
 
-def points_of(state: Adjusted) -> Extensible:
-    """Returns the covariances of the points at the minimum of an adjustment; σ₀ is 1."""
-    return _extensible(list(state.blocks), state.shared, state.setting)
-
-
-def _extensible(blocks: list[Block], shared: Shared, setting: Setting) -> Extensible:
-    normal, _, groups = normal_equations(blocks, shared, setting)
-    inverse = constrained_inverse(normal, free_directions(len(normal), shared))
-    circles = inverse[setting.places(shared).circles]
-    points, to_circles = {}, {}
-    for block, group_equations in zip(blocks, groups, strict=True):
-        outer_index, inner = setting.outer(block, shared), group_equations.inner
-        from_kept, d, q = inner.from_kept[0], 3 * len(block.dots), shared.basis.shape[1]
-        outer = inverse[np.ix_(outer_index, outer_index)]
-        # Rows: the dots, which are eliminated, then the unknowns that the groups share.
-        to_kept = np.concatenate([-from_kept[:d] @ outer, outer])
-        covariance = np.block(
-            [[inner.inverse[0, :d, :d] - to_kept[:d] @ from_kept[:d].T, to_kept[:d]], [to_kept[:d].T, outer]]
-        )
-        covariance_to_circles = np.concatenate([-from_kept[:d] @ circles[:, outer_index].T, circles[:, outer_index].T])
-        row = np.empty(3 * len(block.model.labels) + q, int)
-        row[(3 * block.dots[:, None] + np.arange(3)).ravel()] = np.arange(d)
-        row[(3 * block.circles[:, None] + np.arange(3)).ravel()] = d + np.arange(3 * len(block.circles))
-        row[len(row) - q :] = len(covariance) - q + np.arange(q)
-        points[block.model.group], to_circles[block.model.group] = (
-            covariance[np.ix_(row, row)],
-            covariance_to_circles[row],
-        )
-    c = circles.shape[0]
-    return Extensible(shared.camera, shared.basis, circles[:, :c], points, to_circles)
+def points_of(setting: Setting, solution: JoinedSolution) -> Extensible:
+    """Returns the covariances of the points of an adjustment; σ₀ is 1."""
+    points, to_circles, c = {}, {}, solution.values[CIRCLES].array.size
+    for group, part in zip(setting.groups, solution.whole, strict=True):
+        blocks = {block.name: block for block in part.problem.blocks}
+        dots = blocks.get(group.name(DOTS))
+        together = part.together(dots) if dots else part.inverse
+        place = np.empty((len(group.model.labels), 3), int)
+        place[group.circles] = 3 * group.circle_place[:, None] + np.arange(3)
+        place[group.dots] = part.kept + np.arange(3 * len(group.dots)).reshape(-1, 3)
+        row = np.concatenate([place.ravel(), np.arange(part.kept)[part.places[CAMERA]]])
+        points[group.model.group] = together[np.ix_(row, row)]
+        to_circles[group.model.group] = together[row, :c]
+    return Extensible(setting.camera(solution.values), setting.basis, solution.inverse[:c, :c], points, to_circles)
 
 
 def _start(
     models,
     board: BoardDesign,
     camera: Camera,
-    flatness_mm,
+    flatness_mm: float | None,
     prior: CameraPrior | None,
     common: float = 0.0,
-    photographs: Mapping[str, np.ndarray] | None = None,
-) -> tuple[list[Block], Shared, Setting]:
-    """Returns groups, shared unknowns, and a setting without down-weighting; ``common`` : see :func:`covariance_of`."""
+    start: Camera | None = None,
+) -> tuple[Setting, Values]:
+    """Returns a setting without down-weighting, and the start; ``common`` : see :func:`covariance_of`."""
     labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
-    basis = basis_of(prior)
     weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
-    blocks = [replace(_block(m, board, labels), photographs=(photographs or {}).get(m.group)) for m in models]
-    xyz = _shared_circles(blocks, len(labels))
-    shared = Shared(xyz, np.zeros((board.rows * board.columns, 3)), camera, basis)
-    blocks = [replace(b, model=_with_circles(b, xyz)) for b in blocks]
+    groups = tuple(_group(model, board, labels) for model in models)
     flatness_mm = np.inf if flatness_mm is None else flatness_mm
-    setting = Setting(labels, board, 0.0, flatness_mm, camera, weight, np.inf)
-    if common > 0:
-        blocks, setting = _with_common(blocks, setting, common)
-    return blocks, shared, setting
+    setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis_of(prior), weight, np.inf)
+    return _with_common(setting, setting.values(_shared_circles(groups, len(labels)), start or camera), common)
 
 
-def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[list[Block], Setting]:
-    """Returns groups and setting with a shape of the board that all groups have in common."""
+def _with_common(setting: Setting, values: Values, common: float) -> tuple[Setting, Values]:
+    """Returns setting and state with a shape of the board that all groups have in common, if ``common`` is not 0."""
     setting = replace(setting, common=common)
-    own_sigma, board = setting.own_sigma_mm(), setting.board
-    return [replace(b, sigma_mm=own_sigma, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
+    return setting, values | {SHAPE: Vector(np.zeros((len(setting.cells()), 3)))} if common else values
 
 
-def _minimise(blocks: list[Block], shared: Shared, setting: Setting, settled: float) -> Adjusted:
+def _minimise(setting: Setting, values: Values, settled: float) -> Adjusted:
     """Returns the state of least cost; ``settled`` : see :func:`~stcal.geometry.least_squares.minimise`."""
-    minimum = _descent(blocks, shared, setting, settled)
-    last, beyond = minimum.state, minimum.state.moved(minimum.linear.step(DAMPING)[0], setting)
-    move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
+    minimum = _descent(setting, values, settled)
+    solution = minimum.linear
+    beyond = solution.problem.moved(solution.values, solution.step(DAMPING)[0])
+    before, after = (
+        np.concatenate([group.at(state).residuals_px(setting.camera(state)) for group in setting.groups])
+        for state in (solution.values, beyond)
+    )
+    move = float(np.abs(after - before).max(initial=0.0))
     if not move <= MAX_MOVE_PX:  # true of NaN, too
         raise ConvergenceError(
             "E-NO-MINIMUM",
             f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
             "compare with --solve chain and look at the outliers",
         )
-    return Adjusted(last.blocks, last.shared, setting, minimum.linear.normal, float(move))
+    return Adjusted(setting, solution, move)
 
 
-def _descent(
-    blocks: list[Block], shared: Shared, setting: Setting, settled: float
-) -> Minimum[JointState, SharedEquations]:
+def _descent(setting: Setting, values: Values, settled: float) -> Minimum[Values, JoinedSolution]:
+    joined = setting.joined(values)
     return minimise(
-        JointState(tuple(blocks), shared),
-        lambda state: SharedEquations.of(state, setting),
-        lambda state, step: state.moved(step, setting),
-        cost=lambda state: cost_of(state.blocks, state.shared, setting),
+        dict(values),
+        joined.at,
+        joined.moved,
+        cost=joined.cost,
         damping=DAMPING,
         least_damping=DAMPING,
         settled=settled,
@@ -379,7 +343,7 @@ def _descent(
     )
 
 
-def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Block:
+def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Group:
     place = {label: i for i, label in enumerate(labels)}
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
@@ -390,67 +354,51 @@ def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
             "photograph the board with the faces",
         )
     if 0 < len(dots) < MIN_DOTS:  # the scale is then from the target itself
-        return _block(model.without(np.isin(model.point_index, dots)), board, labels)
+        return _group(model.without(np.isin(model.point_index, dots)), board, labels)
     design = board.places_mm(model.labels[i] for i in dots)
-    return Block(
+    cells = dot_cells(model.labels[i] for i in dots)
+    return Group(
         model,
         align_rigid(model.xyz_model[dots], design) if len(dots) else Rigid(),
         design,
-        board.sigma_mm,
         dots,
         circles,
-        np.zeros(0, int),
+        cells[:, 0] * board.columns + cells[:, 1] if len(dots) else np.zeros(0, int),
         np.array([place[model.labels[i]] for i in circles], int),
     )
 
 
-def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.ndarray:
-    cells = dot_cells(model.labels[i] for i in dots)
-    return cells[:, 0] * board.columns + cells[:, 1]
-
-
-def _robust_sigma(blocks: list[Block], camera: Camera) -> float:
+def _robust_sigma(setting: Setting, values: Values) -> float:
     """Returns the robust σ of the normalised residuals per axis."""
-    length = np.concatenate([np.linalg.norm(normalised(b.model, camera), axis=1) for b in blocks])
+    camera = setting.camera(values)
+    length = np.concatenate([np.linalg.norm(normalised(g.at(values), camera), axis=1) for g in setting.groups])
     return max(robust_sigma(length, 2), 1e-6)
 
 
-def _common_share(blocks: list[Block], board: BoardDesign) -> float:
+def _common_share(setting: Setting, values: Values) -> float:
     """Returns the covariance between the groups' board residuals over their variance; 0 if it is not significant."""
-    by_dot = np.full((len(blocks), board.rows * board.columns, 3), np.nan)
-    for k, b in enumerate(blocks):
-        by_dot[k, _dot_place(b.model, b.dots, board)] = b.board_residual()
+    by_dot = np.full((len(setting.groups), setting.board.rows * setting.board.columns, 3), np.nan)
+    for own, group in zip(by_dot, setting.groups, strict=True):
+        own[group.cells] = group.board_residual(values)
     product, square, count = 0.0, 0.0, 0
-    for i in range(len(blocks)):
-        for j in range(i):
-            both = np.isfinite(by_dot[i]) & np.isfinite(by_dot[j])
-            product += float((by_dot[i][both] * by_dot[j][both]).sum())
-            square += float((by_dot[i][both] ** 2 + by_dot[j][both] ** 2).sum()) / 2
-            count += int(both.sum())
+    for one, two in combinations(by_dot, 2):
+        both = np.isfinite(one) & np.isfinite(two)
+        product += float((one[both] * two[both]).sum())
+        square += float((one[both] ** 2 + two[both] ** 2).sum()) / 2
+        count += int(both.sum())
     if not count or square == 0:
         return 0.0
     share = product / square
     return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
 
 
-def _shared_circles(blocks: list[Block], count: int) -> np.ndarray:
+def _shared_circles(groups: Sequence[Group], count: int) -> np.ndarray:
     """Returns start values of the circles: their means over the groups."""
     total, group_count = np.zeros((count, 3)), np.zeros(count)
-    for b in blocks:
-        np.add.at(total, b.circle_place, b.model.xyz_model[b.circles])
-        np.add.at(group_count, b.circle_place, 1)
+    for group in groups:
+        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
+        np.add.at(group_count, group.circle_place, 1)
     return total / group_count[:, None]
-
-
-def _with_circles(block: Block, xyz: np.ndarray) -> MetricModel:
-    points = block.model.xyz_model.copy()
-    points[block.circles] = xyz[block.circle_place]
-    return replace(block.model, xyz_model=points)
-
-
-def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) -> float:
-    before, after = old.model.residuals_px(shared.camera), new.model.residuals_px(new_shared.camera)
-    return float(np.abs(after - before).max(initial=0.0))
 
 
 def scale_of(sigma0: float) -> float:
@@ -458,43 +406,34 @@ def scale_of(sigma0: float) -> float:
     return max(1.0, sigma0)
 
 
-def _result(
-    blocks: list[Block],
-    shared: Shared,
-    setting: Setting,
-    move_px: float,
-    sigma0: float | None = None,
-    equations: tuple[np.ndarray, slice, slice] | None = None,
-) -> JointResult:
-    """Returns the result with its covariances; ``equations``: normal matrix, places of circles and intrinsics in it."""
-    if equations is None:
-        places = setting.places(shared)
-        equations = normal_equations(blocks, shared, setting)[0], places.circles, places.intrinsics
-    normal, circles, intrinsics = equations
-    inverse = constrained_inverse(normal, free_directions(len(normal), shared))
-    c = circles.stop
-    flat = sum(len(members) - 3 for members, _, _ in planes(shared, setting))
-    for shape in shapes(shared, setting):
+def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: float | None = None) -> JointResult:
+    """Returns the result with its covariances."""
+    values, groups, camera = solution.values, setting.groups, setting.camera(solution.values)
+    models = tuple(group.at(values) for group in groups)
+    xyz = values[CIRCLES].array
+    flat = sum(len(members) - 3 for members, _, _ in planes(xyz, setting))
+    for shape in shapes(xyz, setting):
         flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
-    flat += sum(1 for _ in bars(shared, setting))
-    observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
-    unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 * bool(len(b.dots)) for b in blocks)
+    flat += sum(1 for _ in bars(xyz, setting))
+    observations = sum(2 * len(g.model.image_index) + 3 * len(g.dots) for g in groups) + flat
+    unknowns = xyz.size + sum(6 * len(g.model.images) + 3 * len(g.dots) + 6 * bool(len(g.dots)) for g in groups)
     redundancy = observations - unknowns + FREE_DIRECTIONS
     if sigma0 is None:
-        sigma0 = float(np.sqrt(cost_of(blocks, shared, setting) / max(redundancy, 1)))
-    covariance = scale_of(sigma0) ** 2 * inverse
+        sigma0 = float(np.sqrt(solution.cost / max(redundancy, 1)))
+    covariance = scale_of(sigma0) ** 2 * solution.inverse
+    intrinsics = solution.parts[0].places[CAMERA]
     return JointResult(
-        tuple(b.model for b in blocks),
-        {b.model.group: b.model_from_board for b in blocks},
+        models,
+        {g.model.group: g.board_at(values) for g in groups},
         setting.labels,
-        shared.xyz_model,
-        covariance[:c, :c],
+        xyz,
+        covariance[: xyz.size, : xyz.size],
         sigma0,
-        {b.model.group: b.board_residual() for b in blocks},
+        {g.model.group: g.board_residual(values) for g in groups},
         setting.common,
-        shared.camera,
+        camera,
         covariance[intrinsics, intrinsics],
-        {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
+        {model.group: robust_weights(model, camera, setting.huber) for model in models},
         redundancy,
         move_px,
         setting.print_factor,

@@ -1,19 +1,20 @@
 """Adjustment of one group: weighted bundle adjustment, alternating with the circles' eccentricity."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stcal.adjust.blocks import Vector
+from stcal.adjust.blocks import Block, Vector
 from stcal.adjust.engine import Adjustment
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import PARAMETER_NAMES, Camera
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset, fit_plane
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.scale import find_scale
@@ -24,6 +25,7 @@ EXACTLY = 1e-15
 MAX_STEPS = 50
 DAMPING = 1e-10
 """Relative damping, which holds the seven free directions of the world."""
+NO_PARAMETERS = np.zeros((len(PARAMETER_NAMES), 0))
 
 
 def adjust(model: M, camera: Camera) -> M:
@@ -38,17 +40,41 @@ def adjust(model: M, camera: Camera) -> M:
     few = 2 * len(model.images) <= len(model.labels)  # the larger part of the unknowns is eliminated
     cameras = a.block("poses", poses, eliminate=not few)
     points = a.block("points", Vector(model.xyz_model), eliminate=few)
-    at = lru_cache(maxsize=2)(partial(placed, model))
-    a.factor(
-        lambda poses, points: off_px(at(poses, points), camera),
-        [(cameras, model.image_index), (points, model.point_index)],
-        derivatives=lambda poses, points: projection_jacobians(at(poses, points), camera),
-        root=whitening(model),
-    )
+    reproject(a, model, (points, cameras), lambda *_: camera)
     remedy = "check the camera file, and the sizes of printed faces in target.toml"
     minimum = a.minimum(damping=DAMPING, least_damping=DAMPING, settled=EXACTLY, max_steps=MAX_STEPS)
     values = minimum.required(f"group {model.group}: bundle adjustment", remedy).state
     return placed(model, values["poses"], values["points"])
+
+
+def reproject(
+    a: Adjustment,
+    model: GroupModel,
+    on: Sequence[Block],  # points, poses, and the parameters of a camera if they are adjusted
+    camera_at: Callable[..., Camera],  # of these parameters
+    basis: np.ndarray = NO_PARAMETERS,  # (16, q) derivative of the camera's parameters by them
+    **known: Any,  # kind, cluster and loss of the rows
+) -> None:
+    """Adds the rows of a model's observations, projected minus measured centres, px; infinite where a point lies behind
+    its camera."""
+    point, image, measured_px = model.point_index, model.image_index, model.corrected_px()
+
+    @lru_cache(maxsize=2)
+    def seen(points: Vector, poses: PoseStack) -> np.ndarray:
+        return np.einsum("nij,nj->ni", poses.rotation[image], points.array[point]) + poses.translation[image]
+
+    def residuals(points: Vector, poses: PoseStack, *lens: Vector) -> np.ndarray:
+        xyz = seen(points, poses)
+        behind = (xyz[:, 2] <= 0).any()
+        return np.full_like(measured_px, np.inf) if behind else camera_at(*lens).project(xyz) - measured_px
+
+    def derivatives(points: Vector, poses: PoseStack, *lens: Vector) -> list[np.ndarray]:
+        xyz, camera, own = seen(points, poses), camera_at(*lens), poses[image]
+        by_pose, by_point = jacobians(xyz, own.rotation, own.translation, camera)
+        return [by_point, by_pose, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
+
+    root = model.whiten(np.tile(np.eye(2), (len(image), 1, 1)))
+    a.factor(residuals, list(zip(on, (point, image, None), strict=False)), derivatives=derivatives, root=root, **known)
 
 
 def placed(model: M, poses: PoseStack, points: Vector) -> M:
@@ -57,37 +83,20 @@ def placed(model: M, poses: PoseStack, points: Vector) -> M:
     return replace(model, camera_from_model=rigid, xyz_model=points.array)
 
 
-def off_px(model: GroupModel, camera: Camera) -> np.ndarray:
-    """Returns projected minus measured centres (n, 2); infinite where a point lies behind its camera."""
-    if (model.xyz_camera()[:, 2] <= 0).any():
-        return np.full((len(model.image_index), 2), np.inf)
-    return -model.residuals_px(camera)
-
-
-def whitening(model: GroupModel) -> np.ndarray:
-    """Returns the matrices (n, 2, 2) that whiten the observations."""
-    return model.whiten(np.tile(np.eye(2), (len(model.image_index), 1, 1)))
-
-
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Returns the derivatives of the projections (px) by poses, left perturbed, (n, 2, 6), and by points, (n, 2, 3)."""
-    xyz = model.xyz_camera()
+    own = PoseStack.of(*model.camera_from_model)[model.image_index]
+    return jacobians(model.xyz_camera(), own.rotation, own.translation, camera)
+
+
+def jacobians(
+    xyz: np.ndarray, rotation: np.ndarray, translation: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns :func:`projection_jacobians` of points (n, 3) in cameras with poses (n, 3, 3), (n, 3)."""
     ideal = xyz[:, :2] / xyz[:, 2:]
     by_ideal = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     by_camera = np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / xyz[:, 2, None, None]
-    translation = np.stack([pose.translation for pose in model.camera_from_model])[model.image_index]
-    by_pose = np.concatenate([-by_camera @ skew(xyz - translation), by_camera], axis=2)
-    rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
-    return by_pose, by_camera @ rotation
-
-
-def moved_poses(poses: tuple[Rigid, ...], step: np.ndarray) -> tuple[Rigid, ...]:
-    """Returns poses after left perturbations (m, 6)."""
-    turned = Rotation.from_rotvec(step[:, :3]).as_matrix()
-    return tuple(
-        Rigid(turn @ pose.rotation, pose.translation + shift)
-        for turn, pose, shift in zip(turned, poses, step[:, 3:], strict=True)
-    )
+    return np.concatenate([-by_camera @ skew(xyz - translation), by_camera], axis=2), by_camera @ rotation
 
 
 MAX_ROUNDS = 20

@@ -1,6 +1,6 @@
 """Covariances of faces and circles, and what each kind of observation contributes to them."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -10,17 +10,15 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
-from stcal.geometry.normal_equations import constrained_inverse
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.equations import (
-    Block,
-    Reduced,
-    Setting,
-    Shared,
+    BOARD,
+    CAMERA,
+    CIRCLES,
+    DOTS,
     bars,
-    free_directions,
-    normal_equations,
+    coordinates,
     normalised,
     planes,
     robust_weights,
@@ -29,7 +27,6 @@ from stcal.sfm.adjust.equations import (
 )
 from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
 from stcal.sfm.adjust.joint import Adjusted, JointResult, points_of, scale_of
-from stcal.sfm.adjust.refine import projection_jacobians
 
 STEP_MM = 1e-3
 """Step of the central differences, in mm."""
@@ -241,13 +238,10 @@ def _moves(
     return derivative
 
 
-CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS = "circles", "dots", "board", "flatness", "intrinsics"
-PRINT, SIZES, DISTANCES = "print", "sizes", "distances"
+FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES = "flatness", "intrinsics", "print", "sizes", "distances"
 OBSERVED = (CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES)
 """Kinds of observations: centres of circles and of dots in the images, positions of the dots on the board, flatness of
 the faces, the given intrinsics if they are adjusted; shapes and sizes of faces of known shape, known distances."""
-AT_ONCE = 10_000
-"""Number of observations that are processed together; it bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,7 +287,7 @@ def contributions_of(state: Adjusted) -> Contributions:
         {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in parts.covariance.items()},
         parts.by_scale,
         parts.by_intrinsics,
-        {kind: state.differ * joint.sigma_scale * centre_sigma_px(state.blocks, kind) for kind in (CIRCLES, DOTS)},
+        {kind: state.differ * joint.sigma_scale * centre_sigma_px(state, kind) for kind in (CIRCLES, DOTS)},
     )
 
 
@@ -308,105 +302,45 @@ class _Parts:
 
 def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
     """Returns the parts for quantities with derivatives (3c, k) by the circles, or for the 3c coordinates if None."""
-    blocks, shared, setting = state.blocks, state.shared, state.setting
-    normal, _, groups = normal_equations(blocks, shared, setting)
-    c = shared.xyz_model.size
-    inverse = constrained_inverse(normal, free_directions(len(normal), shared))[:, :c]
-    if quantities is not None:
-        inverse = inverse @ quantities
-    k = inverse.shape[1]
+    setting, solution = state.setting, state.solution
+    camera, xyz = state.camera, solution.values[CIRCLES].array
+    k = xyz.size if quantities is None else quantities.shape[1]
     covariance = {kind: np.zeros((k, k)) for kind in OBSERVED}
     by_scale, by_intrinsics = np.zeros(k), np.zeros((k, len(PARAMETER_NAMES)))
-    fixed = shared.basis.shape[1] == 0
-    for block, reduced in zip(blocks, groups, strict=True):
-        group_answer = _Answer.of(block, reduced, inverse[setting.outer(block, shared)], shared)
-        for kind, rows, lens_rows in group_answer.images(block, shared, setting):
-            covariance[kind] += state.differ**2 * rows.T @ rows
-            by_intrinsics += rows.T @ lens_rows if fixed else 0.0
-        rows = group_answer.board(block, shared)
-        covariance[BOARD] += rows.T @ rows
-        by_scale += rows.T @ (block.design @ block.model_from_board.rotation.T).ravel() / block.sigma_mm
-    places = setting.places(shared)
-    if setting.common:
-        rows = inverse[places.shape] / setting.shape_sigma_mm()
-        covariance[BOARD] += rows.T @ rows
-    covariance[INTRINSICS] += inverse[places.intrinsics].T @ setting.prior @ inverse[places.intrinsics]
-    for members, across, plane_normal in planes(shared, setting):
-        heights = inverse[:c].reshape(-1, 3, k)[members]
+    for group, model, part in zip(setting.groups, state.models, solution.whole, strict=True):
+        along = part.inverse[:, : xyz.size] if quantities is None else part.inverse[:, : xyz.size] @ quantities
+        pitch = (group.design @ group.board_at(solution.values).rotation.T / setting.own_sigma_mm()).ravel()
+        for rows, batch, total in part.effects(along):
+            kind, flat = rows.factor.kind, total.reshape(-1, k)
+            covariance[kind] += (state.differ**2 if kind in (CIRCLES, DOTS) else 1.0) * flat.T @ flat
+            if kind == BOARD and len(rows.factor.on) > 1:
+                by_scale += flat.T @ pitch[3 * batch.start : 3 * batch.stop]
+            elif kind != BOARD and not setting.basis.shape[1]:
+                seen = model.observed(group.observations(kind)[batch])
+                lens = seen.whiten(seen.by_parameters(camera)) * np.sqrt(rows.weight[batch])[:, None, None]
+                by_intrinsics += flat.T @ lens.reshape(len(flat), -1)
+    inverse = solution.inverse[:, : xyz.size] if quantities is None else solution.inverse[:, : xyz.size] @ quantities
+    intrinsics = inverse[solution.parts[0].places[CAMERA]]
+    covariance[INTRINSICS] += intrinsics.T @ setting.prior @ intrinsics
+    for members, across, plane_normal in planes(xyz, setting):
+        heights = inverse[: xyz.size].reshape(-1, 3, k)[members]
         rows = across @ np.einsum("j,mjk->mk", plane_normal, heights) / setting.flatness_mm
         covariance[FLATNESS] += rows.T @ rows
-    for shape in shapes(shared, setting):
-        rows = inverse[(3 * shape.members[:, None] + np.arange(3)).ravel()]
+    for shape in shapes(xyz, setting):
+        rows = inverse[coordinates(shape.members)]
         by_size = rows.T @ shape.by_size()
         covariance[SIZES] += np.outer(by_size, by_size)
         covariance[PRINT] += rows.T @ shape.normal() @ rows - np.outer(by_size, by_size)
-    for members, along, _, sigma in bars(shared, setting):
+    for members, along, _, sigma in bars(xyz, setting):
         row = along @ (inverse[3 * members[0] + np.arange(3)] - inverse[3 * members[1] + np.arange(3)]) / sigma
         covariance[DISTANCES] += np.outer(row, row)
     return _Parts(covariance, by_scale, by_intrinsics)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    """Columns of the inverse normal matrix for the k coordinates of all circles, with the rows of one group."""
-
-    points: np.ndarray  # (p, 3, k)
-    cameras: np.ndarray  # (m, 6, k)
-    pose: np.ndarray  # (6, k) of the group's board
-    shape: np.ndarray  # (d, 3, k)
-    intrinsics: np.ndarray  # (q, k)
-
-    @classmethod
-    def of(cls, block: Block, reduced: Reduced, outer: np.ndarray, shared: Shared) -> "_Answer":
-        """Computes the eliminated unknowns of a group from ``outer``, the rows of its outer unknowns."""
-        k, d, q = outer.shape[1], len(block.dots), shared.basis.shape[1]
-        assert reduced.cameras is not None, "the normal matrix of the photographs alone has no cameras"
-        inner = -(reduced.inner.from_kept[0] @ outer)
-        points = np.zeros((len(block.model.labels), 3, k))
-        points[block.circles] = outer[: 3 * len(block.circles)].reshape(-1, 3, k)
-        points[block.dots] = inner[: 3 * d].reshape(-1, 3, k)
-        intrinsics = outer[len(outer) - q :]
-        cameras = -(reduced.cameras.from_kept @ np.concatenate([points.reshape(-1, k), intrinsics]))
-        shape = outer[3 * len(block.circles) : len(outer) - q].reshape(-1, 3, k)
-        return cls(points, cameras, inner[3 * d :], shape, intrinsics)
-
-    def images(self, block: Block, shared: Shared, setting: Setting) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        """Yields by batch of images the kind, whitened rows (2n, k), and derivatives by the intrinsics (2n, 16)."""
-        model, camera = block.model, shared.camera
-        root = np.sqrt(robust_weights(model, camera, setting.huber))[:, None, None]
-        of_circle = np.isin(model.point_index, block.circles)
-        for kind, indices in ((CIRCLES, np.flatnonzero(of_circle)), (DOTS, np.flatnonzero(~of_circle))):
-            for begin in range(0, len(indices), AT_ONCE):
-                batch = indices[begin : begin + AT_ONCE]
-                batch_model = model.observed(batch)
-                by_pose, by_point = projection_jacobians(batch_model, camera)
-                lens = batch_model.by_parameters(camera)
-                rows = by_pose @ self.cameras[batch_model.image_index] + by_point @ self.points[batch_model.point_index]
-                rows = rows + (lens @ shared.basis) @ self.intrinsics
-                whitened = (batch_model.whiten(array) * root[batch] for array in (rows, lens))
-                rows, lens = (array.reshape(2 * len(batch), -1) for array in whitened)
-                yield kind, rows, lens
-
-    def board(self, block: Block, shared: Shared) -> np.ndarray:
-        """Returns the board's share of the equations: rows (3d, k) of the positions of d dots, divided by their σ."""
-        if not len(block.dots):
-            return np.zeros((0, self.points.shape[2]))
-        rotation = block.model_from_board.rotation
-        turned = block.expected_dots(shared) @ rotation.T
-        rows = self.points[block.dots] + skew(turned) @ self.pose[:3] - self.pose[3:]
-        if len(self.shape):
-            rows = rows - rotation @ self.shape
-        return rows.reshape(3 * len(turned), -1) / block.sigma_mm
-
-
-def centre_sigma_px(blocks: Sequence[Block], kind: str) -> float:
+def centre_sigma_px(state: Adjusted, kind: str) -> float:
     """Returns the RMS of the centres' σ per axis, as used for the weights."""
-    square = np.concatenate(
-        [
-            b.model.sigma_px()[np.isin(b.model.point_index, b.circles if kind == CIRCLES else b.dots)] ** 2
-            for b in blocks
-        ]
-    )
+    each = [group.model.sigma_px()[group.observations(kind)] ** 2 for group in state.setting.groups]
+    square = np.concatenate(each)
     return float(np.sqrt(square.mean())) if len(square) else 0.0
 
 
@@ -426,10 +360,9 @@ def _differ(state: Adjusted, own: Derivatives) -> float:
     faces = np.concatenate([by_circles for by_circles in own.faces.values() if by_circles.any()] or [np.zeros((0, 0))])
     if not faces.size:
         return 1.0
-    extensible, camera, basis = points_of(state), state.shared.camera, state.shared.basis
+    extensible, camera, basis = points_of(state.setting, state.solution), state.camera, state.setting.basis
     scatter, told = np.zeros((2, len(faces), len(faces)))
-    for block in state.blocks:
-        model = block.model
+    for model in state.models:
         points, to_faces = extensible.points[model.group], extensible.to_circles[model.group] @ faces.T
         for rows in model.rows_by_image():
             view = model.observed(rows)

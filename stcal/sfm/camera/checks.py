@@ -7,13 +7,15 @@ from typing import TypeVar
 import numpy as np
 from scipy.optimize import least_squares
 
+from stcal.adjust.blocks import Vector
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
+from stcal.geometry.least_squares import PoseStack
 from stcal.labels import Label
 from stcal.parallel import run_in_order
-from stcal.sfm.adjust.refine import eccentricity_px, moved_poses
+from stcal.sfm.adjust.refine import eccentricity_px, placed
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
     adjust_intrinsics,
@@ -294,17 +296,18 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
     model = replace(model, xyz_model=xyz)
     factor = result.factors.centres
     radius: dict[Label, float] = {**board.radius_of()}
+    points = Vector(xyz)
     for _ in range(POSE_PASSES):
         model = replace(model, shift_px=eccentricity_px(model, camera, radius, 1.0))
-        begin = model
+        begin, poses = model, PoseStack.of(*model.camera_from_model)
 
-        def left(step: np.ndarray, begin=begin) -> np.ndarray:
-            moved = replace(begin, camera_from_model=moved_poses(begin.camera_from_model, step[None]))
+        def left(step: np.ndarray, begin=begin, poses=poses) -> np.ndarray:
+            moved = placed(begin, poses.moved(step[None]), points)
             return moved.whiten(moved.residuals_px(camera)).ravel() / factor
 
         depth = float(np.linalg.norm(begin.camera_from_model[0].translation))
         solution = least_squares(left, np.zeros(6), loss="huber", f_scale=2.0, x_scale=[1, 1, 1, depth, depth, depth])
-        model = replace(model, camera_from_model=moved_poses(begin.camera_from_model, solution.x[None]))
+        model = placed(begin, poses.moved(solution.x[None]), points)
     residual = model.residuals_px(camera)
     return residual, model.whiten(residual)
 

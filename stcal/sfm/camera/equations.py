@@ -1,8 +1,8 @@
 """Normal equations of a camera calibration, with the places of the board's dots as unknowns."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from stcal.geometry.clusters import ByClusters
 from stcal.geometry.least_squares import PoseStack, minimise
 from stcal.geometry.print_modes import PrintModes
 from stcal.sfm.adjust.equations import image_cost, normalised
-from stcal.sfm.adjust.refine import off_px, placed, projection_jacobians, whitening
+from stcal.sfm.adjust.refine import placed, reproject
 from stcal.sfm.data.model import MetricModel
 
 MAX_STEPS = 200
@@ -94,9 +94,9 @@ class Setting:
         """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
         return np.linalg.pinv(self.basis) @ (camera.parameters() - self.start.parameters())
 
-    def camera(self, away: np.ndarray) -> Camera:
-        """Returns the camera with these parameters of the COLMAP model minus those at the start, (q,)."""
-        return self.start.with_parameters(_positive(self.start.parameters() + self.basis @ away))
+    def camera(self, away: Vector) -> Camera:
+        """Returns the camera with these parameters of the COLMAP model minus those at the start, (1, q)."""
+        return self.start.with_parameters(_positive(self.start.parameters() + self.basis @ away.array[0]))
 
     @property
     def kept(self) -> int:
@@ -182,7 +182,7 @@ class Normal:
     def _state(self, values: Mapping[str, Any]) -> State:
         names = [model.group for model in self.models]
         moved = [placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
-        return State(tuple(moved), self.setting.camera(values["lens"].array[0]))
+        return State(tuple(moved), self.setting.camera(values["lens"]))
 
 
 POSES, DOTS_OF = "poses of ", "dots of "
@@ -200,34 +200,14 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
         lens = a.block("lens", values["lens"])
         dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
         poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
-        at = lru_cache(maxsize=2)(partial(placed, model))
-        a.factor(
-            partial(_off, at, setting),
-            [(lens, None), (dots, model.point_index), (poses, model.image_index)],
-            derivatives=partial(_slopes, at, setting),
-            root=whitening(model),
-            cluster=first + model.image_index,
-            loss=Huber(setting.huber),
-        )
+        cluster, loss = first + model.image_index, Huber(setting.huber)
+        reproject(a, model, (dots, poses, lens), setting.camera, setting.basis, cluster=cluster, loss=loss)
         a.prior(dots, board.places, board.modes.weight(setting.sigma_mm))
         if not parts:
             a.prior(lens, np.zeros((1, setting.kept)), setting.weight)
         parts.append(a)
         first += len(model.images)
     return Joined(parts, ("lens",)), values
-
-
-At = Callable[[PoseStack, Vector], MetricModel]
-
-
-def _off(at: At, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> np.ndarray:
-    return off_px(at(poses, dots), setting.camera(lens.array[0]))
-
-
-def _slopes(at: At, setting: Setting, lens: Vector, dots: Vector, poses: PoseStack) -> list[np.ndarray]:
-    moved, camera = at(poses, dots), setting.camera(lens.array[0])
-    by_pose, by_point = projection_jacobians(moved, camera)
-    return [moved.by_parameters(camera) @ setting.basis, by_point, by_pose]
 
 
 def minimum(state: State, setting: Setting) -> State:

@@ -236,6 +236,17 @@ class GroupModel:
         """Returns the model with the given observations only, but with all of its images and points."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _PER_OBSERVATION})
 
+    def plus(self: "M", other: "M") -> "M":
+        """Returns the model with the images of another one of the same points."""
+        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _PER_OBSERVATION[1:]}
+        return replace(
+            self,
+            images=self.images + other.images,
+            camera_from_model=self.camera_from_model + other.camera_from_model,
+            image_index=np.concatenate([self.image_index, other.image_index + len(self.images)]),
+            **both,
+        )
+
     def points_by_face(self) -> dict[str, np.ndarray]:
         """Returns the indices of the points by face; the points of the board have the key ``board``."""
         members: dict[str, list[int]] = {}

@@ -10,8 +10,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
-from stcal.sfm.adjust.equations import rows_of_view
-from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
+from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import result_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.bodies import body_views
@@ -22,7 +21,6 @@ from stcal.sfm.planning.forecast import (
     PRACTICE,
     CentreNoise,
     Forecast,
-    Photographs,
     PositionsWith,
     Setup,
     forecast,
@@ -160,19 +158,18 @@ def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = No
     if not isinstance(known, Known):
         known = known_of(saved_run(known))
     setup = known.setup
-    photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
-    now = forecast(known.models, setup, photographs=photographs)
-    shares = variance_shares(now, known.models, setup, photographs)
+    now = forecast(known.models, setup)
+    shares = variance_shares(now, known.models, setup)
     with kept_processes():
         views = [view for views_of_group in _candidates(known) for view in views_of_group]
-        chosen = _greedy(known, views, now, photographs, count, progress or (lambda *_: None))
+        chosen = _greedy(known, views, now, count, progress or (lambda *_: None))
     return Advice(
         now,
         shares,
         known.noise,
         tuple(chosen),
-        tuple(_new_groups(known, now, photographs, max(count, MIN_NEW_GROUP))) if setup.board.rows else (),
-        forecast(known.models, setup.better_board(0.5), now.derivatives, photographs),
+        tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))) if setup.board.rows else (),
+        forecast(known.models, setup.better_board(0.5), now.derivatives),
         len(views),
     )
 
@@ -185,22 +182,19 @@ def _candidates(known: Known) -> list[list[PlannedView]]:
     return run_in_order(candidates, jobs, 1)
 
 
-def _greedy(
-    known: Known, views: list[PlannedView], now: Forecast, photographs: Photographs, count: int, progress: Progress
-) -> list[Choice]:
+def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, progress: Progress) -> list[Choice]:
     """Chooses view after view, each time the one with which the worst face has the smallest σ."""
     chosen: list[Choice] = []
-    setup, photographs = known.setup, dict(photographs)
+    models = {model.group: model for model in known.models}
     while views and len(chosen) < count:
         progress(f"view {len(chosen) + 1}", 0, len(views))
-        positions = PositionsWith.of(known.models, setup, now.derivatives, photographs)
+        positions = PositionsWith.of(list(models.values()), known.setup, now.derivatives)
         jobs = [(positions, views[i : i + AT_ONCE]) for i in range(0, len(views), AT_ONCE)]
         results = [sigma for part in run_in_order(_positions, jobs, 1) for sigma in part]
         progress(f"view {len(chosen) + 1}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         chosen.append(Choice(views[best], *worst_of(results[best])))
-        rows, _ = rows_of_view(views[best].model, setup.camera, basis_of(setup.prior))
-        photographs[views[best].group] = photographs[views[best].group] + rows.T @ rows
+        models[views[best].group] = models[views[best].group].plus(views[best].model)
         keep = _promising(results) - {best}
         views = [views[i] for i in sorted(keep)]
     return chosen
@@ -215,7 +209,7 @@ def _promising(by_view: list[dict[str, float]]) -> set[int]:
     return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
 
 
-def _new_groups(known: Known, now: Forecast, photographs: Photographs, images: int) -> list[NewGroup]:
+def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
     """Returns the pairs of faces that no group shows together but one view can, the best first."""
     together = {
         pair
@@ -229,7 +223,7 @@ def _new_groups(known: Known, now: Forecast, photographs: Photographs, images: i
                 model = _new_model(known, pair, images)
             except DegenerateError:
                 continue  # the two cannot be seen together at this distance
-            with_model = forecast([*known.models, model], known.setup, now.derivatives, photographs)
+            with_model = forecast([*known.models, model], known.setup, now.derivatives)
             new_groups.append(NewGroup(pair, images, *with_model.worst()))
     return sorted(new_groups, key=lambda group: group.sigma_mm)
 

@@ -1,6 +1,6 @@
 """Forecast of the σ of a geometry, photographed or only planned, and nominal poses before a photograph exists."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
@@ -299,20 +299,10 @@ def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
     return face, sigma[face]
 
 
-Photographs = Mapping[str, np.ndarray]
-"""Normal equations of all images of a group for its points and the intrinsics, by group, see
-:func:`stcal.sfm.adjust.joint.photographs_of`. They are computed once, as the images are many and do not change."""
-
-
-def forecast(
-    models: Sequence[MetricModel],
-    setup: Setup,
-    known: Derivatives | None = None,
-    photographs: Photographs | None = None,
-) -> Forecast:
+def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
     """Returns the σ of metric models, mm, target frame, as the joint adjustment would state them. ``known``:
     derivatives of an earlier forecast of the same circles."""
-    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
+    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.circle_covariance(joint.covariance_mm2)
     reference = setup.start.reference_face
@@ -336,11 +326,9 @@ class PositionsWith:
     scale: float
 
     @classmethod
-    def of(
-        cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
-    ) -> "PositionsWith":
-        """Prepares views in addition to these models. ``known`` and ``photographs`` are as in :func:`forecast`."""
-        now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
+    def of(cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives) -> "PositionsWith":
+        """Prepares views in addition to these models. ``known`` is as in :func:`forecast`."""
+        now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
         faces = known.face_covariance(setup.circle_covariance(now.covariance_mm2))
         variance = {f: position_sigma_mm(c) ** 2 for f, c in faces.items() if f != setup.start.reference_face}
         jacobian = np.concatenate([known.faces[face][3:] for face in variance])
@@ -361,29 +349,21 @@ def position_sigma_mm(face_covariance: np.ndarray) -> float:
     return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 
-def variance_shares(
-    now: Forecast, models: Sequence[MetricModel], setup: Setup, photographs: Photographs | None = None
-) -> dict[str, dict[str, float]]:
+def variance_shares(now: Forecast, models: Sequence[MetricModel], setup: Setup) -> dict[str, dict[str, float]]:
     """Returns, by face and source, the share of the variance of the face's position that is due to the source. A
     variance grows by f² where all σ do by f, so that its derivatives by the sources' variances add up to it."""
-    smaller: dict[str, tuple[Sequence[MetricModel], Setup, Photographs | None]] = {
-        "image noise": (
-            [replace(model, covariance_px2=SMALLER**2 * model.covariance_px2) for model in models],
-            setup,
-            photographs and {group: normal / SMALLER**2 for group, normal in photographs.items()},
-        ),
-        setup.size_source: (models, setup.better_board(SMALLER), photographs),
-    }
+    noisy = [replace(model, covariance_px2=SMALLER**2 * model.covariance_px2) for model in models]
+    smaller = {"image noise": (noisy, setup), setup.size_source: (models, setup.better_board(SMALLER))}
     if setup.flatness_mm is not None:
-        smaller["flatness"] = models, replace(setup, flatness_mm=SMALLER * setup.flatness_mm), photographs
+        smaller["flatness"] = models, replace(setup, flatness_mm=SMALLER * setup.flatness_mm)
     if setup.prior is not None:
         prior = replace(setup.prior, covariance=SMALLER**2 * setup.prior.covariance)
-        smaller["intrinsics"] = models, replace(setup, prior=prior), photographs
+        smaller["intrinsics"] = models, replace(setup, prior=prior)
     if setup.rims_mm2 is not None:
-        smaller["rims"] = models, replace(setup, rims_mm2=SMALLER**2 * setup.rims_mm2), photographs
+        smaller["rims"] = models, replace(setup, rims_mm2=SMALLER**2 * setup.rims_mm2)
     shares: dict[str, dict[str, float]] = {face: {} for face in now.face_covariance}
-    for source, (own_models, own_setup, own_photographs) in smaller.items():
-        less = forecast(own_models, own_setup, now.derivatives, own_photographs).position_sigma_mm()
+    for source, (own_models, own_setup) in smaller.items():
+        less = forecast(own_models, own_setup, now.derivatives).position_sigma_mm()
         for face, sigma in now.position_sigma_mm().items():
             shares[face][source] = (1 - (less[face] / sigma) ** 2) / (1 - SMALLER**2)
     return shares

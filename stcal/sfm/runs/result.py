@@ -13,14 +13,14 @@ from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
+from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.json import ByFace, Part
 from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
-from stcal.sfm.adjust.equations import without_cameras
-from stcal.sfm.adjust.joint import basis_of
+from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
@@ -115,7 +115,8 @@ class ImageResult(Brief):
 
 def _images(model: MetricModel, camera: Camera, scale: float) -> list[ImageResult]:
     """Returns the images of a group; ``scale`` : factor on the centres' σ."""
-    alone = without_cameras(model, camera, basis_of(None), np.inf)[2].inverse
+    by_pose = model.whiten(projection_jacobians(model, camera)[0])
+    alone = np.linalg.inv(blocks_of(by_pose, by_pose[..., 0], model.image_index, len(model.images))[0])
     corrected, residuals = model.corrected_px(), model.residuals_px(camera)
     return [
         ImageResult(

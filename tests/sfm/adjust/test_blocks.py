@@ -5,8 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.adjust.blocks import Vector
+from stcal.adjust.engine import Adjustment
+from stcal.design import BoardDesign
+from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel, DotLabel
 from stcal.sfm.adjust import equations
+from stcal.sfm.adjust.equations import Group, Setting
+from stcal.sfm.adjust.refine import reproject
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.sfm.adjust import dense
 
@@ -25,7 +32,17 @@ def test_without_cameras_it_is_the_schur_complement_of_the_full_equations(group,
     """Points and the camera's parameters remain; a step of these brings the cameras' own along."""
     model, camera = group
     basis = np.eye(16)[:, :intrinsics]
-    normal, right, away = equations.without_cameras(model, camera, basis, np.inf)
+    a = Adjustment()
+    points = a.block("points", Vector(model.xyz_model))
+    poses = a.block("poses", PoseStack.of(*model.camera_from_model), eliminate=True)
+    lens = a.block("lens", Vector(np.zeros((1, intrinsics))))
+
+    def camera_at(lens: Vector):
+        return camera.with_parameters(camera.parameters() + basis @ lens.array[0])
+
+    reproject(a, model, (points, poses, lens), camera_at, basis)
+    solution = a.at({block.name: block.start for block in a.blocks})
+    normal, right, away = solution.normal, solution.right, solution.reduction
     jacobian = dense.jacobian(model, camera)
     if intrinsics:
         by = [
@@ -78,23 +95,24 @@ def test_points_behind_a_camera_cost_everything(group):
 
 def test_dots_off_their_design_cost_their_squares_over_sigma(group):
     model, camera = group
-    dots, none = np.arange(5), np.zeros(0, int)
-    shared = equations.Shared(
-        xyz_model=np.zeros((0, 3)), shape_mm=np.zeros((0, 3)), camera=camera, basis=np.zeros((12, 0))
-    )
+    (dot_rows,) = np.nonzero([isinstance(label, DotLabel) for label in model.labels])
+    (circle_rows,) = np.nonzero([isinstance(label, CircleLabel) for label in model.labels])
+    labels = tuple(model.labels[i] for i in circle_rows)
 
     def cost(off_mm: np.ndarray) -> float:
-        block = equations.Block(
+        own = Group(
             model=model,
             model_from_board=Rigid(),
-            design=model.xyz_model[dots] + off_mm,
-            sigma_mm=0.02,
-            dots=dots,
-            circles=none,
-            dot_place=none,
-            circle_place=none,
+            design=model.xyz_model[dot_rows] + off_mm,
+            dots=dot_rows,
+            circles=circle_rows,
+            cells=np.arange(len(dot_rows)),
+            circle_place=np.arange(len(circle_rows)),
         )
-        return block.cost(shared, np.inf)
+        board = BoardDesign(10, 10, 20.0, 5.0, "bright", sigma_mm=0.02)
+        setting = Setting((own,), labels, board, 0.0, np.inf, camera, np.zeros((16, 0)), np.zeros((0, 0)), np.inf)
+        values = setting.values(model.xyz_model[circle_rows], camera)
+        return setting.joined(values).cost(values)
 
-    off = np.random.default_rng(0).normal(0, 0.05, (5, 3))
+    off = np.random.default_rng(0).normal(0, 0.05, (len(dot_rows), 3))
     assert cost(off) - cost(0 * off) == pytest.approx((off**2).sum() / 0.02**2, rel=1e-6)

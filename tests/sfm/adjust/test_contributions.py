@@ -43,9 +43,9 @@ def state_of(case, refined=False, common=None, board=None, camera=None):
 
 
 def shift(case, changed, common) -> np.ndarray:
-    before = state_of(case, common=common).shared.xyz_model
+    before = state_of(case, common=common).result().xyz_model
     free = free_motions(before, scale=False)
-    moved = (changed.shared.xyz_model - before).ravel()
+    moved = (changed.result().xyz_model - before).ravel()
     return moved - free @ (free.T @ moved)
 
 

@@ -124,19 +124,8 @@ def test_forecast_is_the_spread_of_simulations(exact, common, draws):
         require_chi2(rows[:, 3:], expected.face_covariance[face][3:, 3:])
 
 
-def joined(model: MetricModel, new: MetricModel) -> MetricModel:
-    names = ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
-    return replace(
-        model,
-        images=(*model.images, *new.images),
-        camera_from_model=(*model.camera_from_model, *new.camera_from_model),
-        image_index=np.concatenate([model.image_index, new.image_index + len(model.images)]),
-        **{name: np.concatenate([getattr(model, name), getattr(new, name)]) for name in names},
-    )
-
-
 def doubled(model: MetricModel) -> MetricModel:
-    return joined(model, replace(model, images=tuple(f"{name} again" for name in model.images)))
+    return model.plus(replace(model, images=tuple(f"{name} again" for name in model.images)))
 
 
 def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact):
@@ -206,7 +195,7 @@ def advice(known):
 def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
     models = {model.group: model for model in known.models}
     for view in views:
-        models[view.group] = joined(models[view.group], view.model)
+        models[view.group] = models[view.group].plus(view.model)
     return forecast(list(models.values()), known.setup, now.derivatives)
 
 
@@ -230,7 +219,7 @@ def test_advised_views_do_what_is_said(known, advice):
     """Photographed in simulation: errors as forecast, and σ falls from the run to the adjustment as forecast."""
     models = {model.group: model for model in known.models}
     for choice in advice.choices:
-        models[choice.view.group] = joined(models[choice.view.group], choice.view.model)
+        models[choice.view.group] = models[choice.view.group].plus(choice.view.model)
     views = [choice.view for choice in advice.choices]
     expected = after(known, views, advice.now)
     assert expected.worst() == (advice.choices[-1].face, pytest.approx(advice.choices[-1].sigma_mm))
