@@ -6,6 +6,7 @@ curved; a sheet bends. All points of the plane follow together, by far more than
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -38,6 +39,12 @@ class PrintModes:
     @classmethod
     def of(cls, xy: np.ndarray) -> "PrintModes":
         """Return the modes of points (n, 2) of a plane: stretch, shear, six of second order within it, three bends."""
+        return cls._of(np.ascontiguousarray(xy, float).tobytes())
+
+    @classmethod
+    @lru_cache(maxsize=64)
+    def _of(cls, coordinates: bytes) -> "PrintModes":
+        xy = np.frombuffer(coordinates).reshape(-1, 2)
         xy = xy - xy.mean(axis=0)
         half = max(float(np.ptp(xy, axis=0).max()) / 2, 1e-9)
         x, y = xy.T / half

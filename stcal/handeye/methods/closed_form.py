@@ -141,7 +141,7 @@ def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bo
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
     """Returns the angles (s, m) and distances (s, m) by which the chains miss Z."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
-    chain = np.einsum("mab,sbc,mcd->smad", hand.rotation, x, eye.rotation)
+    chain = hand.rotation @ (x[:, None] @ eye.rotation)
     cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
     board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
     at = np.einsum("mab,smb->sma", hand.rotation, board)

@@ -233,36 +233,46 @@ class _Gap:
         return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class OfTarget:
     """What is known of the circles: flatness of faces, faces of known shape, known distances."""
 
     block: Block
     setting: Setting
+    last: tuple[Vector | None, list, list, list] = (None, [], [], [])  # circles, and their faces and distances
+
+    def _known(self, values: Mapping[str, Any]) -> tuple[list, list, list]:
+        """Returns planes, shapes and distances at a state; both cost and equations of it are asked for."""
+        if self.last[0] is not values[CIRCLES]:
+            xyz, setting = values[CIRCLES].array, self.setting
+            self.last = values[CIRCLES], *(list(each(xyz, setting)) for each in (planes, shapes, bars))
+        return self.last[1:]
 
     def cost(self, values: Mapping[str, Any]) -> float:
         """Returns squared deviations over σ²."""
         xyz, setting = values[CIRCLES].array, self.setting
-        cost = sum(shape.cost() for shape in shapes(xyz, setting))
-        for members, across, normal in planes(xyz, setting):
+        flat, known, distances = self._known(values)
+        cost = sum(shape.cost() for shape in known)
+        for members, across, normal in flat:
             cost += float(((across @ (xyz[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
-        return cost + sum((off / sigma) ** 2 for _, _, off, sigma in bars(xyz, setting))
+        return cost + sum((off / sigma) ** 2 for _, _, off, sigma in distances)
 
     def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Returns normal matrix (3c, 3c) and right side (3c,)."""
         xyz, setting = values[CIRCLES].array, self.setting
         normal, right = np.zeros((xyz.size, xyz.size)), np.zeros(xyz.size)
-        for members, across, normal_model in planes(xyz, setting):
+        flat, known, distances = self._known(values)
+        for members, across, normal_model in flat:
             jacobian = across[:, :, None] * normal_model  # derivatives of distances from the plane by the circles
-            flat = jacobian.reshape(len(members), -1)
+            rows = jacobian.reshape(len(members), -1)
             place = coordinates(members)
-            normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
-            right[place] -= flat.T @ (across @ (xyz[members] @ normal_model)) / setting.flatness_mm**2
-        for shape in shapes(xyz, setting):
+            normal[np.ix_(place, place)] += rows.T @ rows / setting.flatness_mm**2
+            right[place] -= rows.T @ (across @ (xyz[members] @ normal_model)) / setting.flatness_mm**2
+        for shape in known:
             place = coordinates(shape.members)
             normal[np.ix_(place, place)] += shape.normal()
             right[place] -= shape.slope()
-        for members, along, off, sigma in bars(xyz, setting):
+        for members, along, off, sigma in distances:
             place = coordinates(members)
             row = np.concatenate([along, -along]) / sigma
             normal[np.ix_(place, place)] += np.outer(row, row)
