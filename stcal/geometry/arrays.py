@@ -211,6 +211,23 @@ def frozen(
     ``shape`` : the required one, if any; ``None`` in it admits any length; ``what`` : name of the values in messages;
     ``finite`` : whether floats must be finite; if not, NaN stands for values that are not known.
     """
+    if type(values) is np.ndarray and values.dtype == dtype:
+        array = values if values.base is None and not values.flags.writeable else values.copy()
+    else:
+        array = _as_array(values, shape, what, dtype)
+    if shape not in (None, array.shape) and (
+        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
+    ):
+        raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
+    # three times as fast as all() on few numbers
+    if finite and array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():
+        raise InputError("E-ARRAY-NOT-FINITE", f"{what}: holds values that are not finite")
+    array.flags.writeable = False
+    return array
+
+
+def _as_array(values: ArrayLike, shape: Shape | None, what: str, dtype: DTypeLike) -> np.ndarray:
+    """Return a copy of values of any type."""
     _require_unmasked(values, what)
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")
@@ -224,16 +241,7 @@ def frozen(
         raise InputError("E-ARRAY-TYPE", f"{what}: {array.dtype} values; real numbers needed")
     if array.dtype.kind == "f" and np.dtype(dtype).kind in "iu" and (array != np.rint(array)).any():
         raise InputError("E-ARRAY-TYPE", f"{what}: fractions; whole numbers needed")
-    array = array.astype(dtype, copy=False)
-    if shape not in (None, array.shape) and (
-        array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
-    ):
-        raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
-    # three times as fast as all() on few numbers
-    if finite and array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():
-        raise InputError("E-ARRAY-NOT-FINITE", f"{what}: holds values that are not finite")
-    array.flags.writeable = False
-    return array
+    return array.astype(dtype, copy=False)
 
 
 def freeze(

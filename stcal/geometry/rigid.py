@@ -255,8 +255,7 @@ class Poses(_ByValue, Brief):
         freeze(self, "translation", (None, 3), "translations")
         freeze(self, "rotation", (len(self.translation), 3, 3), "rotations")
         r = self.rotation
-        left_handed = np.einsum("mi,mi->m", np.cross(r[:, 0], r[:, 1]), r[:, 2]) < 0
-        if len(r) and (left_handed.any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
+        if len(r) and ((np.linalg.det(r) < 0).any() or np.abs(r @ np.swapaxes(r, 1, 2) - np.eye(3)).max() > 1e-6):
             raise InputError(
                 "E-ROTATION-IMPROPER", "rotations: not proper rotation matrices; orthogonal with determinant +1 needed"
             )

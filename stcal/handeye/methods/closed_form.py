@@ -115,8 +115,9 @@ def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarr
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     # R_G R_X R_C = R_Z: Σ R_C ⊗ R_G maps vec R_X to k vec R_Z, both of one length. They are the first singular vectors.
     k = np.einsum("mab,mcd->madbc", hand.rotation, eye.rotation).reshape(len(loop), 9, 9)
-    u, _, vt = np.linalg.svd(k[subsets].sum(1))
-    z, x = u[:, :, 0].reshape(-1, 3, 3), vt[:, 0].reshape(-1, 3, 3)
+    total = k[subsets].sum(1)
+    first = np.linalg.eigh(np.swapaxes(total, 1, 2) @ total)[1][:, :, -1:]
+    z, x = (total @ first).reshape(-1, 3, 3), first.reshape(-1, 3, 3)
     sign = np.sign(np.linalg.det(x))[:, None, None]
     x, z = best_rotations(sign * x)[0], best_rotations(sign * z)[0]
     t_x, t_z, scale = _translations(loop, subsets, x, with_scale)
