@@ -109,6 +109,16 @@ class Rigid(_ByValue):
             object.__setattr__(self, "rotation", frozen(u @ vt))
 
     @classmethod
+    def _of(cls, rotation: np.ndarray, translation: np.ndarray) -> "Rigid":
+        """Return the transform of a product of rotations, which is one."""
+        made = object.__new__(cls)
+        object.__setattr__(made, "rotation", rotation)
+        object.__setattr__(made, "translation", translation)
+        rotation.flags.writeable = False
+        freeze(made, "translation", (3,), "translation")
+        return made
+
+    @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> "Rigid":
         """Return the transform of a 4×4 (or 3×4) homogeneous matrix; the rotation part is projected onto SO(3)."""
         m = frozen(matrix, what="rigid transform")
@@ -166,7 +176,7 @@ class Rigid(_ByValue):
 
     def inverse(self) -> "Rigid":
         """Return b_from_a."""
-        return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
+        return Rigid._of(self.rotation.T, -self.rotation.T @ self.translation)
 
     @overload
     def __matmul__(self, other: "Rigid") -> "Rigid": ...
@@ -175,7 +185,7 @@ class Rigid(_ByValue):
     def __matmul__(self, other):
         """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
         if isinstance(other, Rigid):
-            return Rigid(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+            return Rigid._of(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
         if isinstance(other, Similarity | Poses):
             return NotImplemented
         return np.asarray(other, float) @ self.rotation.T + self.translation

@@ -23,6 +23,8 @@ from stcal.robot.kinematics.model import DHRow, Robot
 Fit = frozenset[Literal["base", "tool"]]
 BOTH: Fit = frozenset(("base", "tool"))
 ROUNDS = 500
+SETTLED = 1e-5
+"""Largest predicted decrease of the last step, as a share of the squared misfit, which is compared with others."""
 REGULAR = 1e-10
 """Smallest damping. It keeps parameters that these positions leave open at their start, such as the point of a tool
 that never turned."""
@@ -239,6 +241,7 @@ def _base_and_points(
         linearise,
         lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
         least_damping=REGULAR,
+        settled=SETTLED,
         max_steps=ROUNDS,
     )
     minimum.required(
