@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import stcal
 from stcal.cli import options, terminal
-from stcal.cli.help import PANELS
+from stcal.cli.help import FIRST_WEEK, PANELS
 from stcal.cli.main import app, main
 from stcal.errors import lacks_memory
 from tests.commands import COMMANDS
@@ -142,19 +142,24 @@ def test_h_is_help():
         assert re.search(r"-h, --help +Show this message and exit\.", short.output), words
 
 
-def test_help_shows_every_option_once_and_first_what_most_calls_need():
+def test_help_shows_a_dozen_options_and_all_on_demand_each_once():
     used = set()
     for words, callback in COMMANDS.items():
-        shown = CliRunner().invoke(app, [*words.split(), "--help"]).output
-        listed = re.findall(r"^  (?:-\w, )?(--[\w-]+)", shown, flags=re.MULTILINE)
+        each = [CliRunner().invoke(app, [*words.split(), option]).output for option in ("--help", "--help-all")]
+        week, every = (re.findall(r"^  (?:-\w, )?(--[\w-]+)", shown, flags=re.MULTILINE) for shown in each)
+        assert len(week) <= 12, words
         options = [name for name in inspect.signature(callback).parameters if _is_option(callback, name)]
-        assert len(listed) == len(set(listed)) == len(options) + 1, words  # and --help
+        if "--help-all" not in week:  # nothing is left out
+            assert len(week) == len(set(week)) == len(options) + 1, words  # and --help
+            continue
+        assert len(every) == len(set(every)) == len(options) + 2, words
+        assert set(FIRST_WEEK[words]) <= {*options, *inspect.signature(callback).parameters}, words
+        needed = ["[required]" in entry for entry in each[0].partition("Options:")[2].split("\n  -")[1:]]
+        assert needed == sorted(needed, reverse=True), words
         used |= set(options)
-        titles = re.findall(r"^([A-Z].*):$", shown, flags=re.MULTILINE)
+        titles = re.findall(r"^([A-Z].*):$", each[1], flags=re.MULTILINE)
         assert titles == [t for t in ("Arguments", *PANELS, "Example", "Examples") if t in titles], words
     assert {name for names in PANELS.values() for name in names} <= used
-    shown = CliRunner().invoke(app, ["handeye", "--help"]).output
-    assert len(re.findall(r"^  --", shown[: shown.index("Output:")], flags=re.MULTILINE)) <= 10
 
 
 def _is_option(command, name: str) -> bool:

@@ -50,7 +50,7 @@ def commands() -> Iterator[tuple[str, str]]:
     root: Any = get_command(app)
     single = {name: each for name, each in root.commands.items() if not hasattr(each, "commands")}
     groups = {name: each for name, each in root.commands.items() if hasattr(each, "commands")}
-    rows = ["# Commands", "", "Made from the program; `--help` of each says the same.", ""]
+    rows = ["# Commands", "", "Made from the program; `--help-all` of each says the same.", ""]
     for name, group in groups.items():
         words = f"stcal {name}" if name != "sfm" else "stcal-sfm"
         text = [f"# {words}", "", str(group.help or "").strip(), ""]

@@ -1,5 +1,6 @@
-"""Help texts in plain form and full length. Options are sorted into panels, those that most calls need first."""
+"""Help texts in plain form, in two levels: what the first week needs, and all options, sorted into panels."""
 
+from copy import copy
 from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
@@ -65,8 +66,25 @@ def examples_of(path: str) -> list[str]:
     return [f"{path} {arguments}".rstrip() for arguments in EXAMPLES.get(words_of(path), ())]
 
 
+SHOW_ALL = "--help-all"
+
+
 class Command(TyperCommand):
-    """A command whose help has its options in panels, and examples."""
+    """A command whose help has what the first week needs, all options in panels on demand, and examples."""
+
+    def get_params(self, ctx) -> list[Any]:
+        """Returns the parameters, with that for all options."""
+        params, every = super().get_params(ctx), copy(self.get_help_option(ctx))
+        assert every is not None, "help is an option of all commands"
+        show: Any = every.callback
+
+        def show_all(ctx: Any, param: Any, wanted: bool) -> None:
+            ctx.meta[SHOW_ALL] = wanted
+            show(ctx, param, wanted)
+
+        every.name, every.opts, every.callback = "help_all", [SHOW_ALL], show_all
+        every.help = f"Show all {sum(each.param_type_name == 'option' for each in params) + 1} options and exit."
+        return [*params, every]
 
     def format_epilog(self, ctx, formatter) -> None:
         """Writes the examples, each on one line to copy."""
@@ -77,16 +95,20 @@ class Command(TyperCommand):
                 formatter.write("".join(f"  {line}\n" for line in examples))
 
     def format_options(self, ctx, formatter) -> None:
-        """Writes the arguments, and then the options panel by panel."""
-        arguments: list[tuple[str, str]] = []
-        panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
-        for param in self.get_params(ctx):
-            record = param.get_help_record(ctx)
-            if record is None:
+        """Writes the arguments, then the options: those that must be given come first."""
+        listed = FIRST_WEEK.get(words_of(ctx.command_path))
+        week = None if ctx.meta.get(SHOW_ALL) else listed
+        sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": [], **{panel: [] for panel in PANELS}}
+        params = self.get_params(ctx)
+        rank = {name: i for i, name in enumerate(week or ())}
+        for param in sorted(params, key=lambda each: (not each.required, rank.get(str(each.name), len(rank)))):
+            record = None if param.name == "help_all" and not listed else param.get_help_record(ctx)
+            own = getattr(param, "rich_help_panel", None)  # none of the two that show the help
+            if record is None or (week and own and param.param_type_name == "option" and param.name not in rank):
                 continue
-            is_argument = param.param_type_name == "argument"
-            (arguments if is_argument else panels[getattr(param, "rich_help_panel", None) or "Output"]).append(record)
-        for title, records in {"Arguments": arguments, **panels}.items():
+            panel = "Arguments" if param.param_type_name == "argument" else "Options" if week else own or "Output"
+            sections[panel].append(record)
+        for title, records in sections.items():
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)
@@ -159,6 +181,28 @@ EXAMPLES = {
     ),
 }
 """Arguments of typical calls of each command, by its words."""
+
+FIRST_WEEK = {
+    "sfm run": "out camera target board refine_camera board_only exclude every expect_faces verbose",
+    "sfm detect": "camera out target board exclude min_diameter max_diameter workers verbose",
+    "sfm simulate": "target board camera images width distance groups one_board png seed",
+    "sfm design": "size faces tags circles radius distance camera images bright",
+    "sfm plan": "camera target board images distance groups faces run out one_board",
+    "sfm measure": "camera faces out report board sequence joints live serve verbose",
+    "sfm budget": "page pdf statement check_lengths lengths lengths_statement field out strict verbose",
+    "register": "out report model method threshold first second robot_file overwrite verbose",
+    "robot axes": "robot_file out report rotation still_deg orientations overwrite verbose",
+    "robot identify": "robot_file out report model offsets observe adjust partial folds verbose",
+    "robot evaluate": "robot_files refit out report json_file payload_kg overwrite verbose",
+    "robot compensate": "robot_file nominal out report rotation payload_kg overwrite verbose",
+    "robot design": "robot_file count out report observe candidates sigma_mm box target seed",
+    "robot from-photos": "camera faces joints robot_file out targets target board model verbose",
+    "locate run": "layout camera out report hand_eye robot_poses registration offset method verbose",
+    "handeye": "poses camera board setup rotation length_unit method with_scale out report",
+    "handeye plan": "poses camera board setup robot_file count out rotation length_unit verbose",
+}
+FIRST_WEEK = {words: tuple(names.split()) for words, names in FIRST_WEEK.items()}
+"""Parameters that `--help` shows of commands with more than a dozen options, in their order."""
 
 GROUPS = {
     "stcal": {

@@ -108,7 +108,7 @@ class HandEyeOptions:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
     """Input of one call. ``pairs``, ``views`` : after repair of the numbering; ``guess`` : returns first X, Z and scale
-    of a loop and ``with_scale``; ``seen`` : observability; ``notes`` : notes so far."""
+    of a loop and ``with_scale``; ``seen`` : observability; ``notes`` : notes so far; ``part`` : of :func:`handeye`."""
 
     pairs: HandEyePoses
     loop: Loop
@@ -118,6 +118,7 @@ class _Task:
     guess: Guess
     seen: Observability
     notes: tuple[str, ...]
+    part: bool
 
     def only(self, rows: np.ndarray) -> "_Task":
         """Returns the task with these poses alone."""
@@ -141,11 +142,12 @@ def handeye(
     method: str | None = None,
     views: Views | None = None,
     options: HandEyeOptions | None = None,
+    part: bool = False,
 ) -> HandEye:
     """Returns the result of one method, with σ estimated from its own residuals; ``reprojection`` with views, else
     ``pose``, if None. Parameters and errors as for :func:`stcal.handeye.handeye`, which chooses a method and widens
-    σ."""
-    return solved(pairs, setup, method, views, options).result
+    σ. ``part`` : the poses are a part of others, of which conventions were judged."""
+    return solved(pairs, setup, method, views, options, part).result
 
 
 def solved(
@@ -154,6 +156,7 @@ def solved(
     method: str | None,
     views: Views | None,
     options: HandEyeOptions | None,
+    part: bool = False,
 ) -> "Solved":
     """Returns the result of :func:`handeye` with the state from which solutions without some poses start."""
     method = method or ("pose" if views is None else "reprojection")
@@ -172,7 +175,7 @@ def solved(
             "E-HANDEYE-NEEDS-VIEWS",
             f"hand-eye: {method} does not solve for the arm; give views, and method reprojection",
         )
-    task = _task(pairs, setup, views, options)
+    task = _task(pairs, setup, views, options, part)
     if method == "pose":
         return _by_poses(task)
     if method == "reprojection" and task.views is not None:
@@ -210,7 +213,7 @@ class Solved:
         return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
 
 
-def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions) -> _Task:
+def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions, part: bool) -> _Task:
     """Runs the checks that all methods share."""
     observability = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
     if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
@@ -225,8 +228,9 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
     if options.arm is None:
         pairs.require_moving_flange()
     loop, guess = Loop.of(pairs, setup), cache(partial(_guess, options, observability))
-    notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
-    return _Task(pairs, loop, setup, views, options, guess, observability, notes)
+    if not part:
+        notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
+    return _Task(pairs, loop, setup, views, options, guess, observability, notes, part)
 
 
 def _by_equations(task: _Task, method: str) -> HandEye:
@@ -448,6 +452,8 @@ def _remarks(
     task: _Task, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
 ) -> tuple[str, ...]:
     """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
+    if task.part:
+        return ()
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     z = closed_form.mean_pose(task.loop[~outliers].chain(x))
     tilted = flipped(task.loop, x, z, outliers)

@@ -195,7 +195,8 @@ def errors_without(
     if arm is not None:
         options = replace(options, arm=arm[remaining])
     try:
-        result = handeye(pairs[remaining], setup, method, None if views is None else views[remaining], options)
+        own_views = None if views is None else views[remaining]
+        result = handeye(pairs[remaining], setup, method, own_views, options, part=True)
     except DegenerateError as error:
         raise _without(pairs, out, error) from error
     unseen = pairs[out]

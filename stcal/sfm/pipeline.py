@@ -41,7 +41,7 @@ from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, plain_lens, unknown_lens
 from stcal.sfm.report.judgement import lost_groups
-from stcal.sfm.runs.folder import overlays_beside, write_run
+from stcal.sfm.runs.folder import overlays_beside, shown_if_failed, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -248,9 +248,12 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
         if model is None or (task.board.rows and is_rough(model, options)):
             model = _camera_of_dots(task, model)
         detection, labelled = labelled_images(task, model)
-    if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
-        _require_seen(task, labelled)
-    with overlays_beside(detection, labelled, target, task.folder, task.progress) as left_out:
+    with (
+        shown_if_failed(target.name, detection, labelled, task.folder),
+        overlays_beside(detection, labelled, target, task.folder, task.progress) as left_out,
+    ):
+        if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
+            _require_seen(task, labelled)
         shows_dots = any(isinstance(label, DotLabel) for image in labelled for label in image.observations.labels)
         if is_board_assumed and not options.board_only and not shows_dots:
             target = with_drawn_size(target, [image.observations.labels for image in labelled])

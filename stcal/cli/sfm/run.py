@@ -8,7 +8,7 @@ import typer
 from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, verbose, write, write_if
-from stcal.errors import ChecksFailed, InputError
+from stcal.errors import ChecksFailed, InputError, StcalError
 from stcal.io.files import keep_apart
 
 app = typer.Typer()
@@ -90,6 +90,7 @@ def run(
     from stcal.sfm.mapping.pairs import PairOptions
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.text import found_lines, run_text
+    from stcal.sfm.runs.transaction import is_finished
 
     options = RunOptions(
         solve=solve,
@@ -106,8 +107,13 @@ def run(
         exclude=tuple(exclude or ()),
         expect_faces=() if expect_faces is None else tuple(face.strip() for face in expect_faces.split(",")),
     )
-    with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
-        result = pipeline.run(images, camera, out, target, board, options, progress, every=every)
+    try:
+        with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as told:
+            result = pipeline.run(images, camera, out, target, board, options, told, every=every)
+    except StcalError as error:
+        if (page := out / "report.html").exists() and not is_finished(out):
+            error.append(f"; {page} shows the images")
+        raise
     if verbose():
         say("\n".join(found_lines(result.labelled)))
     say(run_text(result))

@@ -245,7 +245,8 @@ class OfTarget:
         """Returns planes, shapes and distances at a state; both cost and equations of it are asked for."""
         if self.last[0] is not values[CIRCLES]:
             xyz, setting = values[CIRCLES].array, self.setting
-            self.last = values[CIRCLES], *(list(each(xyz, setting)) for each in (planes, shapes, bars))
+            known = list(planes(xyz, setting)), list(shapes(xyz, setting)), list(bars(xyz, setting))
+            self.last = values[CIRCLES], *known
         return self.last[1:]
 
     def cost(self, values: Mapping[str, Any]) -> float:

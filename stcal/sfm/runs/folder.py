@@ -4,7 +4,7 @@ import contextlib
 import csv
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,9 +35,10 @@ from stcal.io.files import (
 )
 from stcal.io.json import checked, read_json
 from stcal.io.table import csv_rows
-from stcal.labels import Label
+from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
-from stcal.report.document import pdf_of, require_pdf
+from stcal.report.document import Document, Notes, Section, Table, macro, pdf_of, require_pdf
+from stcal.report.text import NONE, join
 from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectedImage, DetectionResult
@@ -45,13 +46,15 @@ from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
-from stcal.sfm.report.figures import Residuals, shown_overlays
+from stcal.sfm.report.figures import FIRST_IMAGES, Photograph, Photographs, Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
+from stcal.sfm.report.sections import Words
 from stcal.sfm.runs.output import report_of, residuals_px
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import AnyRun, SavedRun, folder_of, verify
+from stcal.sfm.runs.text import found_in_all
 from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
 
 LONGEST_NAME = 200
@@ -283,3 +286,60 @@ def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObse
         else image.centre_px
         for image in observations
     ]
+
+
+@contextlib.contextmanager
+def shown_if_failed(
+    name: str, detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder
+) -> Iterator[None]:
+    """Where the block fails, writes a page on why and what was found, and adds what most images have in common."""
+    try:
+        yield
+    except StcalError as error:
+        seen = found_in_all(labelled)
+        save(folder.stage / "report.html", _page(name, str(error), seen, detection, labelled, folder))
+        error.append(f"; {seen}")
+        raise
+
+
+def _page(
+    name: str,
+    error: str,
+    seen: str,
+    detection: DetectionResult,
+    labelled: Sequence[LabelledImage],
+    folder: RunFolder,
+) -> str:
+    rows, rest = [], max(len(labelled) - FIRST_IMAGES, 0)
+    for each in labelled:
+        image = each.observations
+        dots = sum(isinstance(label, DotLabel) for label in image.labels)
+        rows.append(
+            [image.name, join(sorted(image.face_ids())), len(image) - dots, dots, "; ".join(each.notes) or NONE]
+        )
+    sections = [
+        Section("What is wrong", [*error.split("; ")]),
+        Section(
+            "What was found", [seen, Table(["<Image", "<Faces", "Circles", "Dots", "<Left out"], rows, css="text")]
+        ),
+        Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
+        Section("Overlays", [macro("photographs", _photographs(detection, labelled, folder), rest, WORDS)]),
+    ]
+    answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
+    about = f"{len(labelled)} images, no calibrated target"
+    return Document(name, about, sections, [answer], f"{name}: no calibration").page()
+
+
+HEADS = ["<Image", "<Faces", "Circles", "Dots", "<Left out"]
+WORDS = Words("circle", True)
+
+
+def _photographs(detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder) -> Photographs:
+    """Returns the overlays, which lie beside the page."""
+    width, height = detection.camera.width, detection.camera.height
+    shown = []
+    for each in labelled[:FIRST_IMAGES]:
+        name = each.observations.name
+        place = overlay_path(folder.stage, name).relative_to(folder.stage).as_posix()
+        shown.append(Photograph(name, f"{len(each.observations)} named", place, ""))
+    return Photographs(tuple(shown), f"-0.5 -0.5 {width} {height}", round(width / height, 5), 0.0, 1.0, "", 0.0)

@@ -70,7 +70,7 @@ GONE = "gone.txt"
 """Names of the earlier results that complete ones lack."""
 RESULTS = tuple(name for name in RUN_ENTRIES if name != INTERNAL)
 """Entries that new results replace, or remove if the new results lack them."""
-LOOKED_AT = ("detections.csv", "overlays")
+LOOKED_AT = ("detections.csv", "overlays", "report.html")
 """Results of a run that fails which help to see why, and claim nothing."""
 LONGEST_DATABASE, MOST_DATABASE_BYTES = f"{STAGE}/scratch/mapping.db.partial-journal", 500
 """Longest path of a database below a run's folder, and the longest that SQLite takes (512, of which it keeps a few)."""
@@ -111,7 +111,7 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
     with _staged(out) as stage:
         if not (out / RUN_MARKER).exists():
             save(out / RUN_MARKER, json_text(content.content()))
-        earlier = _finished(out)
+        earlier = is_finished(out)
         try:
             yield RunFolder(out, stage, out / CACHE)
         except BaseException as error:
@@ -170,7 +170,7 @@ def _staged(out: Path) -> Iterator[Path]:
         lock.release()
 
 
-def _finished(out: Path) -> bool:
+def is_finished(out: Path) -> bool:
     """True if the folder holds the results of a run, or of a detection alone, that came to its end."""
     with suppress(InputError):
         if read_result(out / RUN_MARKER, MarkerFile, "run", "run it again").sha256 is not None:
