@@ -214,7 +214,7 @@ def budget(
 ) -> None:
     """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
     from stcal.report.document import pdf_of, require_pdf
-    from stcal.sfm.budget.page import uncertainty_budget
+    from stcal.sfm.budget.page import budget_in_brief, uncertainty_budget
     from stcal.sfm.budget.sources import fields_of
 
     if pdf and page is None:
@@ -224,11 +224,10 @@ def budget(
         require_pdf()
     fields = fields_of(field or ())
     result = uncertainty_budget(run, statement, fields, check_lengths, lengths, lengths_statement)
-    document = result.document()
-    say(document.text())
+    say(result.document().text() if verbose() else budget_in_brief(result.file))
     write_if(out, lambda: result.file, "as JSON")
     if page:
-        html = document.page()
+        html = result.document().page()
         write(page, html, "report")
         if pdf:
             write(page.with_suffix(".pdf"), pdf_of(html), "PDF")

@@ -25,9 +25,9 @@ from stcal.report.document import (
     tiles,
 )
 from stcal.report.svg import COLOURS, LETTER, SMALL, Axes, Drawing
-from stcal.report.text import NONE, number, significant
+from stcal.report.text import NONE, WIDTH, number, significant, text_table, wrapped
 from stcal.sfm.budget.combine import Budget, budget_of_run
-from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncertainty, refusals
+from stcal.sfm.budget.file import BudgetFile, FaceUncertainty, LengthTestPart, SourceRow, Uncertainty, refusals
 from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated, common_views
 from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run, verify
@@ -216,6 +216,46 @@ def budget_report(file: BudgetFile) -> Document:
             ),
         ],
     )
+
+
+MOST_FACES = 5
+"""Number of faces that the terminal shows, those with the largest uncertainty."""
+
+
+def budget_in_brief(file: BudgetFile) -> str:
+    """Returns the result in at most fifteen lines; :func:`budget_report` has all."""
+    k, images = file.coverage_factor, sum(each.images for each in file.views)
+    lines = [f"{Path(file.run.folder).name}: {images} photographs; faces against face {file.reference_face}; k = {k:g}"]
+    lines += _cut(f"May the run be used? {file.use}") if file.use else []
+    ranked = sorted(file.faces.items(), key=lambda each: -_of_face(each[1]).expanded)
+    shown = [(face, each.position_xyz_um or [], each.rotation_xyz_mdeg) for face, each in ranked[:MOST_FACES]]
+    rows = [[face, *(" ".join(significant(k * v) for v in each) for each in xyz)] for face, *xyz in shown]
+    lines += text_table([["<face", "U of x, y, z, µm", "U of rotation about x, y, z, mdeg"], *rows]) if rows else []
+    lines += [f"… and {len(ranked) - MOST_FACES} faces with less"] if len(ranked) > MOST_FACES else []
+    for each in file.distances[:1]:
+        length = as_exact(each.corrected_mm, 1e-3 * each.distance_um.expanded)
+        u = significant(each.distance_um.expanded)
+        lines.append(f"longest distance {name_of(each.circles)}: {length} mm, U {u} µm")
+    if ranked and (worst := _of_face(ranked[0][1])).standard:
+        shares = {row.title: (worst.contributions[row.key] / worst.standard) ** 2 for row in file.sources}
+        most = sorted((title for title in shares if shares[title] > IN_OTHERS), key=lambda title: -shares[title])
+        lines += _cut(f"from: {', '.join(f'{title} {shares[title]:.0%}' for title in most[:3])}")
+    for test in file.length_tests[:1]:
+        lines += _cut(f"lengths against {test.reference}: {verdict_of(test)}")
+    lines += _cut(_no_certificate(file)) if not certifies(file) and _is_valid(file) else []
+    lines += _cut(f"changed since the run: {', '.join(file.run.changed)}") if file.run.changed else []
+    return "\n".join([*lines, f"inputs, contributions and {len(file.notes)} notes: -v, or --report FILE.html"])
+
+
+def _of_face(each: FaceUncertainty) -> Uncertainty:
+    """Returns the uncertainty of a face's position, or rotation where no lengths are known."""
+    return each.position_um or each.rotation_mdeg
+
+
+def _cut(text: str) -> list[str]:
+    """Returns a sentence in two lines at most."""
+    lines = wrapped(text)
+    return lines if len(lines) <= 2 else [lines[0], f"{lines[1][: WIDTH - 2]} …"]
 
 
 def certifies(file: BudgetFile) -> bool:

@@ -245,7 +245,10 @@ def test_the_longest_distances_are_of_different_pairs_of_faces():
 def test_command(stcal_sfm, small_run, tmp_path):
     path, out = tmp_path / "lab.toml", tmp_path / "budget.json"
     path.write_text(STATEMENT)
-    code, text, _ = stcal_sfm("budget", small_run, "--statement", path, "--field", "instrument=X 5", "--json", out)
+    words = "--statement", path, "--field", "instrument=X 5", "--json", out
+    brief = stcal_sfm("budget", small_run, *words)[1].partition("\nas JSON")[0].splitlines()
+    assert (len(brief) <= 15, max(map(len, brief)) <= 100) == (True, True), brief
+    code, text, _ = stcal_sfm("budget", small_run, *words, "-v")
     assert code == 0
     assert all(shown in text for shown in ("operator: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
     file = json.loads(out.read_text())
@@ -271,9 +274,10 @@ def test_command(stcal_sfm, small_run, tmp_path):
 def test_a_changed_run_is_named(stcal_sfm, small_run, tmp_path):
     copy = own_copy(small_run, tmp_path / "run")
     (copy / "report.html").write_text("x")
-    code, text, _ = stcal_sfm("budget", copy)
-    assert code == 0
-    assert "note: the run's folder is not as the run left it: 1 changed (report.html)" in text
+    for more, told in ((), "changed since the run: report.html"), (("-v",), "left it: 1 changed (report.html)"):
+        code, text, _ = stcal_sfm("budget", copy, *more)
+        assert code == 0
+        assert told in text
 
 
 def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
@@ -285,7 +289,7 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     marker = MarkerFile.model_validate_json((copy / RUN_MARKER).read_text())
     sealed = marker.sealed(marker.sha256 | {"report.json": digest_of(copy / "report.json")})
     (copy / RUN_MARKER).write_text(json_text(sealed))
-    code, text, error = stcal_sfm("budget", copy)
+    code, text, error = stcal_sfm("budget", copy, "-v")
     assert (code, "--no-strict" in error) == (4, True)
     assert title in error or "No" in error
     assert title in text

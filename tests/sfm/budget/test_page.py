@@ -23,7 +23,7 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     statement.write_text(STATED)
     field = "operator=<b>A & B</b>"
     words = ("--statement", statement, "--field", field, "--lengths", small_run, "--report", page, "--pdf")
-    code, text, _ = stcal_sfm("budget", small_run, *words)
+    code, text, _ = stcal_sfm("budget", small_run, *words, "-v")
     assert code == 0
     html = page.read_text(encoding="utf-8")
     assert "&lt;b&gt;A &amp; B&lt;/b&gt;" in html
