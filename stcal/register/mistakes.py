@@ -237,7 +237,7 @@ def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
         return None
     from_middle = problem.xyz_a - problem.xyz_a.mean(0)
     by_parameters = jacobian(problem.model, transform, from_middle)
-    motions = jacobian(MODELS["rigid"], Rigid(_turn(transform)), from_middle)
+    motions = jacobian(MODELS["rigid"], Rigid(best_rotations(parts(transform)[0])[0]), from_middle)
     residuals, precision = problem.residuals(transform), problem.noise.precision
 
     def white(values: np.ndarray) -> np.ndarray:
@@ -250,11 +250,6 @@ def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
     rest = residuals - change.moves[:, None] * (motions @ change.motion)
     alike = [neighbours_alike(problem.xyz_a[change.good], each[change.good]) for each in (residuals, rest)]
     return None if all(alike) else change
-
-
-def _turn(transform: Transform) -> np.ndarray:
-    """Returns the rotation next to the linear part of a transform."""
-    return best_rotations(parts(transform)[0])[0]
 
 
 def order_note(change: Change, name: Callable[[int], str]) -> str:

@@ -323,7 +323,7 @@ def lag_tried(
         before, after = (handeye(each, setup, "pose", None, plain) for each in (pairs[lag.kept], shifted))
     except StcalError:  # the motions tell no offset
         return result, ()
-    fits = [float((_lengths(each) ** 2).mean()) for each in (before, after)]
+    fits = [float((np.linalg.norm(each.residuals[~each.outliers, 3:], axis=1) ** 2).mean()) for each in (before, after)]
     harmful = _shift(result, lag) > HARMFUL
     if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
@@ -384,11 +384,6 @@ def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> 
     step = -covariance @ (flat.T @ left)
     variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
     return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
-
-
-def _lengths(result: HandEye) -> np.ndarray:
-    """Returns the translation residuals (m,) of the poses that are no outliers, mm."""
-    return np.linalg.norm(result.residuals[~result.outliers, 3:], axis=1)
 
 
 def _shift(result: HandEye, lag: TimeOffset) -> float:

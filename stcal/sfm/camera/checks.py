@@ -77,7 +77,7 @@ def projection_sigma(result: Intrinsics) -> ProjectionSigma:
     camera = result.camera
     xy = image_grid(camera)
     jacobian = projection_jacobian(camera, result.colmap_model)
-    sigma = _sigma_px(jacobian, result.covariance)
+    sigma = np.sqrt(np.einsum("nip,pq,niq->n", jacobian, result.covariance, jacobian) / 2)
     middle = np.array([camera.width - 1, camera.height - 1]) / 2
     corners = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
     dots = np.concatenate([m.measured_px for m in result.models]) - middle
@@ -85,11 +85,6 @@ def projection_sigma(result: Intrinsics) -> ProjectionSigma:
     reach = np.minimum.reduce(dots[:, None] * corners / middle, axis=2).max(0)
     corner_index = [int(np.argmin(((xy - middle - corner * middle) ** 2).sum(1))) for corner in corners]
     return ProjectionSigma(xy, sigma, np.maximum(reach, 0), sigma[corner_index])
-
-
-def _sigma_px(jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Returns σ per axis (RMS over both axes), (n,)."""
-    return np.sqrt(np.einsum("nip,pq,niq->n", jacobian, covariance, jacobian) / 2)
 
 
 CELLS = (12, 8)
