@@ -95,6 +95,9 @@ class FacesFile(ResultFile):
         description="whether it was corrected; without it `solve` is `chain` and `frame` is `three-point`, as "
         "published, unless they are given"
     )
+    doubted: str = Field(
+        "", description="only where the run's answer is *no*: why; poses and σ do not hold until that is mended"
+    )
     target_from_face: dict[ByFace, Pose] = Field(description="frame of each face")
     circles: dict[ByLabel, Vector3] = Field(description="`face:circle` → centre, target frame, mm")
     radius_mm: dict[ByLabel, float] = Field(description="`face:circle` → radius of the design, mm")
@@ -134,8 +137,10 @@ class FacesFile(ResultFile):
         options: AdjustOptions,
         centre_sigma_factor: float,
         rim_mm: Mapping[CircleLabel, float] | None = None,
+        doubted: str = "",
     ) -> "FacesFile":
-        """File of a calibrated target, with covariances if it states them, and rims behind which it lies."""
+        """File of a calibrated target, with covariances if it states them, rims behind which it lies, and why not to
+        use it."""
         radius = design.radius_of()
         content: dict[str, Any] = {
             "format": "stcal faces 1",
@@ -146,6 +151,7 @@ class FacesFile(ResultFile):
             **({"surface": "luminous", "rim_mm": rim_mm} if rim_mm else {}),
             "eccentricity": options.eccentricity,
             **({"up_to_scale": True} if design.up_to_scale else {}),
+            **({"doubted": doubted} if doubted else {}),
             "target_from_face": target.target_from_face,
             "circles": target.circles,
             "radius_mm": {label: radius[label] for label in target.circles},

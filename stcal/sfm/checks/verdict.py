@@ -54,8 +54,14 @@ class Measured:
     def words(self) -> str:
         """Returns value and limit as text."""
         unit = f" {self.unit}" if self.unit else ""
-        limit = "" if self.limit is None else f", limit {self.limit:.3g}"
-        return f"{self.value:.3g}{unit}{limit}"
+        limit = "" if self.limit is None else f", limit {_digits(self.limit)}"
+        return f"{_digits(self.value)}{unit}{limit}"
+
+
+def _digits(value: float) -> str:
+    """Returns a value to three digits, a large one without an exponent."""
+    text = f"{value:.3g}"
+    return f"{float(text):.0f}" if "e+" in text else text
 
 
 @dataclass(frozen=True, slots=True, repr=False)

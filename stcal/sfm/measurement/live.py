@@ -200,9 +200,14 @@ def rows_of(pose: TargetPose) -> list[list[str]]:
 
 
 def line_of(content: dict) -> str:
-    """Returns one line for the terminal: number, status, pose and rate of a picture."""
-    what = "  ".join(f"{name} {value}" for name, value in content["shown"] if name != "circles") or content["reason"]
-    return f"picture {content['picture']}: {content['status']}: {what}  ({content['rate']:.1f} a second)"
+    """Returns one line for the terminal: number, status, pose and rate of a picture; the page has σ."""
+    values = {name: value.partition(" ± ")[0] for name, value in content["shown"]}
+    what = content["reason"]
+    if values:
+        place, turn = (" ".join(values[f"{kind}{axis}"] for axis in "xyz") for kind in ("", "turn about "))
+        what = f"faces {content['shown'][0][1].replace(' ', '')}  {place} mm  {turn}°"
+    line = f"picture {content['picture']}: {content['status']}: {what}"
+    return f"{line[:82]}{' …' * (len(line) > 82)}  ({content['rate']:.1f} a second)"
 
 
 def drawn(frame: np.ndarray, centres_px: np.ndarray, pose: TargetPose | None, tracker: Tracker) -> np.ndarray:

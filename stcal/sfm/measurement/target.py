@@ -116,6 +116,8 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
         covariance, notes = _covariance(labels, _joint(faces, labels), faces.circle_covariance_mm2)
         if faces.centre_sigma_factor is None:
             notes += ("faces.json states no centre_sigma_factor: the centres' own σ are used; run it again",)
+        if faces.doubted:
+            notes += (f"the run that made faces.json must not be used: {faces.doubted} Mend that, and run again",)
         factor = 1.0 if faces.centre_sigma_factor is None else faces.centre_sigma_factor
         target = TargetCircles(labels, xyz, radius, covariance, factor, notes, design)
     except (InputError, DegenerateError, LookupError, TypeError, ValueError, AttributeError) as error:

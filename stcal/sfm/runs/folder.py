@@ -131,15 +131,17 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     if result.board_design.rows:
         save_run_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
+    judgement = Judgement.model_validate(report["judgement"])
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
-        faces = FacesFile.of(result.target, result.target_design, options, factor, result.calibration.rim_mm)
+        doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
+        faces = FacesFile.of(result.target, result.target_design, options, factor, rims, doubted)
         save(out / "faces.json", json_text(faces.content()))
         require_faces_written(out / "faces.json", result.target)
     write_report(out, report, out)
     (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
     progress("report", 1, 1)
-    return Judgement.model_validate(report["judgement"])
+    return judgement
 
 
 def write_report(out: Path, report: dict, run: Path) -> None:

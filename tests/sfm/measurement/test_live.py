@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 import sys
 import zlib
 from importlib import import_module
@@ -130,9 +131,10 @@ def test_each_message_has_a_picture_with_its_pose_or_the_reason_why_not(tracker,
     first, dark, _ = contents
     assert first["poses"]["images"][0]["image"] == "picture 1"
     assert len(first["poses"]["images"][0]["circles"]) == int(dict(first["shown"])["circles"])
-    assert "mm" in line_of(first)
+    assert re.search(r"faces [\d,]+( +-?[\d.]+){3} mm( +-?[\d.]+){3}°  \([\d.]+ a second\)$", line_of(first))
     assert "face" in dark["reason"]
-    assert dark["reason"] in line_of(dark)
+    assert dark["reason"][:40] in line_of(dark)
+    assert len(line_of(dark)) <= 100
     last, end = TestClient(service.app, f"http://{OWN}").get("/events").text.split("\n\n")[:2]
     assert json.loads(last.removeprefix("data: ")) == service.newest
     assert end.startswith("event: ended")

@@ -8,6 +8,7 @@ import pytest
 
 from stcal.io.images import chosen_images
 from stcal.sfm.checks.verdict import Check, ranked
+from stcal.sfm.measurement.target import read_target
 from stcal.sfm.report.judgement import _first
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error, fails_with
@@ -53,7 +54,8 @@ def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_
     outcome = stcal_sfm(*small.arguments(*files(small)))
     line = assert_error(outcome, CHECKS_FAILED, "E-CHECKS-FAILED", "may I use it? No", "--no-strict", "see")
     assert line.endswith(str(small.out / "report.html"))
-    assert (small.out / "faces.json").exists()
+    doubted = read_target(small.out / "faces.json", load_run(small.out).target_design).notes
+    assert any("must not be used: No: " in note for note in doubted), doubted
 
     code, out, _ = stcal_sfm(*small.arguments(*files(small), "--exclude", STRAY))
     assert code == 0
@@ -63,6 +65,7 @@ def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_
     assert [(each["name"], each["gate"]) for each in report["left_out"]["files"]] == [(STRAY, "excluded")]
     assert STRAY not in {each["name"] for each in report["images"]}
     assert load_run(small.out).options.exclude == (STRAY,)
+    assert not load_run(small.out).faces.doubted
     assert small.image(2).exists()
 
 
