@@ -204,7 +204,9 @@ def line_of(content: dict) -> str:
     values = {name: value.partition(" ± ")[0] for name, value in content["shown"]}
     what = content["reason"]
     if values:
-        place, turn = (" ".join(values[f"{kind}{axis}"] for axis in "xyz") for kind in ("", "turn about "))
+        place, turn = (
+            " ".join(f"{float(values[f'{kind}{axis}']):.2f}" for axis in "xyz") for kind in ("", "turn about ")
+        )
         what = f"faces {content['shown'][0][1].replace(' ', '')}  {place} mm  {turn}°"
     line = f"picture {content['picture']}: {content['status']}: {what}"
     return f"{line[:82]}{' …' * (len(line) > 82)}  ({content['rate']:.1f} a second)"
