@@ -41,7 +41,7 @@ def test_the_reference_board_is_said_and_named_in_an_error(stcal_sfm, two_images
 
 
 @pytest.mark.slow
-def test_measure_and_calibrate_camera_name_what_they_assumed(stcal_sfm, small_set, small_run, tmp_path):
+def test_measure_calibrate_camera_and_plan_name_what_they_assumed(stcal_sfm, small_set, small_run, tmp_path):
     small = small_set("12", detected=False)
     for i in (1, 2, 3):
         small.image(i).unlink()
@@ -62,13 +62,8 @@ def test_measure_and_calibrate_camera_name_what_they_assumed(stcal_sfm, small_se
     assert "no --target: " in out
     assert TARGET_ASSUMED not in out
     assert "reference board" not in out
-
-
-def test_plan_names_what_it_assumed(stcal_sfm):
-    code, out, _ = stcal_sfm("plan", "--images", 2, "--width", 1296, "--groups", "12")
-    assert code == 0
-    assert TARGET_ASSUMED in out
-    assert BOARD_ASSUMED in out
+    out = stcal_sfm("plan", "--images", 2, "--width", 1296, "--groups", "12")[1]
+    assert (TARGET_ASSUMED in out, BOARD_ASSUMED in out) == (True, True)
 
 
 def test_images_tell_the_pitch(small_result):
