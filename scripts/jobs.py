@@ -2,8 +2,8 @@
 
 .venv/bin/python scripts/jobs.py [style] [types] [site] [wheel] -- [arguments of pytest]
 
-Tests run in one process more than there are cores, as some wait, and print as they go. The named jobs follow each other
-beside them; what a job prints is shown where it failed.
+Tests use all cores and print as they go. The named jobs follow each other beside them; what a job prints is shown where
+it failed.
 """
 
 import os
@@ -26,7 +26,7 @@ COMMANDS = {
     "types": f'NODE_OPTIONS="${{NODE_OPTIONS:-}} --max-semi-space-size=128" {PROGRAMS}/basedpyright',
     "site": f"{PYTHON} scripts/build_site.py",
     "wheel": "scripts/try_wheel",
-    "tests": f"{PYTHON} -m pytest -n {(os.cpu_count() or 1) + 1} --dist worksteal",
+    "tests": f"{PYTHON} -m pytest -n {os.cpu_count() or 1} --dist worksteal",
 }
 
 

@@ -8,7 +8,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, Brief, freeze, require_fields
+from stcal.geometry.arrays import Array, Brief, ByValue, freeze, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, dot_cells
 from stcal.lengths import Length, radius, require_millimetres, side
@@ -33,7 +33,7 @@ DOTS_SIGMA_MM = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FaceDesign(Brief):
+class FaceDesign(ByValue, Brief):
     """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
     Parameters
@@ -132,7 +132,7 @@ class KnownDistance:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class TargetDesign(Brief):
+class TargetDesign(ByValue, Brief):
     """Target: its faces, and whether its circles are brighter or darker than their surroundings.
 
     Parameters
@@ -257,7 +257,7 @@ class StatedSize:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BoardDesign:
+class BoardDesign(ByValue):
     """Board with a rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
 
     Parameters

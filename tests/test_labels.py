@@ -28,9 +28,7 @@ def test_a_label_is_text_in_every_other_respect():
     assert json.dumps({labels[0]: labels}) == '{"board:0:1": ["board:0:1", "1:a", "1:1"]}'
     assert f"{labels}" == "('board:0:1', '1:a', '1:1')"  # by which the cache knows its inputs
     for again in (pickle.loads(pickle.dumps(labels)), copy.deepcopy(labels)):
-        assert again == labels
-        assert again[0].column == 1
-        assert again[1].circle == "a"
+        assert (again, again[0].column, again[1].circle) == (labels, 1, "a")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.arrays import Array, freeze, frozen, require_arguments, require_fields
+from stcal.geometry.arrays import Array, ByValue, freeze, frozen, require_arguments, require_fields
 
 MAX_NEWTON_STEPS = 50
 COEFFICIENTS = 12
@@ -52,7 +52,7 @@ LEAST_SHARE_OF_SIDE = 0.015
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera:
+class Camera(ByValue):
     """A central camera with OpenCV's lens model and perspective or equidistant projection.
 
     Perspective: the ideal point (x, y) = (X, Y) / Z is distorted by OpenCV's rational model with thin prisms (its first
@@ -371,11 +371,12 @@ class Camera:
         return self.undistort((np.asarray(xy_px, float) - self.centre) / self.focal)
 
     def project(self, xyz_camera: ArrayLike) -> np.ndarray:
-        """Return the pixels (..., 2) of points (..., 3) in the camera frame."""
+        """Return the pixels (..., 2) of points (..., 3) in the camera frame; NaN of points that are not before it."""
         xyz = np.asarray(xyz_camera, float)
         if xyz.shape[-1:] != (3,):
             raise InputError("E-ARRAY-SHAPE", f"camera: points of shape {xyz.shape}; (..., 3) needed")
-        return self.pixel_from_normalised(xyz[..., :2] / xyz[..., 2:])
+        depth = np.where(xyz[..., 2:] > 0, xyz[..., 2:], np.nan)
+        return self.pixel_from_normalised(xyz[..., :2] / depth)
 
 
 def _equidistant(xy: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ translation (mm), left perturbation in the outer frame.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from itertools import permutations, product
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import MYPY, Array, Brief, freeze, frozen
+from stcal.geometry.arrays import MYPY, Array, Brief, ByValue, freeze, frozen
 
 Order = Literal["wxyz", "xyzw"]
 """Order of a quaternion's components. For tables ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the
@@ -52,22 +52,6 @@ def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
     )
 
 
-class _ByValue:
-    """Equality of transforms whose numbers are the same to the last bit."""
-
-    __slots__ = ()
-
-    def _values(self) -> tuple:
-        parts = [getattr(self, entry.name) for entry in fields(self)]  # pyright: ignore[reportArgumentType]
-        return tuple(part._values() if isinstance(part, _ByValue) else np.asarray(part).tolist() for part in parts)
-
-    def __eq__(self, other: object) -> bool:
-        return self._values() == other._values() if type(other) is type(self) else NotImplemented
-
-    def __hash__(self) -> int:
-        return hash(repr(self._values()).replace("-0.0", "0.0"))
-
-
 if TYPE_CHECKING and not MYPY:
 
     class Turn(Array):
@@ -80,7 +64,7 @@ else:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rigid(_ByValue):
+class Rigid(ByValue):
     """A rigid transform a_from_b: ``xyz_a = rotation @ xyz_b + translation``.
 
     Parameters
@@ -196,7 +180,7 @@ class Rigid(_ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Similarity(_ByValue):
+class Similarity(ByValue):
     """A similarity a_from_b: ``xyz_a = scale * rotation @ xyz_b + translation``.
 
     COLMAP's world has no unit; a transform out of it is a Similarity, so that forgetting the scale is a type error.
@@ -242,7 +226,7 @@ class Similarity(_ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Poses(_ByValue, Brief):
+class Poses(ByValue, Brief):
     """A stack of m transforms a_from_b.
 
     Parameters
@@ -368,7 +352,7 @@ class Poses(_ByValue, Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Affine(_ByValue):
+class Affine(ByValue):
     """An affine transform a_from_b of twelve parameters.
 
     Parameters

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, InputNote
-from stcal.geometry.arrays import require_fields
+from stcal.geometry.arrays import ByValue, require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
     COLMAP_PIXEL_ORIGIN,
@@ -38,7 +38,7 @@ OF_IMAGES = "the images"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraModel:
+class CameraModel(ByValue):
     """A camera as its file states it.
 
     ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, with OpenCV's pixel origin;
@@ -101,7 +101,7 @@ def model_of(camera: Camera, source: str = "camera") -> CameraModel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraPrior:
+class CameraPrior(ByValue):
     """A prior of the intrinsics, as :func:`stcal.camera_prior` returns it.
 
     Parameters
