@@ -293,16 +293,12 @@ class Solution:
 
         A kept block stands in it twice.
         """
-        by = np.eye(self.kept)[self.places[block.name]] if not block.eliminate else self._by_kept()
+        by = self._each[block.name].reshape(-1, self.kept)
         mixed = by @ self.inverse
         own = mixed @ by.T
         if block.eliminate:
             own += block_diagonal(self.reduction.inverse)
         return np.block([[self.inverse, mixed.T], [mixed, own]])
-
-    def _by_kept(self) -> np.ndarray:
-        """Return how eliminated unknowns (m·a, k) go with the kept ones."""
-        return -self.reduction.from_kept.reshape(-1, self.kept)
 
     def by_clusters(self, block: Block) -> ByClusters:
         """Return the covariance of a kept block by how the clusters of observations differ."""
@@ -335,7 +331,7 @@ class Solution:
         return ways
 
     @cached_property
-    def _alone(self) -> dict[str, np.ndarray]:
+    def _each(self) -> dict[str, np.ndarray]:
         """The ways of each kept unknown by itself."""
         return self._ways(np.eye(self.kept))
 
@@ -346,7 +342,7 @@ class Solution:
         for rows in self.rows:
             if rows.factor.cluster is None or not (own := rows.factor.cluster == cluster).any():
                 continue
-            totals.append(rows.total(self._alone)[own].reshape(-1, self.kept))
+            totals.append(rows.total(self._each)[own].reshape(-1, self.kept))
             residuals.append(rows.residual[own].ravel())
             by_dropped = np.zeros((*rows.residual[own].shape, *dropped))
             for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
@@ -368,7 +364,7 @@ class Solution:
         left = 0.0
         for rows in self.rows:
             if kind in (None, rows.factor.kind):
-                total = rows.total(self._alone)
+                total = rows.total(self._each)
                 taken = float(((total @ self.inverse) * total).sum())
                 for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
                     if block.eliminate:
@@ -398,7 +394,7 @@ class Solution:
             own = raw / sigma * np.sqrt(rows.weight)[:, None, None]
             normal += np.einsum("rwp,rwq->pq", own, own)
             right -= np.einsum("rwp,rw->p", own, rows.residual)
-            mixed += np.einsum("rwp,rwk->pk", own, rows.total(self._alone))
+            mixed += np.einsum("rwp,rwk->pk", own, rows.total(self._each))
             for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
                 if block.eliminate:
                     np.add.at(by_dropped, numbers(index, slope), np.swapaxes(slope, 1, 2) @ own)

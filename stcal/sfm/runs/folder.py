@@ -38,7 +38,7 @@ from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
 from stcal.report.document import Document, Notes, Section, Table, macro, pdf_of, require_pdf
-from stcal.report.text import NONE, join
+from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectedImage, DetectionResult
@@ -316,14 +316,12 @@ def _page(
     for each in labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
-        rows.append(
-            [image.name, join(sorted(image.face_ids())), len(image) - dots, dots, "; ".join(each.notes) or NONE]
-        )
+        rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
+    left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
-        Section(
-            "What was found", [seen, Table(["<Image", "<Faces", "Circles", "Dots", "<Left out"], rows, css="text")]
-        ),
+        Section("What was found", [seen, Table(HEADS, rows)]),
+        Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
         Section("Overlays", [macro("photographs", _photographs(detection, labelled, folder), rest, WORDS)]),
     ]
@@ -332,8 +330,8 @@ def _page(
     return Document(name, about, sections, [answer], f"{name}: no calibration").page()
 
 
-HEADS = ["<Image", "<Faces", "Circles", "Dots", "<Left out"]
-WORDS = Words("circle", True)
+HEADS = ["<Image", "<Faces", "Points", "Dots"]
+WORDS = Words("point", True)
 
 
 def _photographs(detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder) -> Photographs:
