@@ -22,7 +22,6 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise
 from stcal.handeye.data.pairs import SETUPS, Loop
 from stcal.handeye.data.views import Views, pairs_of_views
-from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
 from stcal.handeye.solve import handeye
@@ -128,9 +127,8 @@ def corner_bound(exact: Truth, noise: Noise) -> np.ndarray:
     """Inverse information (6, 6) on X of corners; Z, robot and board unknown but for their σ."""
     flange = exact.pairs.base_from_flange
     corners, _ = problem(Loop.of(exact.pairs, exact.setup), flange, exact.views, noise)
-    x, z = exact.mount_from_camera, exact.stand_from_board
-    state = Bundle(x, z, flange, corners.xyz_board, exact.views.camera)
-    return np.linalg.inv(corners.linear(state).normal)[:6, :6]
+    start = corners.start(exact.mount_from_camera, exact.stand_from_board, 1.0)
+    return corners.problem().at(start).inverse[:6, :6]
 
 
 @one_thread()

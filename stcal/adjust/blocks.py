@@ -109,26 +109,37 @@ class Factor:
     derivatives: Callable[..., Sequence[np.ndarray]] | None
     on: tuple[tuple[Block, np.ndarray | None], ...]
     root: np.ndarray
-    kind: str
+    kind: str | tuple[str, ...]
     cluster: np.ndarray | None
     loss: Huber
     order: dict[tuple[int, int], Any] = field(default_factory=dict)  # in which products are summed, by pair of blocks
 
-    def white(self, values: Mapping[str, Any], sigma: float) -> np.ndarray:
-        """Return the residuals (r, w) over their σ."""
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of its residuals."""
+        return (self.kind,) if isinstance(self.kind, str) else self.kind
+
+    def white(self, values: Mapping[str, Any], sigma: Mapping[str, float]) -> np.ndarray:
+        """Return the residuals (r, w) over their σ; ``sigma`` : factor on that of each kind."""
         raw = np.asarray(self.residuals(*(values[block.name] for block, _ in self.on)))
         return self._whitened(raw, sigma)
 
-    def slopes(self, values: Mapping[str, Any], sigma: float) -> list[np.ndarray]:
+    def slopes(self, values: Mapping[str, Any], sigma: Mapping[str, float]) -> list[np.ndarray]:
         """Return the derivatives (r, w, dim) of the residuals over σ, by each block."""
         own = [values[block.name] for block, _ in self.on]
         raw = self.derivatives(*own) if self.derivatives else self._numerical(own)
         return [self._whitened(np.asarray(each), sigma) for each in raw]
 
-    def _whitened(self, raw: np.ndarray, sigma: float) -> np.ndarray:
+    def over(self, raw: np.ndarray, sigma: Mapping[str, float]) -> np.ndarray:
+        """Return residuals (r, w) or derivatives (r, w, k) over the factors on their σ."""
+        if isinstance(self.kind, str):
+            return raw / sigma.get(self.kind, 1.0)
+        return raw / np.array([sigma.get(kind, 1.0) for kind in self.kind]).reshape(-1, *[1] * (raw.ndim - 2))
+
+    def _whitened(self, raw: np.ndarray, sigma: Mapping[str, float]) -> np.ndarray:
         if self.root.ndim < 3:
-            return raw * (self.root / sigma).reshape(*self.root.shape, *[1] * (raw.ndim - self.root.ndim))
-        return (self.root @ (raw if raw.ndim == 3 else raw[..., None])).reshape(raw.shape) / sigma
+            return self.over(raw * self.root.reshape(*self.root.shape, *[1] * (raw.ndim - self.root.ndim)), sigma)
+        return self.over((self.root @ (raw if raw.ndim == 3 else raw[..., None])).reshape(raw.shape), sigma)
 
     def _numerical(self, own: list[Any]) -> list[np.ndarray]:
         """Return central differences: a row depends on one member, so that all members are moved at once."""

@@ -6,9 +6,9 @@ members that no row ties to one another are eliminated (Schur complement), so th
 others alone.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,10 +16,12 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Values, numbers
+from stcal.adjust.components import Components, Equations
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise
 from stcal.geometry.normal_equations import (
+    TINY,
     Reduction,
     blocks_of,
     constrained_inverse,
@@ -32,7 +34,8 @@ HELD = 1e-14
 """Share of an eliminated member's information that is added, so that one which its rows do not determine stays."""
 LEFT = 1e-9
 """Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
-TINY = 1e-300
+LOOSE = 1e-10
+"""Share of each unknown's information that is added where σ are sought, so that undetermined ones do no harm."""
 AT_ONCE = 10_000
 """Number of rows whose derivatives are multiplied at once; it bounds the memory."""
 
@@ -89,7 +92,7 @@ class Adjustment:
         sigma: float | np.ndarray = 1.0,
         derivatives: Callable[..., Sequence[np.ndarray]] | None = None,
         root: np.ndarray | None = None,
-        kind: str = "",
+        kind: str | Sequence[str] = "",
         cluster: np.ndarray | None = None,
         loss: Huber | None = None,
     ) -> None:
@@ -102,14 +105,15 @@ class Adjustment:
         sigma : σ of the rows, a number, (r,) or (r, w)
         derivatives : returns the derivatives (r, w, dim) of the residuals by each block; numerical ones if None
         root : (r, w, w) matrices that whiten the rows, in place of ``sigma``
-        kind : name of the σ that the rows share, which :meth:`Solution.component` tells; it is multiplied by
-            ``self.sigma[kind]``, 1 where that has none
+        kind : name of the σ that the rows share, or (w,) one of each column, which :meth:`Solution.component` tells; it
+            is multiplied by ``self.sigma[kind]``, 1 where that has none
         cluster : (r,) number of the photograph, or other unit, whose errors may be common
         loss : loss of the rows' lengths over σ; squares if None
         """
         whiten = 1 / np.asarray(sigma, float) if root is None else root
+        kinds = kind if isinstance(kind, str) else tuple(kind)
         ends = tuple((block, None if rows is None else np.asarray(rows)) for block, rows in on)
-        self.factors.append(Factor(residuals, derivatives, ends, whiten, kind, cluster, loss or Huber()))
+        self.factors.append(Factor(residuals, derivatives, ends, whiten, kinds, cluster, loss or Huber()))
 
     def prior(self, block: Block, mean: np.ndarray, weight: np.ndarray) -> None:
         """Add knowledge of a kept :class:`Vector` block: ``mean`` (n, dim), and ``weight`` (n·dim, n·dim) over σ²."""
@@ -145,7 +149,7 @@ class Adjustment:
         total = 0.0
         for factor in self.factors:
             with np.errstate(all="ignore"):
-                white = factor.white(values, self.sigma.get(factor.kind, 1.0))
+                white = factor.white(values, self.sigma)
             if not np.isfinite(white).all():
                 return np.inf
             total += float(factor.loss.cost(np.sqrt((white**2).sum(1))).sum())
@@ -218,44 +222,52 @@ class Solution:
         """Whitened and weighted rows of all factors."""
         return [Rows.of(factor, self) for factor in self.problem.factors]
 
+    def equations(self, kinds: Collection[str] | None = None) -> Equations:
+        """Return the equations of the residuals of some kinds, or of all, without prior knowledge."""
+        dropped = self.dropped
+        sums = Equations.nothing(self.kept, (len(dropped.start), dropped.start.dim) if dropped else (0, 1))
+        square, count = 0.0, 0
+        for rows in self._of(kinds):
+            rows.add(sums)
+            square, count = square + float((rows.residual**2).sum()), count + rows.residual.size
+        return replace(sums, square=square, count=count)
+
+    def _of(self, kinds: Collection[str] | None) -> "list[Rows]":
+        """Return the residuals of some kinds, or all."""
+        return self.rows if kinds is None else [own for rows in self.rows if (own := rows.of_kinds(kinds))]
+
     @cached_property
-    def _equations(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Normal matrix and right side of kept unknowns; blocks, right sides and mixed parts of the eliminated ones."""
-        k, dropped = self.kept, self.dropped
-        m, a = (len(dropped.start), dropped.start.dim) if dropped else (0, 1)
-        normal, right = np.zeros((k, k)), np.zeros(k)
-        block, block_right, cross = np.zeros((m, a, a)), np.zeros((m, a)), np.zeros((m, a, k))
-        for rows in self.rows:
-            rows.add(normal, right, (block, block_right, cross))
+    def _all(self) -> Equations:
+        """Equations of everything; fixed unknowns do not move."""
+        sums = self.equations()
         for prior in self.problem.priors:
             at = self.places[prior.block.name]
             of_prior, pull = prior.equations(self.values)
-            normal[at, at] += of_prior
-            right[at] += pull
+            sums.normal[at, at] += of_prior
+            sums.right[at] += pull
         held = np.concatenate(
             [np.repeat(b.fixed, b.start.dim) for b in self.problem.blocks if not b.eliminate] or [np.zeros(0, bool)]
         )
-        normal[held], normal[:, held], right[held] = 0.0, 0.0, 0.0  # of priors
-        normal[held, held] = 1.0
-        own = np.einsum("mii->mi", block)
+        sums.normal[held], sums.normal[:, held], sums.right[held] = 0.0, 0.0, 0.0  # of priors
+        sums.normal[held, held] = 1.0
+        own = np.einsum("mii->mi", sums.block)
         own[:] = np.where(own > 0, (1 + HELD) * own, 1.0)  # 1: fixed members, and what no row depends on
-        return normal, right, block, block_right, cross
+        return sums
 
     @cached_property
     def reduction(self) -> Reduction:
         """Elimination of the block that is not kept."""
-        _, _, block, block_right, cross = self._equations
-        return reduce(block, block_right, cross)
+        return reduce(self._all.block, self._all.block_right, self._all.cross)
 
     @cached_property
     def normal(self) -> np.ndarray:
         """Normal matrix (k, k) of the kept unknowns, the others eliminated."""
-        return self._equations[0] - self.reduction.normal
+        return self._all.normal - self.reduction.normal
 
     @cached_property
     def right(self) -> np.ndarray:
         """Right side (k,) of the kept unknowns: minus half the gradient of the cost."""
-        return self._equations[1] - self.reduction.right
+        return self._all.right - self.reduction.right
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Return the step of kept, then eliminated unknowns, damped for the kept ones, and its predicted gain."""
@@ -362,15 +374,14 @@ class Solution:
     def redundancy(self, kind: str | None = None) -> float:
         """Return the redundancy of the rows of one kind, or of all."""
         left = 0.0
-        for rows in self.rows:
-            if kind in (None, rows.factor.kind):
-                total = rows.total(self._each)
-                taken = float(((total @ self.inverse) * total).sum())
-                for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
-                    if block.eliminate:
-                        inverse = self.reduction.inverse[numbers(index, slope)]
-                        taken += float(((slope @ inverse) * slope).sum())
-                left += rows.residual.shape[1] * np.count_nonzero(rows.weight) - taken
+        for rows in self._of(None if kind is None else (kind,)):
+            total = rows.total(self._each)
+            taken = float(((total @ self.inverse) * total).sum())
+            for (block, index), slope in zip(rows.factor.on, rows.slopes, strict=True):
+                if block.eliminate:
+                    inverse = self.reduction.inverse[numbers(index, slope)]
+                    taken += float(((slope @ inverse) * slope).sum())
+            left += rows.residual.shape[1] * np.count_nonzero(rows.weight) - taken
         return left
 
     def component(self, kind: str) -> float:
@@ -378,6 +389,15 @@ class Solution:
         own = [rows for rows in self.rows if rows.factor.kind == kind]
         square = sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in own)
         return float(np.sqrt(square / max(self.redundancy(kind), 1.0)))
+
+    def components(self, kinds: Sequence[str], caution: float | np.ndarray = 0.0) -> Components:
+        """Return what all residuals tell together about the σ of some ``kinds``, those of the others being known.
+
+        ``caution`` : redundancy of each kind that is not counted. Prior knowledge must be factors.
+        """
+        others = {kind for factor in self.problem.factors for kind in factor.kinds} - set(kinds)
+        each = [self.equations((kind,)) for kind in kinds]
+        return Components(each, self.equations(others), caution=caution, held=LOOSE)
 
     def score(self, columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return normal matrix (p, p) and right side (p,) of further unknowns, all others adjusted.
@@ -390,8 +410,7 @@ class Solution:
         dropped = self.reduction.step.shape
         by_dropped, inverse = np.zeros((*dropped, p)), self.reduction.inverse
         for rows, raw in zip(self.rows, columns, strict=True):
-            sigma = self.problem.sigma.get(rows.factor.kind, 1.0)
-            own = raw / sigma * np.sqrt(rows.weight)[:, None, None]
+            own = rows.factor.over(raw, self.problem.sigma) * np.sqrt(rows.weight)[:, None, None]
             normal += np.einsum("rwp,rwq->pq", own, own)
             right -= np.einsum("rwp,rw->p", own, rows.residual)
             mixed += np.einsum("rwp,rwk->pk", own, rows.total(self._each))
@@ -561,7 +580,7 @@ class Rows:
     @classmethod
     def of(cls, factor: Factor, solution: Solution) -> "Rows":
         """Return the rows of a factor."""
-        sigma = solution.problem.sigma.get(factor.kind, 1.0)
+        sigma = solution.problem.sigma
         white = factor.white(solution.values, sigma)
         length = np.sqrt((white**2).sum(1))
         weight = factor.loss.weight(length)
@@ -573,6 +592,13 @@ class Rows:
         places = tuple(solution.places.get(block.name) for block, _ in factor.on)
         return cls(factor, places, slopes, white * root[:, None], length, weight)
 
+    def of_kinds(self, kinds: Collection[str]) -> "Rows | None":
+        """Return the residuals of some kinds."""
+        own = [i for i, kind in enumerate(self.factor.kinds) if kind in kinds]
+        if isinstance(self.factor.kind, str) or not own:
+            return self if own else None
+        return replace(self, slopes=[each[:, own] for each in self.slopes], residual=self.residual[:, own])
+
     def total(self, ways: Mapping[str, np.ndarray], part: slice = slice(None)) -> np.ndarray:
         """Return the derivatives (r, w, q) of a part of the rows by changes of all blocks (n, dim, q), by name."""
         total: Any = 0.0
@@ -581,36 +607,35 @@ class Rows:
             total = total + slope[part] @ (way[0] if index is None else way[index[part]])
         return total
 
-    def add(self, normal: np.ndarray, right: np.ndarray, dropped: "tuple[np.ndarray, np.ndarray, np.ndarray]") -> None:
-        """Add the rows to the equations of kept unknowns, and to blocks, right sides, mixed parts of dropped ones."""
-        block, block_right, cross = dropped
-        mixed = cross.reshape(-1, cross.shape[2])
+    def add(self, sums: Equations) -> None:
+        """Add the rows to the matrices and right sides of equations."""
+        normal, mixed = sums.normal, sums.cross.reshape(-1, sums.cross.shape[2])
         ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
         for i, ((own, members), place, slope) in enumerate(ends):
             square, pull = blocks_of(slope, -self.residual, numbers(members, slope), len(own.start))
             if place is None:
-                block += square
-                block_right += pull
+                sums.block[:] += square
+                sums.block_right[:] += pull
             else:
                 at = _unknowns(place, np.arange(len(own.start)), slope)
                 normal[at[:, :, None], at[:, None]] += square
-                right[place] += pull.ravel()
+                sums.right[place] += pull.ravel()
             for j, (_, other_place, other) in enumerate(ends[:i]):
-                members_of_sums, sums = self._sums(i, j)
+                pairs, products = self._products(i, j)
                 one, two = (
                     _unknowns(which, number, each)
-                    for which, number, each in zip((place, other_place), members_of_sums, (slope, other), strict=True)
+                    for which, number, each in zip((place, other_place), pairs, (slope, other), strict=True)
                 )
-                back = np.swapaxes(sums, 1, 2)
+                back = np.swapaxes(products, 1, 2)
                 if place is None:
-                    mixed[one[:, :, None], two[:, None]] += sums
+                    mixed[one[:, :, None], two[:, None]] += products
                 elif other_place is None:
                     mixed[two[:, :, None], one[:, None]] += back
                 else:
-                    normal[one[:, :, None], two[:, None]] += sums
+                    normal[one[:, :, None], two[:, None]] += products
                     normal[two[:, :, None], one[:, None]] += back
 
-    def _sums(self, i: int, j: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    def _products(self, i: int, j: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
         """Return the pairs of members that rows tie, and the sums (u, a, b) of the products of their derivatives."""
         one, two = self.slopes[i], self.slopes[j]
         members, others = (self.factor.on[k][1] for k in (i, j))

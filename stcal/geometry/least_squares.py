@@ -1,6 +1,6 @@
 """Least squares on a manifold: the package's only descent, for one problem or many, also with several minima."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -74,12 +74,6 @@ class NormalEquations:
     def impossible(cls, count: int) -> "NormalEquations":
         """Return the equations of an inadmissible state with ``count`` parameters: the cost is infinite."""
         return cls(np.inf, np.eye(count), np.zeros(count))
-
-    @classmethod
-    def stacked(cls, each: Sequence["NormalEquations"]) -> "NormalEquations":
-        """Return h problems as one, from the normal equations of single problems."""
-        cost, normal, gradient = (np.array([getattr(one, name) for one in each]) for name in cls.__slots__)
-        return cls(cost, normal, gradient)
 
     def __add__(self, other: "NormalEquations") -> "NormalEquations":
         return NormalEquations(self.cost + other.cost, self.normal + other.normal, self.gradient + other.gradient)

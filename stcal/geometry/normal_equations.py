@@ -11,6 +11,7 @@ from stcal.geometry.rigid import skew
 SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
 
+TINY = 1e-300
 LARGE = 100
 """Number of unknowns of a block from which on its inverse is computed from Cholesky's factors."""
 
@@ -51,6 +52,8 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
     Raises LinAlgError: a block is singular.
     """
     m, a, k = cross.shape
+    if not m:
+        return Reduction(np.zeros((k, k)), np.zeros(k), right, cross, block, 0.0)
     if a < LARGE:
         inverse = np.linalg.inv(block)
         from_kept, step = inverse @ cross, (inverse @ right[..., None])[..., 0]
@@ -71,13 +74,18 @@ def _solved(block: np.ndarray, cross: np.ndarray, right: np.ndarray) -> np.ndarr
 def _inverses(block: np.ndarray) -> np.ndarray:
     """Return the inverses of symmetric matrices (m, a, a); of large ones by Cholesky's factors, three times as fast."""
     if block.shape[1] < LARGE:
-        return np.linalg.inv(block)
-    inverse = np.empty_like(block)
-    for i, matrix in enumerate(block):
-        factor, fault = dpotrf(matrix, lower=True)
-        lower, _ = dpotri(factor, lower=True)  # its upper triangle is zero, as the factor's is
-        inverse[i] = np.linalg.inv(matrix) if fault else lower + lower.T - np.diag(np.diag(lower))
-    return inverse
+        return np.linalg.inv(block) if len(block) else block
+    return np.stack([inverse_and_size(matrix)[0] for matrix in block])
+
+
+def inverse_and_size(normal: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the inverse of a symmetric matrix (k, k), by Cholesky's factors, and the logarithm of its determinant."""
+    factor, fault = dpotrf(normal, lower=True)
+    if fault:
+        return np.linalg.inv(normal), float(np.linalg.slogdet(normal)[1])
+    lower, _ = dpotri(factor, lower=True)  # its upper triangle is zero, as the factor's is
+    own = np.diag(lower)
+    return lower + lower.T - np.diag(own), 2 * float(np.log(np.diag(factor)).sum())
 
 
 def blocks_of(
@@ -89,6 +97,9 @@ def blocks_of(
     (n, c) observed minus computed, divided by σ; ``index`` : (n,) block of each observation.
     """
     n, _, k = jacobian.shape
+    if count == 1:
+        flat = jacobian.reshape(residual.size, k)
+        return (flat.T @ flat)[None], (flat.T @ residual.ravel())[None]
     products = np.swapaxes(jacobian, 1, 2) @ np.concatenate([jacobian, residual[:, :, None]], axis=2)
     order = np.argsort(index, kind="stable")
     ends = np.searchsorted(index, np.arange(count + 1), sorter=order)
@@ -124,5 +135,5 @@ def datum(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 def generalised_inverse(normal: np.ndarray) -> np.ndarray:
     """Return the pseudo-inverse of a normal matrix (k, k), scaled by its diagonal; undetermined directions are 0."""
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scale = np.sqrt(np.maximum(np.diag(normal), TINY))
     return np.linalg.pinv(normal / scale[:, None] / scale, rcond=SINGULAR, hermitian=True) / scale[:, None] / scale

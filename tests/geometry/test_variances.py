@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.geometry.least_squares import NormalEquations
-from stcal.geometry.variances import Parts, component_variances, sigma_factor
+from stcal.geometry.variances import component_variances, sigma_factor
 
 GROUPS, EACH = 12, 5
 
@@ -19,31 +18,6 @@ def grouped():
     within = ((values - middle) ** 2).sum() / (GROUPS * (EACH - 1))
     between = EACH * ((middle - values.mean()) ** 2).sum() / (GROUPS - 1)
     return values, (within, (between - within) / EACH)
-
-
-def test_parts_of_an_adjustment_give_the_variances_of_the_analysis(grouped):
-    values, wanted = grouped
-    present = np.array([0.3, 2.0])
-    own = np.repeat(np.eye(GROUPS), EACH, axis=0)
-    error = NormalEquations.of(-values.ravel() / present[0], np.column_stack([np.ones(values.size), own]) / present[0])
-    group = NormalEquations.of(np.zeros(GROUPS), np.column_stack([np.zeros(GROUPS), np.eye(GROUPS)]) / present[1])
-    none = NormalEquations(0.0, np.zeros((GROUPS + 1, GROUPS + 1)), np.zeros(GROUPS + 1))
-    parts = Parts(NormalEquations.stacked([error, group]), np.array([values.size, GROUPS]), none)
-    best = parts.best(np.full(2, -5.0), np.full(2, 5.0), [np.zeros(2), np.ones(2)])
-    assert (present * np.exp(best)) ** 2 == pytest.approx(wanted, rel=1e-4)
-    assert parts.at(best[None])[2][0, 0] == pytest.approx(values.mean(), rel=1e-9)
-
-
-def test_the_gradient_is_that_of_the_density(grouped):
-    values, _ = grouped
-    design = np.random.default_rng(5).normal(size=(values.size, 3))
-    first, second = (NormalEquations.of(values.ravel()[rows], design[rows]) for rows in (slice(20), slice(20, None)))
-    parts = Parts(
-        NormalEquations.stacked([first, second]), np.array([20, 40]), first, np.array([0.1, 0.2]), 0.7, 2.0, 1e-10
-    )
-    x, small = np.array([0.4, -0.3]), 1e-5 * np.eye(2)
-    ahead, behind = parts.at(x + small)[0], parts.at(x - small)[0]
-    assert parts.at(x[None])[1][0] == pytest.approx((ahead - behind) / 2e-5, rel=1e-6)
 
 
 def test_a_sum_of_components_gives_the_variances_of_the_analysis(grouped):

@@ -1,19 +1,19 @@
 """Unknowns and residuals of a hand-eye adjustment from corners, and of an arm that is adjusted too."""
 
-from dataclasses import dataclass, field, replace
-from functools import reduce
-from operator import add
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.engine import Adjustment
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import perturbed
+from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.geometry.robust import huber_cost, huber_weights, length_limit
+from stcal.geometry.robust import length_limit
 from stcal.handeye.data.views import project_jacobian
-from stcal.handeye.methods.equations import Equations, Part
 
 SETTLED_MM = 1e-3
 """Largest motion of a flange in a round of linear steps, in mm, after which only squares of the motion are
@@ -89,6 +89,8 @@ class LinearArm:
 
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand has a weight below one."""
+ROBOT = ("robot_rad", "robot_mm")
+"""Kinds of the robot's errors: of its rotations and of its translations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,13 +102,8 @@ class Bundle:
     base_from_flange: Poses
     corners: np.ndarray
     camera: Camera
-    scale: float = 1.0
-    arm: np.ndarray = field(default_factory=lambda: np.zeros(0))
-
-    def camera_from_board(self, inverted: bool) -> Poses:
-        """Returns the poses of the scaled board that follow from the robot's poses."""
-        hand = self.base_from_flange if inverted else self.base_from_flange.inverse()
-        return self.mount_from_camera.inverse() @ hand @ self.stand_from_board
+    scale: float
+    arm: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +112,7 @@ class Corners:
 
     ``inverted`` : eye-to-hand; ``base_from_flange`` : m, as reported; ``xyz_board`` : (K, 3) as designed; ``view``,
     ``corner`` : (n,) view and corner of each measurement; ``xy_px`` : (n, 2); ``weight`` : (n, 2, 2) whitening at σ 1;
-    ``robot`` : (m, 6, 6) whitening in place of σ, or None; ``sigma`` : σ of each group, 0 where exact; ``basis`` : (16,
+    ``robot`` : (m, 6, 6) whitening in place of σ, or None; ``sigma`` : σ of each kind, 0 where exact; ``basis`` : (16,
     q) of the intrinsics solved for; ``information`` : (q, q) of them about ``camera``, to be divided by the squares of
     the factors; ``with_scale``; ``arm`` : the arm whose parameters are solved for and by which ``base_from_flange`` was
     computed, or None.
@@ -136,84 +133,109 @@ class Corners:
     with_scale: bool
     arm: LinearArm | None = None
 
-    def places(self) -> dict[str, slice]:
-        """Returns the slices of the unknowns in a step; those of what is not solved for are empty."""
-        sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
-        sizes["arm"] = 0 if self.arm is None else len(self.arm.parameters)
-        exact = self.robot is None and not self.sigma["robot_mm"]
-        sizes["robot"] = 0 if exact else 6 * len(self.base_from_flange)
-        sizes["board"] = self.xyz_board.size if self.sigma["board_mm"] else 0
-        ends = np.cumsum([0, *sizes.values()])
-        return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
+    def problem(self) -> Adjustment:
+        """Returns the adjustment: X, Z, the scale, and what else has a σ."""
+        a, one = Adjustment(sigma=dict(self.sigma)), PoseStack.of(Rigid())
+        on: list[tuple[Block, np.ndarray | None]] = [(a.block("x", one), None), (a.block("z", one), None)]
+        on.append((a.block("scale", Vector(np.ones((1, 1))), fixed=[] if self.with_scale else [0]), None))
+        if self.basis.shape[1]:
+            on.append((a.block("camera", Vector(np.zeros((1, self.basis.shape[1])))), None))
+            for name, rows in self.camera_parts():
+                root = np.linalg.cholesky(self.information[np.ix_(rows, rows)]).T
+                a.factor(_linear(root, rows), on[-1:], kind=name)
+        if self.arm is not None:
+            arm = self.arm.parameters
+            on.append((a.block("arm", Vector(np.zeros((1, len(arm))))), None))
+            for name, rows in self.arm.parts().items():
+                a.factor(_linear(np.eye(len(rows)), rows, arm[rows]), on[-1:], kind=name)
+        m = len(self.base_from_flange)
+        if self.robot is not None or self.sigma["robot_mm"]:
+            on.append((a.block("robot", PoseStack.of(*[Rigid()] * m)), self.view))
+            by_itself, kinds = np.tile(np.eye(6), (m, 1, 1)), np.repeat(ROBOT, 3).tolist() if self.robot is None else ""
+            root, off = by_itself if self.robot is None else self.robot, [(on[-1][0], np.arange(m))]
+            a.factor(errors, off, derivatives=lambda robot: [by_itself], root=root, kind=kinds, loss=Huber(POSE))
+        if self.sigma["board_mm"]:
+            board = a.block("board", Vector(self.xyz_board), eliminate=True)
+            on.append((board, self.corner))
+            every, apart = np.arange(len(self.xyz_board)), np.tile(np.eye(3), (len(self.xyz_board), 1, 1))
+            a.factor(
+                lambda own: own.array - self.xyz_board, [(board, every)], 1.0, lambda own: [apart], kind="board_mm"
+            )
+        names = [block.name for block, _ in on]
+
+        def residuals(*own: Any) -> np.ndarray:
+            return self.residuals(self.bundle(dict(zip(names, own, strict=True))))
+
+        def slopes(*own: Any) -> list[np.ndarray]:
+            by = self.slopes(self.bundle(dict(zip(names, own, strict=True))))
+            return [by[name] for name in names]
+
+        a.factor(residuals, on, derivatives=slopes, root=self.weight, kind="corner_px", loss=Huber(CORNER))
+        return a
+
+    def start(self, x: Rigid, z: Rigid, scale: float) -> dict[str, Any]:
+        """Returns the values of the unknowns at the start."""
+        given = {"x": PoseStack.of(x), "z": PoseStack.of(z), "scale": Vector(np.full((1, 1), scale))}
+        return {block.name: block.start for block in self.problem().blocks} | given
+
+    def bundle(self, values: Mapping[str, Any]) -> Bundle:
+        """Returns the unknowns, those that are not solved for included."""
+        arm = values["arm"].array[0] if "arm" in values else np.zeros(0)
+        flange, camera = (
+            self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, arm),
+            self.camera,
+        )
+        if "robot" in values:
+            off = values["robot"]
+            flange = Poses(off.rotation @ flange.rotation, off.translation + flange.translation)
+        if "camera" in values:
+            camera = camera.with_parameters(camera.parameters() + self.basis @ values["camera"].array[0])
+        corners = values["board"].array if "board" in values else self.xyz_board
+        x, z = values["x"].rigid(0), values["z"].rigid(0)
+        return Bundle(x, z, flange, corners, camera, float(values["scale"].array[0, 0]), arm)
 
     def camera_parts(self) -> list[tuple[str, np.ndarray]]:
         """Returns :func:`camera_parts` of the intrinsics solved for."""
         return camera_parts(self.basis, self.information)
 
-    def by_arm(self, step: np.ndarray) -> Poses:
-        """Returns base_from_flange after a step (k,) of the arm's parameters; as reported without an arm."""
-        return self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, step)
-
-    def robot_weight(self) -> np.ndarray:
-        """Returns the whitening (m, 6, 6) of errors of base_from_flange."""
-        if self.robot is not None:
-            return self.robot
-        sigma = np.repeat([self.sigma["robot_rad"], self.sigma["robot_mm"]], 3)
-        return np.tile(np.diag(1 / sigma), (len(self.base_from_flange), 1, 1))
-
-    def moved(self, state: Bundle, step: np.ndarray) -> Bundle:
-        """Returns the state after a step of all unknowns."""
-        steps = {name: step[place] for name, place in self.places().items()}
-        camera, flange, corners = state.camera, state.base_from_flange, state.corners
-        if len(steps["camera"]):
-            camera = camera.with_parameters(camera.parameters() + self.basis @ steps["camera"])
-        if len(steps["robot"]):
-            pose_steps = steps["robot"].reshape(-1, 6)
-            turn = Rotation.from_rotvec(pose_steps[:, :3]).as_matrix()
-            if self.arm is not None:
-                before, after = self.by_arm(state.arm), self.by_arm(state.arm + steps["arm"])
-                turn = turn @ flange.rotation @ np.swapaxes(before.rotation, 1, 2) @ after.rotation
-                flange = Poses(turn, flange.translation + after.translation - before.translation + pose_steps[:, 3:])
-            else:
-                flange = Poses(turn @ flange.rotation, flange.translation + pose_steps[:, 3:])
-        if len(steps["board"]):
-            corners = corners + steps["board"].reshape(-1, 3)
-        x, z = perturbed(state.mount_from_camera, steps["x"]), perturbed(state.stand_from_board, steps["z"])
-        scale = state.scale + float(steps["scale"].sum())
-        return Bundle(x, z, flange, corners, camera, scale, state.arm + steps["arm"])
-
-    def seen(self, state: Bundle) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Returns the white residuals of the corners (n, 2) and their derivatives (n, 2, ·) by each kind of unknown.
-        Derivatives by board and robot are those by the measurement's own corner and view."""
+    def _placed(self, state: Bundle) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns of each measured corner its place (n, 3) in the frames of the stand, the mount and the camera."""
         x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
+        hand = hand if self.inverted else hand.inverse()
+        stand = state.scale * state.corners[self.corner] @ z.rotation.T + z.translation
+        mount = np.einsum("nab,nb->na", hand.rotation[self.view], stand) + hand.translation[self.view]
+        return stand, mount, (mount - x.translation) @ x.rotation
+
+    def residuals(self, state: Bundle) -> np.ndarray:
+        """Returns projected minus measured corners (n, 2), px; NaN behind the camera."""
+        return state.camera.project(self._placed(state)[2]) - self.xy_px
+
+    def slopes(self, state: Bundle) -> dict[str, np.ndarray]:
+        """Returns the derivatives (n, 2, ·) of :meth:`residuals` by each kind of unknown."""
+        x, z, hand = state.mount_from_camera, state.stand_from_board, state.base_from_flange
+        stand, mount, xyz_camera = self._placed(state)
         turn, place = hand.rotation[self.view], hand.translation[self.view]
-        board = state.corners[self.corner] @ z.rotation.T
-        stand = state.scale * board + z.translation
         if self.inverted:  # the flange is the stand, the base is the mount
-            mount_from_stand, arm = turn, np.einsum("nab,nb->na", turn, stand)
-            mount = arm + place
-            by_hand = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), turn.shape)], axis=2)
+            mount_from_stand = turn
+            by_hand = np.concatenate([-skew(mount - place), np.broadcast_to(np.eye(3), turn.shape)], axis=2)
         else:
             mount_from_stand = np.swapaxes(turn, 1, 2)
-            mount = np.einsum("nab,nb->na", mount_from_stand, stand - place)
-            by_hand = mount_from_stand @ np.concatenate([skew(stand - place), -np.ones_like(turn) * np.eye(3)], axis=2)
-        reach = mount - x.translation
-        xyz_camera = reach @ x.rotation
-        px, by_point = project_jacobian(state.camera, xyz_camera)
-        by_mount = self.weight / self.sigma["corner_px"] @ by_point @ x.rotation.T
+            by_hand = np.concatenate([mount_from_stand @ skew(stand - place), -mount_from_stand], axis=2)
+        _, by_point = project_jacobian(state.camera, xyz_camera)
+        by_mount = by_point @ x.rotation.T
         by_stand = by_mount @ mount_from_stand
-        by_camera = state.camera.parameter_jacobian(xyz_camera[:, :2] / xyz_camera[:, 2:]) @ self.basis
-        derivatives = {
-            "x": np.concatenate([by_mount @ skew(reach), -by_mount], axis=2),
-            "z": np.concatenate([-by_stand @ skew(state.scale * board), by_stand], axis=2),
-            "camera": self.weight / self.sigma["corner_px"] @ by_camera,
-            "scale": np.einsum("nab,nb->na", by_stand, board)[:, :, None],
+        of_board = stand - z.translation
+        slopes = {
+            "x": np.concatenate([by_mount @ skew(mount - x.translation), -by_mount], axis=2),
+            "z": np.concatenate([-by_stand @ skew(of_board), by_stand], axis=2),
+            "camera": state.camera.parameter_jacobian(xyz_camera[:, :2] / xyz_camera[:, 2:]) @ self.basis,
+            "scale": np.einsum("nab,nb->na", by_stand, of_board / state.scale)[:, :, None],
             "board": state.scale * by_stand @ z.rotation,
             "robot": by_mount @ by_hand,
         }
         if self.arm is not None:
-            derivatives["arm"] = derivatives["robot"] @ self.arm.slope_after(state.arm)[self.view]
-        return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], derivatives
+            slopes["arm"] = slopes["robot"] @ self.arm.slope_after(state.arm)[self.view]
+        return slopes
 
     def only(self, keep: np.ndarray) -> "Corners":
         """Returns the problem of the poses ``keep``, a mask (m,)."""
@@ -238,121 +260,15 @@ class Corners:
         """Returns a factor of 1 for each kind of the intrinsics solved for."""
         return dict.fromkeys((name for name, _ in self.camera_parts()), 1.0)
 
-    def kept(self) -> int:
-        """Returns the number of unknowns besides the corners of the board, which come last."""
-        return self.places()["board"].start
 
-    def parts(self, state: Bundle) -> "dict[str, Part]":
-        """Returns all observations by the name of their σ."""
-        return {name: part for group in self.groups(state) for name, part in group.parts.items()}
+def errors(robot: PoseStack) -> np.ndarray:
+    """Returns what poses of a robot err (m, 6): rotation vectors, rad, and translations, mm."""
+    return np.hstack([Rotation.from_matrix(robot.rotation).as_rotvec(), robot.translation])
 
-    def linear(self, state: Bundle) -> Equations:
-        """Returns cost and normal equations; the cost is infinite where a corner lies behind the camera."""
-        if not self.in_front(state):
-            return Equations.impossible(self.kept(), self._corners())
-        groups = self.groups(state)
-        equations = reduce(add, (part.equations for group in groups for part in group.parts.values()))
-        return replace(equations, cost=sum(group.cost for group in groups))
 
-    def groups(self, state: Bundle) -> "list[Group]":
-        """Returns all observations: the corners seen, the prior knowledge of the intrinsics, the board as designed, the
-        robot's poses as reported, and the arm as filed."""
-        groups, at = [self._seen_group(state)], self.places()
-        if self.basis.shape[1]:
-            deviation = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
-            for name, rows in self.camera_parts():
-                root = np.linalg.cholesky(self.information[rows][:, rows]).T / self.sigma[name]
-                groups.append(self._prior(name, root @ deviation[rows], root, at["camera"].start + rows))
-        if at["board"].stop > at["board"].start:
-            nothing, information = self._nothing(), 1 / self.sigma["board_mm"] ** 2
-            deviation = state.corners - self.xyz_board
-            cost, k = information * float((deviation**2).sum()), len(deviation)
-            block = np.tile(information * np.eye(3), (k, 1, 1))
-            own = replace(nothing, cost=cost, block=block, slope=information * deviation)
-            groups.append(Group(cost, {"board_mm": Part(3 * k, own)}))
-        if at["robot"].stop > at["robot"].start:
-            groups.append(self._robot_group(state))
-        if self.arm is not None:
-            for name, rows in self.arm.parts().items():
-                root = np.eye(len(rows)) / self.sigma[name]
-                white = root @ (self.arm.parameters + state.arm)[rows]
-                groups.append(self._prior(name, white, root, at["arm"].start + rows))
-        return groups
-
-    def _corners(self) -> int:
-        """Returns the number of corners that are unknowns."""
-        return len(self.xyz_board) if self.sigma["board_mm"] else 0
-
-    def _nothing(self) -> Equations:
-        """Returns the equations of no observation."""
-        s, k = self.kept(), self._corners()
-        return Equations(0.0, np.zeros((s, s)), np.zeros(s), np.zeros((k, 3, 3)), np.zeros((k, 3)), None)
-
-    def _prior(self, name: str, white: np.ndarray, root: np.ndarray, places: np.ndarray) -> "Group":
-        """Returns the prior knowledge of the kept unknowns at ``places``, with residuals ``white`` and their derivative
-        ``root``."""
-        own, cost = self._nothing(), float(white @ white)
-        own.normal[np.ix_(places, places)] = root.T @ root
-        own.gradient[places] = root.T @ white
-        return Group(cost, {name: Part(len(white), replace(own, cost=cost))})
-
-    def _robot_group(self, state: Bundle) -> "Group":
-        """Returns the robot's poses as observations; rotation and translation have a σ each, or stated covariances."""
-        first, weight = self.places()["robot"].start, self.robot_weight()
-        white = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.by_arm(state.arm)))
-        length = np.linalg.norm(white, axis=1)
-        share = huber_weights(length, POSE)
-        halves = {"robot_rad": slice(0, 3), "robot_mm": slice(3, 6)} if self.robot is None else {"": slice(0, 6)}
-        m, parts = len(white), {}
-        columns = first + np.arange(6 * m).reshape(m, 6)
-        for name, rows in halves.items():
-            own, root = self._nothing(), weight[:, rows]
-            pulled = np.swapaxes(root, 1, 2) * share[:, None, None]
-            own.normal[columns[:, :, None], columns[:, None]] = pulled @ root
-            own.gradient[columns] = np.einsum("mab,mb->ma", pulled, white[:, rows])
-            cost = float(share @ (white[:, rows] ** 2).sum(1))
-            parts[name] = Part(white[:, rows].size, replace(own, cost=cost))
-        return Group(float(huber_cost(length, POSE).sum()), parts)
-
-    def _seen_group(self, state: Bundle) -> "Group":
-        """Returns the observations of the corners in the images."""
-        white, derivatives = self.seen(state)
-        length = np.linalg.norm(white, axis=1)
-        root = np.sqrt(huber_weights(length, CORNER))
-        at, equations, white = self.places(), self._nothing(), white * root[:, None]
-        everywhere = [name for name in ("x", "z", "camera", "scale", "arm") if at[name].stop > at[name].start]
-        places = np.concatenate([np.arange(at[name].start, at[name].stop) for name in everywhere])
-        by_kept = np.concatenate([derivatives[name] for name in everywhere], axis=2)
-        robot = at["robot"].stop > at["robot"].start
-        if robot:
-            by_kept = np.concatenate([by_kept, derivatives["robot"]], axis=2)
-        by_kept *= root[:, None, None]
-        by_corner = np.swapaxes(derivatives["board"] * root[:, None, None], 1, 2)
-        k = self._corners()
-        cross = np.zeros((k, 3, len(equations.gradient))) if k else None
-        for rows in np.split(np.arange(len(white)), np.flatnonzero(np.diff(self.view)) + 1):
-            view, jacobian = self.view[rows[0]], by_kept[rows].reshape(2 * len(rows), -1)
-            columns = np.concatenate([places, at["robot"].start + 6 * view + np.arange(6)]) if robot else places
-            equations.normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
-            equations.gradient[columns] += jacobian.T @ white[rows].ravel()
-            if cross is not None:
-                index, mixed = np.ix_(self.corner[rows], np.arange(3), columns), by_corner[rows] @ by_kept[rows]
-                if len(set(self.corner[rows].tolist())) == len(rows):  # ten times as fast
-                    cross[index] += mixed
-                else:
-                    np.add.at(cross, index, mixed)
-        if k:
-            np.add.at(equations.block, self.corner, by_corner @ np.swapaxes(by_corner, 1, 2))
-            np.add.at(equations.slope, self.corner, np.einsum("nab,nb->na", by_corner, white))
-        cost = float((white**2).sum())
-        part = Part(white.size, replace(equations, cost=cost, cross=cross))
-        return Group(float(huber_cost(length, CORNER).sum()), {"corner_px": part})
-
-    def in_front(self, state: Bundle) -> bool:
-        """True if all corners lie in front of the camera."""
-        poses = state.camera_from_board(self.inverted)
-        depth = (poses.rotation[self.view, 2] * (state.scale * state.corners[self.corner])).sum(1)
-        return bool((depth + poses.translation[self.view, 2] > 0).all())
+def _linear(root: np.ndarray, rows: np.ndarray, about: np.ndarray | float = 0.0) -> Callable[[Vector], np.ndarray]:
+    """Returns a function that gives ``root`` times the numbers ``rows`` of a single member and ``about``, as a row."""
+    return lambda own: ((own.array[0, rows] + about) @ root.T)[None]
 
 
 def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, np.ndarray]]:
@@ -364,11 +280,3 @@ def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, 
     kinds = {"focal": (0, 1), "centre": (2, 3), "radial": (4, 5, 8, 9, 10, 11), "tangential": (6, 7)}
     parts = [(f"camera_{kind}", np.flatnonzero(np.isin(first, numbers))) for kind, numbers in kinds.items()]
     return [(name, rows) for name, rows in parts if len(rows)]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Group:
-    """Observations of one kind: their ``cost``, Huber's where they are robust, and ``parts`` by the name of their σ."""
-
-    cost: float
-    parts: dict[str, Part]

@@ -2,26 +2,37 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import reduce
-from operator import add
+from typing import Any
 
 import numpy as np
 from scipy.stats import f
 
-from stcal.errors import DegenerateError
+from stcal.adjust.blocks import Vector
+from stcal.adjust.engine import Solution
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, whitened
-from stcal.handeye.methods.bundle import ARM_ROUNDS, SETTLED_MM, ArmModel, Bundle, Corners, LinearArm, camera_parts
-from stcal.handeye.methods.equations import Equations
-from stcal.handeye.methods.noise import Noise, adjust, estimated
+from stcal.handeye.methods.bundle import (
+    ARM_ROUNDS,
+    ROBOT,
+    SETTLED_MM,
+    ArmModel,
+    Bundle,
+    Corners,
+    LinearArm,
+    camera_parts,
+    errors,
+)
+from stcal.handeye.methods.noise import CAUTION, FARTHEST, UNKNOWNS, Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES, LoopState, PoseSolution
 from stcal.handeye.methods.reprojection import (
     FIRST,
     GROSS_RAD,
     GROSS_SHARE,
+    LEAST_SIGMA,
     UNKNOWN_LENS,
     Reprojection,
     found_of,
@@ -52,38 +63,66 @@ class CameraError:
         return without_camera + moved @ self.moment @ moved.T
 
 
-def considered(wider: Corners, state: Bundle, free: tuple[str, ...]) -> CameraError:
+ADJUST_ROUNDS = 20
+ROUGHLY = 1e-6
+"""Relative fall of the cost below which the minimisation within a round of σ ends."""
+WORST = "check the poses that fit worst"
+
+
+def adjust(corners: Corners, values: dict[str, Any], free: tuple[str, ...]) -> tuple[Corners, Solution, bool]:
+    """Solves, and estimates the σ of the ``free`` kinds, in rounds: returns the problem with these σ, its solution, and
+    whether σ settled; raises ConvergenceError: no minimum is reached."""
+    if not np.isfinite(corners.problem().cost(values)):
+        raise ConvergenceError("E-NO-MINIMUM", f"hand-eye: corners lie behind the camera at the start; {WORST}")
+    settled = not free
+    for _ in range(ADJUST_ROUNDS if free else 0):
+        solution = corners.problem().minimum(values, settled=ROUGHLY).required("hand-eye", WORST).linear
+        values, before = solution.values, corners.sigma
+        corners = replace(corners, sigma=before | estimated(corners, solution, free))
+        settled = bool(max(abs(np.log(corners.sigma[name] / before[name])) for name in free) < SETTLED)
+        if settled:
+            break
+    return corners, corners.problem().minimum(values).required("hand-eye", WORST).linear, settled
+
+
+def estimated(corners: Corners, solution: Solution, free: tuple[str, ...]) -> dict[str, float]:
+    """Returns restricted maximum-likelihood σ of the ``free`` kinds, all else linear."""
+    present = [name for name in free if any(name in factor.kinds for factor in solution.problem.factors)]
+    least = np.log([LEAST_SIGMA.get(name, 1.0) / corners.sigma[name] for name in present])
+    caution = np.array([CAUTION if name in LEAST_SIGMA else 0.0 for name in present])
+    farthest = np.full(len(present), FARTHEST)
+    likelihood = solution.components(present, caution)
+    best = likelihood.best(np.maximum(least, -farthest), farthest, [np.zeros(len(present))])
+    return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(present, best, strict=True)}
+
+
+def considered(wider: Corners, values: dict[str, Any], free: tuple[str, ...]) -> CameraError:
     """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``: they are
     *considered* (Schmidt 1966; Bierman 1977, ch. VIII), that is, their prior covariance is carried through. ``free`` σ,
     too large by the camera's error, are estimated again with them, linear about the state."""
-    factors, poses = wider.factors(), wider.places()["z"].stop
-    sigma = wider.sigma | estimated(wider, state, (*free, *factors))
-    camera = np.arange(wider.places()["camera"].start, wider.places()["camera"].stop)
-    left = replace(wider, sigma=sigma).linear(state).eliminated()
-    covariance = generalised_inverse(left.normal)
-    error = -covariance[camera] @ left.gradient
-    # Equations and gradient noise of all other observations, in units of the σ that weighted the solution.
-    parts = {name: part.equations for name, part in wider.parts(state).items() if name not in factors}
-    scatter = {name: (sigma[name] / wider.sigma[name]) ** 2 if name in free else 1.0 for name in parts}
-    known = reduce(add, parts.values())
-    noise = reduce(add, (own.times(scatter[name]) for name, own in parts.items()))
-    without_board = known.eliminated()
-    others = np.setdiff1d(np.arange(len(known.gradient)), camera)
-    eliminated, normal = others[poses:], without_board.normal
-    reduced = np.eye(poses, len(others))
-    reduced[:, poses:] = -normal[np.ix_(others[:poses], eliminated)] @ generalised_inverse(
+    values = values | {"camera": Vector(np.zeros((1, wider.basis.shape[1])))}
+    factors, linear = wider.factors(), wider.problem().at(values)
+    sigma = wider.sigma | estimated(wider, linear, (*free, *factors))
+    again = replace(wider, sigma=sigma).problem().at(values)
+    covariance = generalised_inverse(again.normal)
+    camera = np.arange(covariance.shape[0])[linear.places["camera"]]
+    error = covariance[camera] @ again.right
+    # What each kind of observation tells, in units of the σ that weighted the solution.
+    kinds = {kind for factor in linear.problem.factors for kind in factor.kinds} - set(factors)
+    told = {kind: linear.equations((kind,)).told(linear.reduction.from_kept) for kind in kinds}
+    normal = np.sum(list(told.values()), axis=0)
+    scattered = sum((sigma[kind] / wider.sigma[kind]) ** 2 * own if kind in free else own for kind, own in told.items())
+    others = np.setdiff1d(np.arange(len(normal)), camera)
+    poses, eliminated = others[:UNKNOWNS], others[UNKNOWNS:]
+    reduced = np.zeros((UNKNOWNS, len(normal)))
+    reduced[:, poses] = np.eye(UNKNOWNS)
+    reduced[:, eliminated] = -normal[np.ix_(poses, eliminated)] @ generalised_inverse(
         normal[np.ix_(eliminated, eliminated)]
     )
-    scattered = noise.normal
-    if known.cross is not None and without_board.from_kept is not None and noise.cross is not None:
-        by_corner = without_board.from_kept  # what the gradient of the others takes over from that of the corners
-        mixed = np.tensordot(by_corner, noise.cross, ((0, 1), (0, 1)))
-        scattered = scattered - mixed - mixed.T
-        scattered = scattered + np.tensordot(by_corner, noise.block @ by_corner, ((0, 1), (0, 1)))
     return CameraError(
-        slope=reduced @ normal[np.ix_(others, camera)],
+        slope=reduced @ normal[:, camera],
         moment=covariance[np.ix_(camera, camera)] + np.outer(error, error),
-        noise=reduced @ scattered[np.ix_(others, others)] @ reduced.T,
+        noise=reduced @ scattered @ reduced.T,
     )
 
 
@@ -163,19 +202,19 @@ SEEN = 1e-3
 class Adjusted:
     """An adjustment of corners.
 
-    ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses, ``state``
-    : its solution, ``linear`` : its normal equations there; ``covariance`` : (12, 12) of X and Z; ``camera_error`` :
-    error of the intrinsics as filed, which it does not hold, where their prior is known; ``sigma_scale``; ``sigma`` :
-    by group; ``estimated`` : groups whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its
-    σ; ``camera_gain`` : fall of the cost per parameter if the intrinsics were solved for; ``found`` : other results;
-    ``settled`` : whether the estimated σ settled.
+    ``loop`` : with all poses; ``used`` : (m,) which of them were used; ``corners`` : problem of these poses,
+    ``solution`` : its solution, ``state`` : the same as what is sought; ``covariance`` : (12, 12) of X and Z;
+    ``camera_error`` : error of the intrinsics as filed, which it does not hold, where their prior is known;
+    ``sigma_scale``; ``sigma`` : by kind; ``estimated`` : kinds whose σ were estimated; ``scale_hint`` : the scale if it
+    were solved for, and its σ; ``camera_gain`` : fall of the cost per parameter if the intrinsics were solved for;
+    ``found`` : other results; ``settled`` : whether the estimated σ settled.
     """
 
     loop: Loop
     used: np.ndarray
     corners: Corners
+    solution: Solution
     state: Bundle
-    linear: Equations
     covariance: np.ndarray
     camera_error: CameraError | None
     sigma_scale: float | None
@@ -188,21 +227,22 @@ class Adjusted:
 
     def normal(self) -> np.ndarray:
         """Returns the normal matrix (12, 12) of X and Z, all other unknowns eliminated."""
-        normal, k = self.linear.eliminated().normal, len(self.covariance)
+        normal, k = self.solution.normal, len(self.covariance)
         return normal[:k, :k] - normal[:k, k:] @ generalised_inverse(normal[k:, k:]) @ normal[k:, :k]
 
     def without(self, out: np.ndarray) -> Bundle:
         """Returns the solution without the poses ``out``, rows among all: by steps from the solution of all, with its
         σ. The error of such a step is of second order in a small change (influence: Cook & Weisberg 1982)."""
         keep = ~np.isin(np.flatnonzero(self.used), out)
-        corners, state = self.corners.only(keep), self.state
-        state = replace(state, base_from_flange=state.base_from_flange[keep])
+        corners, values = self.corners.only(keep), dict(self.solution.values)
+        if "robot" in values:
+            values["robot"] = values["robot"][keep]
+        problem = corners.problem()
         for _ in range(INFLUENCE_STEPS):
-            linear = corners.linear(state)
-            if not np.isfinite(linear.cost):
+            if not np.isfinite(problem.cost(values)):
                 break
-            state = corners.moved(state, linear.step(LEAST_DAMPING)[0])
-        return state
+            values = problem.moved(values, problem.at(values).step(LEAST_DAMPING)[0])
+        return corners.bundle(values)
 
 
 def adjust_views(
@@ -266,65 +306,65 @@ def _adjusted(
             )
         flange, linear_arm = base_from_flange[rows], None if arm is None else arm[rows]
         corners, free = problem(loop[rows], flange, views[rows], noise, intrinsics, with_scale, linear_arm, sigma)
-        no_step = np.zeros(0 if arm is None else len(arm.parameters))
-        begin = Bundle(*first[:2], flange, corners.xyz_board, views.camera, first[2], no_step)
-        solution = adjust(corners, begin, free)
-        corners, state = solution.corners, solution.state
-        inverse = solution.linear.inverse()
-        bad = contradicting(corners, state, inverse)
+        corners, solution, settled = adjust(corners, corners.start(*first), free)
+        inverse = generalised_inverse(solution.normal)
+        bad = contradicting(corners, solution, inverse)
         if not bad.any() or len(rows) - bad.sum() < LEAST_POSES:
             break
         used[rows[bad]] = False
         good -= int(bad.sum())
-    at, camera_error = corners.places(), None
-    if intrinsics is None and camera is not None:
-        known = intrinsic_basis(camera.colmap_model), np.linalg.inv(camera.covariance)
-        camera_error = considered(corners.with_intrinsics(*known), state, free)
-    gain = 1.0
-    if intrinsics is None:  # by one step from the solution; about 1 where the camera is right
-        gain = corners.with_intrinsics(*UNKNOWN_LENS).linear(state).gain() / UNKNOWN_LENS[0].shape[1]
+    values, state, at = solution.values, corners.bundle(solution.values), solution.places["scale"]
+    camera_error, gain = None, 1.0
+    if intrinsics is None:
+        if camera is not None:
+            known = intrinsic_basis(camera.colmap_model), np.linalg.inv(camera.covariance)
+            camera_error = considered(corners.with_intrinsics(*known), values, free)
+        # By one step from the solution; about 1 where the camera is right.
+        wider, unknown = corners.with_intrinsics(*UNKNOWN_LENS), UNKNOWN_LENS[0].shape[1]
+        step = wider.problem().at(values | {"camera": Vector(np.zeros((1, unknown)))})
+        gain = (float(step.right @ generalised_inverse(step.normal) @ step.right) + step.reduction.gain) / unknown
     return Adjusted(
         loop=loop,
         used=used,
         corners=corners,
+        solution=solution,
         state=state,
-        linear=solution.linear,
-        covariance=inverse[: at["z"].stop, : at["z"].stop],
+        covariance=inverse[:UNKNOWNS, :UNKNOWNS],
         camera_error=camera_error,
-        sigma_scale=float(np.sqrt(inverse[at["scale"], at["scale"]].item())) if with_scale else None,
+        sigma_scale=float(np.sqrt(inverse[at, at].item())) if with_scale else None,
         sigma={name: float(value) for name, value in corners.sigma.items() if value},
         estimated=free,
-        scale_hint=_scale_hint(corners, state),
+        scale_hint=_scale_hint(corners, values),
         camera_gain=gain,
-        found=found_of(corners, state, inverse, base_from_flange, rows, intrinsics is not None),
-        settled=solution.settled,
+        found=found_of(corners, state, solution, base_from_flange, rows),
+        settled=settled,
     )
 
 
-def contradicting(corners: Corners, state: Bundle, inverse: np.ndarray) -> np.ndarray:
+def contradicting(corners: Corners, solution: Solution, inverse: np.ndarray) -> np.ndarray:
     """Returns which poses (m,) have a robot error that is not by chance, by the variance of its estimate."""
-    m = len(corners.base_from_flange)
-    at = corners.places()["robot"]
-    if at.stop == at.start:
+    m, at = len(corners.base_from_flange), solution.places.get("robot")
+    if at is None:
         return np.zeros(m, bool)
-    error = state.base_from_flange.difference(corners.base_from_flange)
-    weight = corners.robot_weight()
-    white = np.einsum("mab,mb->ma", weight, error)
+    weight = corners.robot
+    if weight is None:
+        weight = np.tile(np.diag(1 / np.repeat([corners.sigma[name] for name in ROBOT], 3)), (m, 1, 1))
+    white = np.einsum("mab,mb->ma", weight, errors(solution.values["robot"]))
     covariance = inverse[at, at].reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
     # For Gaussian knowledge δ ~ N(0, Σ) with posterior covariance C, the estimate of δ scatters by Σ − C.
     value, vector = np.linalg.eigh(np.eye(6) - weight @ covariance @ np.swapaxes(weight, 1, 2))
     turned = np.einsum("mab,ma->mb", vector, white)
     squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
-    redundancy = max(6 * (m - 1) - at.start, 6)
+    redundancy = max(6 * (m - 1) - at.start + (not corners.with_scale), 6)
     return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
 
 
-def _scale_hint(corners: Corners, state: Bundle) -> tuple[float, float]:
+def _scale_hint(corners: Corners, values: dict[str, Any]) -> tuple[float, float]:
     """Returns the scale, one step from the solution, if it were solved for, and its σ."""
-    wider = replace(corners, with_scale=True)
-    left, at = wider.linear(state).eliminated(), wider.places()["scale"].start
-    inverse = generalised_inverse(left.normal)
-    return state.scale - float(inverse[at] @ left.gradient), float(np.sqrt(inverse[at, at]))
+    wider = replace(corners, with_scale=True).problem().at(values)
+    inverse, at = generalised_inverse(wider.normal), wider.places["scale"].start
+    step = float(inverse[at] @ wider.right)
+    return float(values["scale"].array[0, 0]) + step, float(np.sqrt(inverse[at, at]))
 
 
 def _near(loop: Loop, x: Rigid, z: Rigid, scale: float) -> np.ndarray:

@@ -1,20 +1,15 @@
 """Errors of robot and camera: σ as stated, or estimated in rounds as variance components."""
 
-from dataclasses import dataclass, replace
-from functools import reduce
-from operator import add
+from dataclasses import dataclass
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
-from stcal.geometry.least_squares import minimise
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
 from stcal.geometry.variances import component_variances
 from stcal.handeye.data.pairs import Loop
-from stcal.handeye.methods.bundle import Bundle, Corners
-from stcal.handeye.methods.equations import Components, Equations
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
 """Lower limits of estimated σ, by kind: exact data would give 0."""
@@ -163,64 +158,3 @@ def variance_components(
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)
     return component_variances(residuals, jacobian, parts.known, parts.free, first, (least, most), CAUTION)
-
-
-LEAST_SIGMA = {
-    "corner_px": 1e-6,
-    "robot_rad": 1e-8,
-    "robot_mm": 1e-5,
-    "board_mm": 1e-5,
-    "arm_rad": 1e-8,
-    "arm_mm": 1e-5,
-}
-"""Lower limits of estimated σ: exact data would give 0. The lower limit of the factors of stated camera σ is 1."""
-ROUNDS = 20
-ROUGHLY = 1e-6
-"""Relative fall of the cost below which the minimisation within a round of σ ends."""
-SETTLED = 1e-3
-"""Relative change of σ between rounds below which the iteration has converged."""
-HELD = 1e-10
-"""Share of each unknown's information that is added, so that undetermined unknowns do not make the matrix singular."""
-WORST = "check the poses that fit worst"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BundleSolution:
-    """``linear`` : normal equations about ``state``; ``settled`` : whether σ settled within :data:`ROUNDS`."""
-
-    corners: Corners
-    state: Bundle
-    linear: Equations
-    settled: bool
-
-
-def adjust(corners: Corners, start: Bundle, free: tuple[str, ...]) -> BundleSolution:
-    """Solve, and estimate the σ of the ``free`` groups, in rounds; raises ConvergenceError: no minimum is reached."""
-    state, settled = start, not free
-    for _ in range(ROUNDS if free else 0):
-        state = minimise(state, corners.linear, corners.moved, settled=ROUGHLY).required("hand-eye", WORST).state
-        sigma = corners.sigma | estimated(corners, state, free)
-        change = max(abs(np.log(sigma[name] / corners.sigma[name])) for name in free)
-        corners = replace(corners, sigma=sigma)
-        settled = bool(change < SETTLED)
-        if settled:
-            break
-    minimum = minimise(state, corners.linear, corners.moved).required("hand-eye", WORST)
-    return BundleSolution(corners, minimum.state, minimum.linear, settled)
-
-
-def estimated(corners: Corners, state: Bundle, free: tuple[str, ...]) -> dict[str, float]:
-    """Returns restricted maximum-likelihood σ of ``free`` groups, all else linear (as :func:`variance_components`)."""
-    parts = corners.parts(state)
-    names = tuple(name for name in parts if name in free)
-    fixed = [part.equations for name, part in parts.items() if name not in free]
-    likelihood = Components(
-        [parts[name] for name in names],
-        reduce(add, fixed) if fixed else None,
-        np.array([CAUTION if name in LEAST_SIGMA else 0.0 for name in names]),
-        HELD,
-    )
-    least = np.log([LEAST_SIGMA.get(name, 1.0) / corners.sigma[name] for name in names])
-    farthest = np.full(len(names), FARTHEST)
-    best = likelihood.best(np.maximum(least, -farthest), farthest)
-    return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(names, best, strict=True)}

@@ -6,13 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
+from stcal.adjust.engine import Solution
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, resect
 from stcal.handeye.methods.bundle import Bundle, Corners, LinearArm
-from stcal.handeye.methods.noise import LEAST_SIGMA, Noise
+from stcal.handeye.methods.noise import Noise
 from stcal.io.cameras.model import CameraPrior
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
@@ -30,6 +32,17 @@ SAME_DIGITS = 6
 """Decimals of a millimetre to which two places on the board agree that are one corner."""
 FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1, "arm_rad": 1e-3, "arm_mm": 0.5}
 """First guesses of the σ that are estimated."""
+
+
+LEAST_SIGMA = {
+    "corner_px": 1e-6,
+    "robot_rad": 1e-8,
+    "robot_mm": 1e-5,
+    "board_mm": 1e-5,
+    "arm_rad": 1e-8,
+    "arm_mm": 1e-5,
+}
+"""Lower limits of estimated σ: exact data would give 0. The lower limit of the factors of stated camera σ is 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,25 +146,22 @@ def problem(
     return replace(corners, sigma=sigma | factors), (*free, *factors)
 
 
-def found_of(
-    corners: Corners, state: Bundle, inverse: np.ndarray, reported: Poses, rows: np.ndarray, with_camera: bool
-) -> Reprojection:
+def found_of(corners: Corners, state: Bundle, solution: Solution, reported: Poses, rows: np.ndarray) -> Reprojection:
     """Returns the results. ``rows`` : (m,) row in ``reported`` of each pose of the problem."""
-    at = corners.places()
-    white, _ = corners.seen(state)
-    residuals = corners.sigma["corner_px"] * np.linalg.solve(corners.weight, white[:, :, None])[:, :, 0]
+    inverse = generalised_inverse(solution.normal)
+    covariance = {name: inverse[at, at] for name, at in solution.places.items()}
     true = list(reported)
     for row, pose in zip(rows, state.base_from_flange, strict=True):
         true[row] = pose
     return Reprojection(
         state.camera,
-        inverse[at["camera"], at["camera"]] if with_camera else None,
+        covariance.get("camera"),
         Poses.of(true),
         corners.xyz_board,
         state.scale * state.corners,
         rows[corners.view],
         corners.corner,
-        residuals,
+        corners.residuals(state),
         None if corners.arm is None else corners.arm.parameters + state.arm,
-        None if corners.arm is None else inverse[at["arm"], at["arm"]],
+        covariance.get("arm"),
     )

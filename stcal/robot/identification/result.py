@@ -21,7 +21,7 @@ from stcal.robot.identification.adjustment import (
 from stcal.robot.identification.observability import ObservabilityIndices, Predicted
 from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identification.unexplained import Finding
-from stcal.robot.identification.variances import Components
+from stcal.robot.identification.variances import Spread
 from stcal.robot.kinematics.file import WRITTEN_MM, load_robot
 from stcal.robot.kinematics.model import Elasticity, Robot
 
@@ -147,7 +147,7 @@ class Adjustment:
     weighting: Weighting
     deviations: Deviations
     rows: NominalRows
-    parts: Components
+    parts: Spread
     notes: tuple[str, ...] = ()
 
 

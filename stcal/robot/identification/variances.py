@@ -9,12 +9,12 @@ a normal one.
 """
 
 from dataclasses import astuple, dataclass, replace
+from itertools import compress
 
 import numpy as np
 from scipy.special import chdtr, chdtrc
 
-from stcal.geometry.least_squares import NormalEquations
-from stcal.geometry.variances import Parts
+from stcal.adjust.components import Components, Equations
 from stcal.robot.identification.adjustment import (
     USELESS_MM,
     WIDTH,
@@ -52,11 +52,11 @@ STEP = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Components:
-    """Parts of an adjustment, linear about its solution, in ``units`` (k,) of its parameters. Parts of the data come
-    first, then the groups of the robot's dimensions. ``least``, ``most`` : (p,) limits of log (σ / present σ)."""
+class Spread:
+    """Components of an adjustment, linear about its solution, in ``units`` (k,) of its parameters. Those of the data
+    come first, then the groups of the robot's dimensions. ``least``, ``most`` : (p,) limits of log (σ / present σ)."""
 
-    parts: Parts
+    parts: Components
     least: np.ndarray
     most: np.ndarray
     units: np.ndarray
@@ -71,8 +71,8 @@ class Components:
         """Returns the covariance (k, k) of the parameters about the estimate at ``best`` (p,)."""
         root = self._root(best)
         z, rule = _rule(root.shape[1])
-        log_density, _, step, inverse = self.parts.at(best + z @ root.T)
-        middle = self.parts.at(best[None])
+        log_density, _, step, inverse = map(np.array, zip(*map(self.parts.at, best + z @ root.T), strict=True))
+        middle = self.parts.at(best)
         log_weight = np.log(rule) + log_density - middle[0] + 0.5 * (z**2).sum(1)
         weight = np.exp(log_weight - log_weight.max())
         weight /= weight.sum()
@@ -84,7 +84,8 @@ class Components:
         """Returns a square root (p, f) of the covariance of log σ, for the f components above their lower limit."""
         free = np.flatnonzero(best > self.least + STEP)
         moves = STEP * np.eye(len(best))[free]
-        gradient = self.parts.at(np.concatenate([best + moves, best - moves]))[1]
+        points = np.concatenate([best + moves, best - moves])
+        gradient = np.array([self.parts.at(x)[1] for x in points]).reshape(points.shape)
         hessian = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
         values, directions = np.linalg.eigh(-(hessian + hessian.T) / 2)
         # a flat or rising direction is at most as wide as the prior
@@ -112,7 +113,7 @@ def components(
     robust: bool,
     rows: NominalRows,
     deviations: Deviations,
-) -> Components:
+) -> Spread:
     """Returns the parts of an adjustment: those of the data whose σ is estimated, then groups of dimensions."""
     units = solution.units
     white = weighting.whiten(solution.residuals, measured)
@@ -123,44 +124,48 @@ def components(
     # σ scales the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² does not depend on σ.
     weight = solution.weights[:, None, None]
     scaled = weight**2 * honest[:, None, None]
-    parts, fixed = [], NormalEquations(0.0, np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units)))
+    nothing = Equations.nothing(len(units))
+    parts, fixed = [], replace(nothing, normal=np.eye(len(units)) / USELESS_MM**2)
     for name, columns in weighting.columns(white.shape[1]).items():
         if name in weighting.estimated:
-            equations, count = _linear(white, derivative, columns, scaled), huber_share * white[honest, columns].size
-            parts.append(
-                (equations, count, 0.0, np.inf, max(np.log(LEAST / weighting.value(name)), -FARTHEST), FARTHEST)
-            )
+            equations = _linear(white, derivative, columns, scaled)
+            equations = replace(equations, count=huber_share * white[honest, columns].size)
+            parts.append((equations, 0.0, np.inf, max(np.log(LEAST / weighting.value(name)), -FARTHEST), FARTHEST))
             fixed = fixed + _linear(white, derivative, columns, weight - scaled)
         else:
             fixed = fixed + _linear(white, derivative, columns, weight)
     held, group = rows.held(solution.state, deviations, measured.kind), rows.groups
     e, j = held.value / held.sigma, held.jacobian * units / held.sigma[:, None]
-    fixed = fixed + NormalEquations.of(e[group >= MOMENT], j[group >= MOMENT])
+    fixed = fixed + Equations.of(e[group >= MOMENT], j[group >= MOMENT])
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
         in_group = group == g
         if in_group.any():
             far = NEAREST if g in (AXIS, ACROSS) else FARTHEST
-            equations = NormalEquations.of(e[in_group], j[in_group])
-            parts.append((equations, in_group.sum(), np.log(expected / sigma), DOUBT, -far, far))
-    equations_of_parts, *numbers = zip(*parts, strict=True)
-    count, expected, doubt, least, most = (np.array(values, float) for values in numbers)
-    together, curved = NormalEquations.stacked(equations_of_parts), curvature_of(solution, measured, weighting)
+            parts.append((Equations.of(e[in_group], j[in_group]), np.log(expected / sigma), DOUBT, -far, far))
+    each, *numbers = zip(*parts, strict=True)
+    expected, doubt, least, most = (np.array(values, float) for values in numbers)
+    curved = curvature_of(solution, measured, weighting)
     if curved is not None:
         # At the minimum the data pull as much as held and fixed parts hold; this changes with the σ of these parts.
         held = np.isfinite(doubt)
-        bends = Bent.of(fixed.normal + together.normal[held].sum(0), curved * units[:, None] * units).bends()
-        bent = np.where(held[:, None, None], bends.T @ together.normal @ bends, together.normal)
-        together, fixed = replace(together, normal=bent), replace(fixed, normal=bends.T @ fixed.normal @ bends)
-    return Components(Parts(together, count, fixed, expected, doubt), least, most, units)
+        holding = fixed.normal + sum(own.normal for own in compress(each, held))
+        bends = Bent.of(holding, curved * units[:, None] * units).bends()
+        each = [_bent(own, bends) if holds else own for own, holds in zip(each, held, strict=True)]
+        fixed = _bent(fixed, bends)
+    return Spread(Components(each, fixed, expected, doubt), least, most, units)
 
 
-def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
-    """Returns the normal equations of the residuals e - J δ of some coordinates, with weights (r, 1, 1)."""
-    k = derivative.shape[2]
-    e, j = white[:, columns].ravel(), derivative[:, columns]
-    weighted = (weight * j).reshape(-1, k).T
-    cost = float((weight[:, :, 0] * white[:, columns] ** 2).sum())
-    return NormalEquations(cost, weighted @ j.reshape(-1, k), -(weighted @ e))
+def _bent(equations: Equations, bends: np.ndarray) -> Equations:
+    """Returns equations with BᵀNB in place of their normal matrix N."""
+    return replace(equations, normal=bends.T @ equations.normal @ bends)
+
+
+def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> Equations:
+    """Returns the equations of the residuals e - J δ of some coordinates, with weights (r, 1, 1)."""
+    root = np.sqrt(weight)
+    return Equations.of(
+        (root[:, :, 0] * white[:, columns]).ravel(), -(root * derivative[:, columns]).reshape(-1, derivative.shape[2])
+    )
 
 
 class Relaxation:

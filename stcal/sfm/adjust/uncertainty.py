@@ -311,7 +311,7 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
         along = part.inverse[:, : xyz.size] if quantities is None else part.inverse[:, : xyz.size] @ quantities
         pitch = (group.design @ group.board_at(solution.values).rotation.T / setting.own_sigma_mm()).ravel()
         for rows, batch, total in part.effects(along):
-            kind, flat = rows.factor.kind, total.reshape(-1, k)
+            (kind,), flat = rows.factor.kinds, total.reshape(-1, k)
             covariance[kind] += (state.differ**2 if kind in (CIRCLES, DOTS) else 1.0) * flat.T @ flat
             if kind == BOARD and len(rows.factor.on) > 1:
                 by_scale += flat.T @ pitch[3 * batch.start : 3 * batch.stop]

@@ -1,12 +1,13 @@
 """Variance components against closed forms of the textbook."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from stcal.geometry.least_squares import NormalEquations
-from stcal.geometry.variances import Parts
+from stcal.adjust.components import Components, Equations
 from stcal.robot.identification.adjustment import MOST_BENT, Bent
-from stcal.robot.identification.variances import Components, Relaxation
+from stcal.robot.identification.variances import Relaxation, Spread
 
 
 def regression(
@@ -16,14 +17,13 @@ def regression(
     design = rng.normal(size=(rows, width))
     drawn = rng.normal(size=width) * tau * (np.arange(width) >= width - groups)
     seen = design @ drawn + rng.normal(size=rows) * sigma
-    each, count, doubt = [NormalEquations.of(seen, -design)], [rows], [np.inf]
+    each, doubt = [Equations.of(seen, -design)], [np.inf]
     if groups:
         mine = np.diag((np.arange(width) >= width - groups).astype(float))
-        each, count, doubt = [*each, NormalEquations.of(np.zeros(width), mine)], [rows, groups], [np.inf, 1.0]
-    fixed = NormalEquations(0.0, 1e-12 * np.eye(width), np.zeros(width))
-    parts = Parts(NormalEquations.stacked(each), np.array(count), fixed, np.zeros(len(count)), np.array(doubt))
-    far = np.full(len(count), 3.0)
-    return Components(parts, -far, far, np.ones(width)), design, seen, drawn
+        each, doubt = [*each, replace(Equations.of(np.zeros(width), mine), count=groups)], [np.inf, 1.0]
+    fixed = Equations.of(np.zeros(width), 1e-6 * np.eye(width))
+    far = np.full(len(each), 3.0)
+    return Spread(Components(each, fixed, 0.0, np.array(doubt)), -far, far, np.ones(width)), design, seen, drawn
 
 
 @pytest.mark.parametrize("rows", [14, 24, 104])
@@ -44,7 +44,7 @@ def test_of_several_parts_the_covariance_is_true_on_average():
     for seed in range(400):
         parts, _, _, drawn = regression(np.random.default_rng(seed), 30, 10, 6, 1.0, 0.6)
         best = parts.best()
-        step = parts.parts.at(best[None])[2][0]
+        step = parts.parts.at(best)[2]
         away = step - drawn
         error.append(away @ np.linalg.solve(parts.covariance(best), away) / 10)
     # With the σ taken for known it is 1.18. Three standard errors of the mean of 400 draws:
@@ -54,10 +54,8 @@ def test_of_several_parts_the_covariance_is_true_on_average():
 def test_parts_without_noise_do_not_break_it():
     design = np.random.default_rng(3).normal(size=(20, 3))
     exact = design @ [1.0, 2.0, 3.0]
-    each = NormalEquations.stacked([NormalEquations.of(exact, -design)])
-    none = NormalEquations(0.0, np.zeros((3, 3)), np.zeros(3))
-    parts = Parts(each, np.array([20]), none, np.zeros(1), np.array([np.inf]))
-    parts = Components(parts, np.array([-2.0]), np.array([3.0]), np.ones(3))
+    parts = Components([Equations.of(exact, -design)], Equations.nothing(3), 0.0, np.array([np.inf]))
+    parts = Spread(parts, np.array([-2.0]), np.array([3.0]), np.ones(3))
     best = parts.best()
     assert best == pytest.approx([-2.0])
     assert np.isfinite(parts.covariance(best)).all()

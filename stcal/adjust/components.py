@@ -1,0 +1,138 @@
+"""Normal equations by kind of residual, and from them the σ of each kind: restricted maximum likelihood."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import minimize
+
+from stcal.geometry.normal_equations import Reduction, inverse_and_size, reduce
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Equations:
+    """Normal equations of k kept and of m eliminated unknowns, of ``a`` numbers each.
+
+    ``square`` : sum of the squares of all residuals; ``count`` : their number; ``normal`` : (k, k); ``right`` : (k,),
+    minus half the gradient; ``block`` : (m, a, a) of each eliminated unknown; ``block_right`` : (m, a); ``cross`` : (m,
+    a, k) mixed parts.
+    """
+
+    square: float
+    count: float
+    normal: np.ndarray
+    right: np.ndarray
+    block: np.ndarray
+    block_right: np.ndarray
+    cross: np.ndarray
+
+    @classmethod
+    def nothing(cls, kept: int, eliminated: tuple[int, int] = (0, 1)) -> "Equations":
+        """Return the equations of no residual; ``eliminated`` : m and a."""
+        k, (m, a) = kept, eliminated
+        return cls(0.0, 0.0, np.zeros((k, k)), np.zeros(k), np.zeros((m, a, a)), np.zeros((m, a)), np.zeros((m, a, k)))
+
+    @classmethod
+    def of(cls, residual: np.ndarray, slope: np.ndarray) -> "Equations":
+        """Return the equations of residuals (n,) and their derivatives (n, k), both over σ; nothing is eliminated."""
+        square, count = float(residual @ residual), float(len(residual))
+        none = cls.nothing(slope.shape[1])
+        return cls(square, count, slope.T @ slope, -slope.T @ residual, none.block, none.block_right, none.cross)
+
+    def __add__(self, other: "Equations") -> "Equations":
+        return Equations(*(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)))
+
+    def flat(self) -> np.ndarray:
+        """Return all numbers in a row."""
+        return np.concatenate([np.ravel(getattr(self, each.name)) for each in fields(self)])
+
+    def filled(self, flat: np.ndarray) -> "Equations":
+        """Return equations of the same unknowns with the numbers of :meth:`flat`."""
+        parts, at = [], 0
+        for each in fields(self):
+            own = getattr(self, each.name)
+            parts.append(flat[at : at + np.size(own)].reshape(np.shape(own)))
+            at += np.size(own)
+        return Equations(*parts)
+
+    def alone(self, held: float = 0.0) -> "tuple[np.ndarray, np.ndarray, Reduction]":
+        """Return normal matrix and right side of the kept unknowns alone, and the elimination of the others.
+
+        ``held`` : share of each unknown's information that is added; one on which nothing depends stays.
+        """
+        normal, block = self.normal.copy(), self.block.copy()
+        for diagonal in (np.einsum("kk->k", normal), np.einsum("maa->ma", block)):
+            diagonal[:] = np.where(diagonal > 0, (1 + held) * diagonal, 1.0)
+        reduction = reduce(block, self.block_right, self.cross)
+        return normal - reduction.normal, self.right - reduction.right, reduction
+
+    def told(self, from_kept: np.ndarray) -> np.ndarray:
+        """Return what the residuals tell (k, k) about the kept unknowns, with which the others go: (m, a, k)."""
+        mixed = np.tensordot(from_kept, self.cross, ((0, 1), (0, 1)))
+        return self.normal - mixed - mixed.T + np.tensordot(from_kept, self.block @ from_kept, ((0, 1), (0, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """A linearised adjustment in p parts with a σ each; what is sought is x = log (σ / present σ) (p,).
+
+    ``each`` : p equations of the parts at their present σ; ``fixed`` : equations of what has a known σ; ``expected``,
+    ``doubt`` : (p,) mean and σ of the prior of x, ``doubt`` infinite without a prior; ``caution`` : (p,) redundancy
+    that is not counted; ``held`` : see :meth:`Equations.alone`.
+    """
+
+    each: Sequence[Equations]
+    fixed: Equations
+    expected: np.ndarray | float = 0.0
+    doubt: np.ndarray | float = np.inf
+    caution: np.ndarray | float = 0.0
+    held: float = 0.0
+
+    @cached_property
+    def _flat(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The numbers of all parts (p, N), those of ``fixed`` (N,), and how many residuals of each part count (p,)."""
+        counted = np.array([own.count for own in self.each]) - self.caution
+        return np.array([own.flat() for own in self.each]), self.fixed.flat(), counted
+
+    def at(self, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """Evaluate the posterior at x (p,), by restricted maximum likelihood (Patterson & Thompson 1971).
+
+        Return log posterior density, its gradient (p,), the step of the kept unknowns (k,) from the state, and their
+        covariance (k, k).
+        """
+        share, (each, fixed, counted) = np.exp(-2 * x), self._flat
+        whole = self.fixed.filled(share @ each + fixed)
+        normal, right, reduction = whole.alone(self.held)
+        inverse, size = inverse_and_size(normal)
+        kept = inverse @ right
+        away, dropped = reduction.from_kept, reduction.back(kept)
+        mixed = -away @ inverse
+        of_dropped = reduction.inverse - mixed @ np.swapaxes(away, 1, 2)
+        # Second moments of the unknowns about the state, laid out as what they are multiplied by.
+        moments = Equations(
+            1.0,
+            0.0,
+            inverse + kept[:, None] * kept,
+            -2 * kept,
+            of_dropped + dropped[:, :, None] * dropped[:, None],
+            -2 * dropped,
+            2 * (mixed + dropped[:, :, None] * kept),
+        )
+        doubted = (x - self.expected) / self.doubt
+        size += float(np.linalg.slogdet(reduction.block)[1].sum())
+        left = float(whole.square - kept @ right - reduction.gain)
+        value = -float(x @ counted) - 0.5 * (left + size + float((doubted**2).sum()))
+        return value, share * (each @ moments.flat()) - counted - doubted / self.doubt, kept, inverse
+
+    def best(self, low: np.ndarray, high: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the x (p,) of highest density within bounds (p,), by descents from several ``starts`` (p,)."""
+
+        def downhill(logs: np.ndarray) -> tuple[float, np.ndarray]:
+            """Return minus twice the log density, and its gradient, at the logarithms of the weights, -2x."""
+            value, gradient, _, _ = self.at(-logs / 2)
+            return -2 * value, gradient
+
+        bounds, begin = -2 * np.column_stack([high, low]), [-2 * np.clip(x, low, high) for x in starts]
+        fits = [minimize(downhill, logs, jac=True, method="L-BFGS-B", bounds=bounds) for logs in begin]
+        return -min(fits, key=lambda fit: fit.fun).x / 2
