@@ -269,6 +269,16 @@ class Camera(ByValue):
         jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 0], jacobian[..., 1, 1] = derivatives
         return distorted, jacobian @ _equidistant_jacobian(ideal) if self.fisheye else jacobian
 
+    def pixel_jacobian(self, xy: np.ndarray) -> np.ndarray:
+        """Return the derivative (..., 2, 2) of pixels by ideal normalised coordinates (..., 2)."""
+        return self.focal[:, None] * self.distort_jacobian(xy)[1]
+
+    def projection_jacobian(self, xyz_camera: np.ndarray) -> np.ndarray:
+        """Return the derivative (n, 2, 3) of :meth:`project` by points (n, 3) in the camera frame."""
+        ideal = xyz_camera[:, :2] / xyz_camera[:, 2:]
+        by_ideal = self.pixel_jacobian(ideal)
+        return np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / xyz_camera[:, 2, None, None]
+
     def _distorted_parts(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return distorted x and y, and derivatives x by x, x by y, y by x, y by y; after :func:`_equidistant`."""
         k1, k2, p1, p2, k3, k4, k5, k6, *prisms = self.distortion.tolist()

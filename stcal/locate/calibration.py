@@ -428,7 +428,7 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
     pixels = found.corners_px[own].reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
     board_px2 = np.tile(np.eye(2), (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
-    seen_from_px = np.linalg.inv(camera.distort_jacobian(board_seen)[1] * camera.focal[:, None])
+    seen_from_px = np.linalg.inv(camera.pixel_jacobian(board_seen))
     return ImageCorners(
         name,
         pose,

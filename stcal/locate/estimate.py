@@ -318,7 +318,7 @@ def problem_of(
     rows = (8 * detected.rows[:, None] + np.arange(8)).ravel()
     pixels = detected.corners_px.reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
-    px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
+    px_by_seen = camera.pixel_jacobian(ideal)
     seen_by_px = np.linalg.inv(px_by_seen)
     k, tag = len(detected), np.arange(len(detected))
     by_edges, by_tag = np.zeros((k, 4, 2, k)), np.zeros((k, 4, 2, k, 2))  # px, by shifts of edges and of whole tags

@@ -163,24 +163,14 @@ def pairs_of_views(
     return HandEyePoses(base_from_flange, resection.camera_from_board, None, resection.covariance, names, where)
 
 
-def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns pixels (n, 2) of points (n, 3) in the camera's frame, and their derivative (n, 2, 3)."""
-    depth = xyz_camera[:, 2:]
-    xy = xyz_camera[:, :2] / depth
-    distorted, by_ideal = camera.distort_jacobian(xy)
-    by_point = np.zeros((len(xy), 2, 3))
-    by_point[:, [0, 1], [0, 1]] = 1 / depth
-    by_point[:, :, 2] = -xy / depth
-    return distorted * camera.focal + camera.centre, camera.focal[:, None] * (by_ideal @ by_point)
-
-
 def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
     """Returns residuals (2k,) of a view's corners in σ, and their derivative (2k, 6) by the board's pose."""
     weight = view.whitening()
     rotated = view.xyz_board @ camera_from_board.rotation.T
-    px, by_point = project_jacobian(camera, rotated + camera_from_board.translation)
+    xyz = rotated + camera_from_board.translation
+    by_point = camera.projection_jacobian(xyz)
     by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
-    return np.einsum("kab,kb->ka", weight, px - view.xy_px).ravel(), (weight @ by_pose).reshape(-1, 6)
+    return np.einsum("kab,kb->ka", weight, camera.project(xyz) - view.xy_px).ravel(), (weight @ by_pose).reshape(-1, 6)
 
 
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:

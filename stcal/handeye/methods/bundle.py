@@ -13,7 +13,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import length_limit
-from stcal.handeye.data.views import project_jacobian
 
 SETTLED_MM = 1e-3
 """Largest motion of a flange in a round of linear steps, in mm, after which only squares of the motion are
@@ -221,8 +220,7 @@ class Corners:
         else:
             mount_from_stand = np.swapaxes(turn, 1, 2)
             by_hand = np.concatenate([mount_from_stand @ skew(stand - place), -mount_from_stand], axis=2)
-        _, by_point = project_jacobian(state.camera, xyz_camera)
-        by_mount = by_point @ x.rotation.T
+        by_mount = state.camera.projection_jacobian(xyz_camera) @ x.rotation.T
         by_stand = by_mount @ mount_from_stand
         of_board = stand - z.translation
         slopes = {

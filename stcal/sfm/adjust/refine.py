@@ -93,9 +93,7 @@ def jacobians(
     xyz: np.ndarray, rotation: np.ndarray, translation: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns :func:`projection_jacobians` of points (n, 3) in cameras with poses (n, 3, 3), (n, 3)."""
-    ideal = xyz[:, :2] / xyz[:, 2:]
-    by_ideal = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
-    by_camera = np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / xyz[:, 2, None, None]
+    by_camera = camera.projection_jacobian(xyz)
     return np.concatenate([-by_camera @ skew(xyz - translation), by_camera], axis=2), by_camera @ rotation
 
 

@@ -66,7 +66,7 @@ def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
     jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)
     x, y = ideal.T
     rotation = np.stack([np.stack([-x * y, 1 + x * x, -y], axis=-1), np.stack([-1 - y * y, x * y, x], axis=-1)], axis=1)
-    by_ideal = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
+    by_ideal = camera.pixel_jacobian(ideal)
     by_rotation = (by_ideal @ rotation).reshape(-1, 3)
     flat = jacobian.reshape(len(by_rotation), -1)
     return (flat - by_rotation @ np.linalg.lstsq(by_rotation, flat, rcond=None)[0]).reshape(jacobian.shape)

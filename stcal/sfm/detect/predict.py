@@ -137,7 +137,7 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
 
 def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
     """Returns the largest and smallest ratio, in any direction, of measured ellipses (normalised) to expected ones."""
-    local = camera.focal[:, None] * camera.distort_jacobian(centre)[1]
+    local = camera.pixel_jacobian(centre)
     return singular_values(np.linalg.solve(shape_px, local @ shape))
 
 

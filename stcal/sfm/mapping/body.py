@@ -9,11 +9,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.engine import Adjustment
 from stcal.design import FaceDesign
 from stcal.errors import DegenerateError, MappingError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import Normal, PoseStack, descend, minimise
-from stcal.geometry.normal_equations import blocks_of, reduce
+from stcal.geometry.least_squares import Normal, PoseStack, descend
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
@@ -35,6 +36,8 @@ MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
 """Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
 LEAST_SIGMA_OFF = 0.02
 """σ of such a logarithm that the reflections of views and a rough camera leave to any."""
+LEAST_FOCAL = 0.1
+"""Smallest focal length of the camera, as a share of that at the start."""
 BETTER = 0.2
 """Share by which another pose of a face must fit its corners better."""
 BY_CHANCE = 0.01
@@ -378,30 +381,6 @@ def _images(
     return PoseStack(rotation, translation), placed
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Equations:
-    """Normal equations over the placed faces but one and the intrinsics, with the images eliminated."""
-
-    cost: float
-    normal: np.ndarray
-    right: np.ndarray
-    block: np.ndarray
-    block_right: np.ndarray
-    cross: np.ndarray
-
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step of faces and intrinsics, then of the images, and the predicted gain."""
-        held = self.block + damping * self.block * np.eye(6)
-        reduction = reduce(held, self.block_right, self.cross)
-        scale = np.sqrt(np.maximum(np.diag(self.normal), 1e-300))
-        left = self.normal + damping * np.diag(scale**2) - reduction.normal
-        outer = np.linalg.lstsq(left / scale[:, None] / scale, (self.right - reduction.right) / scale, rcond=1e-12)[0]
-        outer = outer / scale
-        inner = reduction.back(outer)
-        gain = float(outer @ self.right + (inner * self.block_right).sum())
-        return np.concatenate([outer, inner.ravel()]), gain
-
-
 def adjust_body(
     start: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera, rounds: int = ROBUST_ROUNDS
 ) -> Body:
@@ -417,77 +396,44 @@ def adjust_body(
     return replace(body, cost=float(huber_cost(length, HUBER * max(robust_sigma(length, 2), 1e-3)).sum()))
 
 
-def _minimum(body: Body, used: Corners, basis, prior, given: Camera, huber: float) -> Body:
-    faces, images = np.flatnonzero(body.placed_faces), np.flatnonzero(body.placed_images)
-    free = faces[1:]
-    face_place, image_place = np.full(len(body.placed_faces), -1), np.full(len(body.placed_images), -1)
-    face_place[free], image_place[images] = np.arange(len(free)), np.arange(len(images))
-    q, m, k = basis.shape[1], len(images), 6 * len(free)
-    away = np.linalg.pinv(basis)
+def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera, huber: float) -> Body:
+    a, q = Adjustment(), basis.shape[1]
+    held = ~body.placed_faces
+    held[body.placed_faces.argmax()] = True
+    faces = a.block("faces", body.body_from_face, fixed=np.flatnonzero(held))
+    images = a.block("images", body.camera_from_body, eliminate=True, fixed=np.flatnonzero(~body.placed_images))
+    on: list[tuple[Block, np.ndarray | None]] = [(faces, used.face), (images, used.image)]
+    if q:
+        lens = a.block("lens", Vector(np.zeros((1, q))))
+        a.prior(lens, (np.linalg.pinv(basis) @ (given.parameters() - body.camera.parameters()))[None], prior)
+        on.append((lens, None))
 
-    def cost(state: Body) -> float:
-        length = state.lengths(used)
-        if not np.isfinite(length).all():
-            return np.inf
-        off = away @ (state.camera.parameters() - given.parameters())
-        return float(huber_cost(length, huber).sum() + off @ prior @ off)
+    def at(faces: PoseStack, images: PoseStack, *lens: Vector) -> Body:
+        parameters = body.camera.parameters() + sum(basis @ own.array[0] for own in lens)
+        parameters[:2] = np.maximum(parameters[:2], LEAST_FOCAL * body.camera.focal)
+        camera = body.camera.with_parameters(parameters)
+        return replace(body, body_from_face=faces, camera_from_body=images, camera=camera)
 
-    def linearise(state: Body) -> _Equations:
-        f, i = state.body_from_face, state.camera_from_body
-        in_face = np.einsum("nij,nj->ni", f.rotation[used.face], used.xyz_face())
-        in_body = in_face + f.translation[used.face]
-        rotated = np.einsum("nij,nj->ni", i.rotation[used.image], in_body)
-        p = rotated + i.translation[used.image]
-        ideal = p[:, :2] / p[:, 2:]
-        distorted, by_ideal = state.camera.distort_jacobian(ideal)
-        by_ideal = state.camera.focal[:, None] * by_ideal
-        by_camera = np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / p[:, 2, None, None]
-        residual = used.xy_px - (distorted * state.camera.focal + state.camera.centre)
-        residual = np.einsum("nij,nj->ni", used.root, residual)
-        root = np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None, None] * used.root
-        weighted = residual * np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None]
-        by_image = root @ np.concatenate([-by_camera @ skew(rotated), by_camera], axis=2)
-        turned = by_camera @ i.rotation[used.image]
-        by_face = root @ np.concatenate([-turned @ skew(in_face), turned], axis=2)
-        by_lens = root @ (state.camera.parameter_jacobian(ideal) @ basis)
-        place, own = image_place[used.image], face_place[used.face]
-        block, block_right = blocks_of(by_image, weighted, place, m)
-        normal, right, cross = np.zeros((k + q, k + q)), np.zeros(k + q), np.zeros((m, 6, k + q))
-        on = own >= 0
-        blocks, rights = blocks_of(by_face[on], weighted[on], own[on], len(free))
-        columns = 6 * np.arange(len(free))[:, None] + np.arange(6)
-        normal[columns[:, :, None], columns[:, None]] = blocks
-        right[:k] = rights.ravel()
-        coupled = np.zeros((m, len(free), 6, 6))
-        np.add.at(coupled, (place[on], own[on]), np.swapaxes(by_image[on], 1, 2) @ by_face[on])
-        cross[:, :, :k] = coupled.transpose(0, 2, 1, 3).reshape(m, 6, k)
-        if q:
-            np.add.at(cross[:, :, k:], place, np.swapaxes(by_image, 1, 2) @ by_lens)
-            to_lens = np.zeros((len(free), 6, q))
-            np.add.at(to_lens, own[on], np.swapaxes(by_face[on], 1, 2) @ by_lens[on])
-            normal[:k, k:] = to_lens.reshape(k, q)
-            normal[k:, :k] = normal[:k, k:].T
-            off = away @ (state.camera.parameters() - given.parameters())
-            normal[k:, k:] = np.einsum("nki,nkj->ij", by_lens, by_lens) + prior
-            right[k:] = np.einsum("nki,nk->i", by_lens, weighted) - prior @ off
-        return _Equations(cost(state), normal, right, block, block_right, cross)
+    def residuals(*own) -> np.ndarray:
+        state = at(*own)
+        return state.camera.project(state.xyz_camera(used)) - used.xy_px
 
-    def moved(state: Body, step: np.ndarray) -> Body:
-        face_step, image_step = np.zeros((len(state.placed_faces), 6)), np.zeros((len(state.placed_images), 6))
-        face_step[free], image_step[images] = step[:k].reshape(-1, 6), step[k + q :].reshape(-1, 6)
-        camera = state.camera
-        if q:
-            parameters = camera.parameters() + basis @ step[k : k + q]
-            parameters[:2] = np.maximum(parameters[:2], 0.1 * camera.focal)
-            camera = camera.with_parameters(parameters)
-        return replace(
-            state,
-            body_from_face=state.body_from_face.moved(face_step),
-            camera_from_body=state.camera_from_body.moved(image_step),
-            camera=camera,
-        )
+    def slopes(*own) -> list[np.ndarray]:
+        state, (faces, images, *lens) = at(*own), own
+        xyz, turn = state.xyz_camera(used), images.rotation[used.image]
+        in_face = np.einsum("nij,nj->ni", faces.rotation[used.face], used.xyz_face())
+        by_point = state.camera.projection_jacobian(xyz)
+        by_body = by_point @ turn
+        by_face = np.concatenate([-by_body @ skew(in_face), by_body], axis=2)
+        by_image = np.concatenate([-by_point @ skew(xyz - images.translation[used.image]), by_point], axis=2)
+        by_lens = [state.camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens]
+        return [by_face, by_image, *by_lens]
 
-    return minimise(body, linearise, moved, cost=cost, settled=1e-7, max_steps=MAX_STEPS).state
+    a.factor(residuals, on, derivatives=slopes, root=used.root, loss=Huber(huber))
+    start = {block.name: block.start for block in a.blocks}
+    if not np.isfinite(a.cost(start)):
+        return body
+    return at(*a.minimum(start, settled=1e-7, max_steps=MAX_STEPS).state.values())
 
 
 def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:

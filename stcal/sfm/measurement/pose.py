@@ -258,7 +258,7 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     rows = (3 * place[:, None] + np.arange(3)).ravel()
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
     ideal = camera.normalised_from_pixel(centre[used])
-    px_by_centre = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
+    px_by_centre = camera.pixel_jacobian(ideal)
     centre_by_px = np.linalg.inv(px_by_centre)
     by_camera, prior_covariance = np.zeros((len(used), 2, 0)), np.zeros((0, 0))
     if prior is not None:
