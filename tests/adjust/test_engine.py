@@ -191,3 +191,11 @@ def test_a_member_that_its_rows_do_not_determine_stays():
     found = a.solve().values
     assert found["shift"].array == pytest.approx(1)
     assert found["points"].array == pytest.approx(np.array([[0, 0], [1, 0], [2, 0]]), abs=1e-6)
+
+
+def test_a_factor_without_rows_changes_nothing():
+    a = problem("pose", np.random.default_rng(1))
+    before = a.solve().values["focal"].array
+    points, none = next(block for block in a.blocks if block.name == "point"), np.zeros(0, int)
+    a.factor(lambda own: own.array[none], [(points, none)])
+    assert a.solve().values["focal"].array == pytest.approx(before, rel=1e-9)
