@@ -2,9 +2,11 @@
 
 Residuals of one photograph have much in common that a model of independent errors does not know: light, focus, the
 edges of its blur. Photographs are what is drawn anew; how their pulls on the answer scatter tells σ, whatever they have
-in common inside (Liang & Zeger 1986). With few of them that scatter is itself uncertain; it is corrected for the
-share that a photograph has in the answer (CR2, Bell & McCaffrey 2002), drawn towards one common factor as far as chance
-explains the difference (Ledoit & Wolf 2004), and what it adds is that of Student's distribution.
+in common inside (Liang & Zeger 1986). With few of them that scatter is itself uncertain. It is corrected for the share
+that a photograph has in the answer: as for independent errors (CR2), and, as far as photographs differ beyond chance
+(James & Stein 1961), as for errors that they have in common, which pull the answer after them (CR3, the jackknife; Bell
+& McCaffrey 2002). It is drawn towards one common factor as far as chance explains the difference (Ledoit & Wolf 2004),
+and what it adds is that of Student's distribution.
 """
 
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ MOST_SHARE = 1 - 1e-6
 """Largest share of a direction's information in one cluster for which its pull is corrected."""
 LEAST_FREEDOM = 3.0
 """Smallest number of degrees of freedom for which Student's variance is used, which is infinite for two."""
+TINY = 1e-150
 LEAST_TOLD = 1e-14
 """Smallest eigenvalue of a normal matrix of unit diagonal: below it is rounding, and σ are enormous."""
 
@@ -35,13 +38,14 @@ class ByClusters:
     freedom: np.ndarray
 
 
-def released(values: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return what clusters would show, had they not taken part in the answer (CR2).
+def released(values: np.ndarray, share: np.ndarray, power: float = 0.5) -> np.ndarray:
+    """Return what clusters would show, had they not taken part in the answer.
 
-    ``values`` : (…, k) what they show, of unit variance by itself; ``share`` : (…, k, k) part that the answer took
+    ``values`` : (…, k) what they show, of unit variance by itself; ``share`` : (…, k, k) part that the answer took;
+    ``power`` : 0.5 for the variance of independent errors (CR2), 1 for the answer without the cluster (CR3)
     """
     taken, axes = np.linalg.eigh((share + np.swapaxes(share, -1, -2)) / 2)
-    along = (np.swapaxes(axes, -1, -2) @ values[..., None])[..., 0] / np.sqrt(1 - np.clip(taken, 0, MOST_SHARE))
+    along = (np.swapaxes(axes, -1, -2) @ values[..., None])[..., 0] / (1 - np.clip(taken, 0, MOST_SHARE)) ** power
     return (axes @ along[..., None])[..., 0]
 
 
@@ -60,16 +64,20 @@ def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -
     half = vector / np.sqrt(np.maximum(value, LEAST_TOLD)) / scale[:, None]
     inverse = half @ half.T
     unit = half.T @ information @ half
-    rows = released(pull @ half, unit)
-    scatter, told, n = rows.T @ rows, unit.sum(0), len(rows)
-    factor = float(np.trace(scatter) / max(np.trace(told), 1e-300))
-    common = max(1.0, factor) * told
+    told, n = unit.sum(0), len(pull)
+    size = max(float(np.trace(told)), TINY)
+    factor = float((released(pull @ half, unit) ** 2).sum()) / size
+    chance = 2 / pull.size  # variance of the factor by chance
+    beyond = max(0.0, 1 - chance / max(factor - 1, TINY) ** 2)
+    rows = released(pull @ half, unit, 0.5 + 0.5 * beyond)
+    scatter = rows.T @ rows
+    common = max(1.0, float(np.trace(scatter)) / size) * told
     by_chance = sum(((n * np.outer(row, row) - scatter) ** 2).sum() for row in rows) / n**2
-    drawn = min(1.0, by_chance / max(((scatter - common) ** 2).sum(), 1e-300))
+    drawn = min(1.0, by_chance / max(((scatter - common) ** 2).sum(), TINY))
     value, vector = np.linalg.eigh(drawn * common + (1 - drawn) * scatter + np.eye(len(told)) - told)
     more = half @ (vector * np.maximum(value - 1, 0)) @ vector.T @ half.T
     of_cluster = np.einsum("pi,vij,jp->pv", inverse, information, inverse)
-    freedom = of_cluster.sum(1) ** 2 / np.maximum((of_cluster**2).sum(1), 1e-300) - 1
+    freedom = of_cluster.sum(1) ** 2 / np.maximum((of_cluster**2).sum(1), TINY) - 1
     counted = np.maximum(freedom, LEAST_FREEDOM)
     student = np.sqrt(counted / (counted - 2))
     covariance = inverse + student[:, None] * more * student

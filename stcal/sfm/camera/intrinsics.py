@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.geometry.variances import sigma_factor
 from stcal.labels import DotLabel, Label
-from stcal.sfm.adjust.equations import robust_weights
+from stcal.sfm.adjust.equations import normalised, robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px
 from stcal.sfm.camera.equations import Board, Normal, Setting, State, dots_costs, minimum
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
@@ -173,6 +173,9 @@ SETTLED_SHIFT_PX = 1e-5
 """Largest change of an eccentricity in the last round, px."""
 LEAST_ROBUST = 1e-6
 """Smallest robust σ of normalised residuals, for exact data."""
+LOUD = 1.5
+"""Ratio of a photograph's residuals to those of most from which its σ grow with them: a photograph that was moved or out
+of focus does not decide. Of 20 centres, chance exceeds it in one photograph of 600."""
 LEAST_DOTS = 0.1
 """Smallest factor of the dots' σ: dots may be more accurate than the board file states, but never exact."""
 MIN_BOARD_REDUNDANCY = 20.0
@@ -377,17 +380,29 @@ def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDe
 
 
 def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board: BoardDesign) -> State:
-    """Returns the state with scaled σ of the centres and updated eccentricity."""
+    """Returns the state with scaled σ of the centres, larger ones in loud photographs, and updated eccentricity."""
     radius: dict[Label, float] = {**board.radius_of()}
+    equal = [replace(m, covariance_px2=factors.centres**2 * each) for m, each in zip(state.models, own, strict=True)]
+    loud = _loudness(replace(state, models=tuple(equal)))
     models = tuple(
         replace(
-            m,
-            shift_px=eccentricity_px(m, state.camera, radius, 1.0),
-            covariance_px2=factors.centres**2 * covariance,
+            model,
+            shift_px=eccentricity_px(model, state.camera, radius, 1.0),
+            covariance_px2=times[model.image_index, None, None] ** 2 * model.covariance_px2,
         )
-        for m, covariance in zip(state.models, own, strict=True)
+        for model, times in zip(equal, loud, strict=True)
     )
     return replace(state, models=models)
+
+
+def _loudness(state: State) -> list[np.ndarray]:
+    """Returns by model the factor on σ of each photograph: above 1 where its residuals exceed those of most by far."""
+    sizes = []
+    for model in state.models:
+        length = np.linalg.norm(normalised(model, state.camera), axis=1)
+        sizes.append(np.array([robust_sigma(length[rows], 2) for rows in model.rows_by_image()]))
+    usual = LOUD * max(float(np.median(np.concatenate(sizes))), LEAST_ROBUST)
+    return [np.maximum(own / usual, 1.0) for own in sizes]
 
 
 def _updated_factors(last: Normal, factors: SigmaFactors) -> tuple[SigmaFactors, dict[str, Board]]:
