@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,16 @@ from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel, Label, dot_cells
 from stcal.lengths import require_millimetres, side
+
+
+class Distinct:
+    """A board that no turn leaves as it looks: its tags, or its boards, differ."""
+
+    __slots__ = ()
+
+    def symmetries(self) -> list[Rigid]:
+        """Return an empty list."""
+        return []
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +54,7 @@ class ChessboardDesign:
 
 
 @dataclass(frozen=True, slots=True)
-class CharucoDesign:
+class CharucoDesign(Distinct):
     """A ChArUco board of ``rows`` × ``columns`` squares of ``square_mm``, with tags in the white squares.
 
     The tags have the size ``marker_mm`` and are from ``dictionary``.
@@ -70,10 +81,6 @@ class CharucoDesign:
         """Return the inner corners, ((rows − 1)·(columns − 1), 2), row-major, mm."""
         row, column = np.divmod(np.arange((self.rows - 1) * (self.columns - 1)), self.columns - 1)
         return self.square_mm * (1 + np.column_stack([column, row]).astype(float))
-
-    def symmetries(self) -> list[Rigid]:
-        """Return an empty list: the tags differ."""
-        return []
 
 
 UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
@@ -112,7 +119,7 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class TagLayout(Brief):
+class TagLayout(Distinct, Brief):
     """Tags in one plane, Z into it.
 
     Parameters
@@ -190,13 +197,9 @@ class TagLayout(Brief):
         """Return the corners (4n, 2), tag by tag, mm."""
         return self.corners_mm.reshape(-1, 2)
 
-    def symmetries(self) -> list[Rigid]:
-        """Return an empty list: the tags differ."""
-        return []
-
 
 @dataclass(frozen=True, slots=True)
-class AprilGridDesign:
+class AprilGridDesign(Distinct):
     """An AprilGrid of ``rows`` × ``columns`` AprilTags of ``tag_mm`` (outer edge of the black border), as of Kalibr.
 
     The step from tag to tag is ``tag_mm`` · (1 + ``spacing``). Ids count up from ``first_id`` along the bottom row,
@@ -233,10 +236,6 @@ class AprilGridDesign:
     def xy_mm(self) -> np.ndarray:
         """Return the corners (4·rows·columns, 2), tag by tag, in the order of the detectors, mm."""
         return self.layout().xy_mm()
-
-    def symmetries(self) -> list[Rigid]:
-        """Return an empty list: the tags differ."""
-        return []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,6 +279,7 @@ class AsymmetricCirclesDesign:
     polarity: Polarity
     sigma_mm: float = 0.005
     rings: tuple[tuple[int, int], ...] = ()
+    LATTICE: ClassVar[type[LatticePart]] = LatticePart
 
     def __post_init__(self):
         require_fields(self, "asymmetric circles")
@@ -296,10 +296,6 @@ class AsymmetricCirclesDesign:
         """Return a half turn if the number of rows is even, so that first and last row differ in their shift."""
         return [] if self.rows % 2 or self.rings else turns(self.xy_mm(), [2])
 
-    def _ring_cells(self, cells: np.ndarray) -> tuple[tuple[int, int], ...]:
-        """Return row and column in the lattice of the circles with a hole; ``cells`` : (n, 2) of all circles."""
-        return tuple((int(v), int(u)) for v, u in (cells[row * self.columns + place] for row, place in self.rings))
-
     def radii_mm(self) -> np.ndarray:
         """Return the radii, (rows·columns,), mm."""
         if self.radius_mm is None:
@@ -310,23 +306,19 @@ class AsymmetricCirclesDesign:
         """Return the distance of neighbouring circles, mm."""
         return float(np.sqrt(2) * self.spacing_mm)
 
-    def lattice(self) -> LatticePart:
-        """Return the square lattice, rotated by 45°, of which the circles occupy some places."""
+    def _cells(self) -> np.ndarray:
+        """Return row and column of all circles in the lattice, (n, 2): the square one, rotated by 45°."""
         x, y = self._steps().T
-        cells = np.column_stack([y - x, y + x]) // 2
-        cells = cells - cells.min(0)
+        return np.column_stack([y - x, y + x]) // 2
+
+    def lattice(self) -> LatticePart:
+        """Return the lattice of which the circles occupy some places."""
+        cells = self._cells() - self._cells().min(0)
         rows, columns = (cells.max(0) + 1).tolist()
-        return LatticePart(
-            rows,
-            columns,
-            self.nearest_mm(),
-            self.radii_mm()[0],
-            self.polarity,
-            self.sigma_mm,
-            rings=self._ring_cells(cells),
-            taken=cells,
-            circles=self,
-        )
+        sizes = rows, columns, self.nearest_mm(), self.radii_mm()[0]
+        ringed = (cells[row * self.columns + place].tolist() for row, place in self.rings)
+        rings = tuple((row, column) for row, column in ringed)
+        return self.LATTICE(*sizes, self.polarity, self.sigma_mm, rings=rings, taken=cells, circles=self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -350,23 +342,19 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
     √3 / 2 · ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`.
     """
 
+    LATTICE: ClassVar[type[LatticePart]] = HexagonalPart
+
     def _steps(self) -> np.ndarray:
-        row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        return np.column_stack([place - row // 2, row]) @ HEXAGONAL.T
+        return self._cells()[:, ::-1] @ HEXAGONAL.T
 
     def nearest_mm(self) -> float:
         """Return the distance of neighbouring circles, mm."""
         return self.spacing_mm
 
-    def lattice(self) -> HexagonalPart:
-        """Return the hexagonal lattice, whose rows are shifted by half a pitch each."""
+    def _cells(self) -> np.ndarray:
+        """Return row and column of all circles in the hexagonal lattice, whose rows are shifted by half a pitch."""
         row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        cells = np.column_stack([row, place - row // 2])
-        cells = cells - cells.min(0)
-        rows, columns = (cells.max(0) + 1).tolist()
-        sizes = rows, columns, self.spacing_mm, self.radii_mm()[0]
-        rings = self._ring_cells(cells)
-        return HexagonalPart(*sizes, self.polarity, self.sigma_mm, rings=rings, taken=cells, circles=self)
+        return np.column_stack([row, place - row // 2])
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign
@@ -438,7 +426,7 @@ def _ranked(values: np.ndarray) -> tuple[tuple[float, ...], np.ndarray]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BoardSet:
+class BoardSet(Distinct):
     """A set of several boards that are fixed relative to one another.
 
     ``names`` : name of each board in messages; ``boards`` : flat boards that look different in images, each without
@@ -457,10 +445,6 @@ class BoardSet:
         """Return the points of all boards, board by board, (n, 3) mm in the frame of the set."""
         parts = zip(self.common_from_board, self.boards, strict=True)
         return np.concatenate([place @ np.pad(board.xy_mm(), ((0, 0), (0, 1))) for place, board in parts])
-
-    def symmetries(self) -> list[Rigid]:
-        """Return an empty list: none of the boards has a symmetry."""
-        return []
 
 
 def turns(xy_mm: np.ndarray, quarters: list[int]) -> list[Rigid]:

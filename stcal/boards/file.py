@@ -336,16 +336,11 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     kind = content.get("type", "circles")
     if kind == "circles":
         return board_design(validated(content, BoardEntry, where), where)
-    if kind == "chessboard":
-        data = validated(content, _Chessboard, where)
-        require_millimetres([side("square_mm", data.square_mm)], data.unusual_size, where)
-        return ChessboardDesign(data.rows, data.columns, data.square_mm, data.sigma_mm)
-    if kind == "charuco":
-        return _charuco(validated(content, _Charuco, where), where)
+    for design, entry in GRIDS.items():
+        if kind == TYPES[design]:
+            return _grid(design, validated(content, entry, where), where)
     if kind == "tags":
         return _tags(validated(content, TagsFile, where), where)
-    if kind == "aprilgrid":
-        return _aprilgrid(validated(content, _AprilGrid, where), where)
     if kind in ("asymmetric-circles", "hexagonal-circles"):
         return _asymmetric(validated(content, _AsymmetricCircles, where), where)
     if kind == SET:
@@ -369,17 +364,30 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
         return yaml_content(text, ("target_type",) if "target_type" in text else BUNDLE_KEYS)
 
 
-def _charuco(data: _Charuco, where: str) -> CharucoDesign:
-    lengths = [side("square_mm", data.square_mm), side("marker_mm", data.marker_mm)]
-    require_millimetres(lengths, data.unusual_size, where)
-    if data.marker_mm > MOST_MARKER * data.square_mm:
+GRIDS = {ChessboardDesign: _Chessboard, CharucoDesign: _Charuco, AprilGridDesign: _AprilGrid}
+"""Entries of boards of squares and of tags in rows, whose keys are the fields of the board."""
+
+
+def _grid(
+    design: type[ChessboardDesign | CharucoDesign | AprilGridDesign], data: Sized, where: str
+) -> ChessboardDesign | CharucoDesign | AprilGridDesign:
+    board = design(**data.model_dump(exclude={"type", "unusual_size"}))
+    require_millimetres(_lengths(board), data.unusual_size, where)
+    if isinstance(board, ChessboardDesign):
+        return board
+    if isinstance(board, CharucoDesign) and board.marker_mm > MOST_MARKER * board.square_mm:
         raise InputError(
             "E-BOARD-MARKER-SIZE",
-            f"{where}: marker_mm {data.marker_mm:g}, under {MOST_MARKER:g} of square_mm {data.square_mm:g} needed; "
+            f"{where}: marker_mm {board.marker_mm:g}, under {MOST_MARKER:g} of square_mm {board.square_mm:g} needed; "
             "are they swapped?",
         )
-    board = CharucoDesign(**data.model_dump(exclude={"type", "unusual_size"}))
-    _require_tags(board, where)
+    ids = board.tag_ids()
+    if ids.stop > (count := count_of(board.dictionary)):
+        raise InputError(
+            "E-TAG-ID-RANGE",
+            f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
+            "columns, first_id or dictionary",
+        )
     return board
 
 
@@ -430,24 +438,6 @@ def _require_convex(corners: np.ndarray, where: str) -> None:
             "E-TAG-CORNERS",
             f"{where}: corners_mm turn the other way, cross or lie on a line; top left, top right, bottom right, "
             "bottom left as printed needed, Y downwards",
-        )
-
-
-def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
-    require_millimetres([side("tag_mm", data.tag_mm)], data.unusual_size, where)
-    board = AprilGridDesign(**data.model_dump(exclude={"type", "unusual_size"}))
-    _require_tags(board, where)
-    return board
-
-
-def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
-    """Refuse a board that needs more tags than its dictionary has."""
-    ids = board.tag_ids()
-    if ids.stop > (count := count_of(board.dictionary)):
-        raise InputError(
-            "E-TAG-ID-RANGE",
-            f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
-            "columns, first_id or dictionary",
         )
 
 

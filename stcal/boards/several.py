@@ -7,16 +7,9 @@ from typing import Any, Literal
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import (
-    AprilGridDesign,
-    AsymmetricCirclesDesign,
-    BoardSet,
-    CharucoDesign,
-    ChessboardDesign,
-    FlatBoard,
-    TagLayout,
-)
+from stcal.boards.design import AsymmetricCirclesDesign, BoardSet, CharucoDesign, ChessboardDesign, FlatBoard
 from stcal.boards.file import SET, board_content, design_of, flat_board, load_flat_board
+from stcal.boards.target import tags_on
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
@@ -125,7 +118,7 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
                 f"{part.rows}×{part.columns} inner corners are seen in {inner[0]}×{inner[1]} too; one with more rows "
                 "and fewer columns, or tags, needed"
             )
-    if common := sorted(_tags(first) & _tags(second)):
+    if common := sorted(set(tags_on(first)) & set(tags_on(second))):
         return f"both have tag {common[0][1]} of {common[0][0]}; other ids (first_id) or another dictionary needed"
     return ""
 
@@ -139,12 +132,3 @@ def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
     if isinstance(board, ChessboardDesign):
         return board.rows, board.columns
     return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None
-
-
-def _tags(board: BoardDesign | FlatBoard) -> set[tuple[str, int]]:
-    """Return dictionary and id of each of the board's tags."""
-    if isinstance(board, TagLayout):
-        return set(board.tags)
-    if isinstance(board, CharucoDesign | AprilGridDesign):
-        return {(board.dictionary, tag) for tag in board.tag_ids()}
-    return set()

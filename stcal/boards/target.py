@@ -5,14 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from stcal.boards.design import (
-    TAG_SIGMA_MM,
-    AprilGridDesign,
-    CharucoDesign,
-    ChessboardDesign,
-    FlatBoard,
-    TagLayout,
-)
+from stcal.boards.design import TAG_SIGMA_MM, AprilGridDesign, CharucoDesign, FlatBoard, TagLayout
 from stcal.boards.file import TYPES, flat_board, keys_of, tag_rows
 from stcal.design import POINT_RADIUS_MM, FaceDesign, TargetDesign, reference_target
 from stcal.errors import InputError
@@ -86,12 +79,12 @@ load_target, save_target = load_body, save_body
 
 
 def tags_on(printed: Any) -> list[tuple[str, int]]:
-    """Return dictionary and id of every tag of a board or layout; a chessboard has none."""
+    """Return dictionary and id of every tag of a board or layout; a chessboard, or a board of circles, has none."""
     if isinstance(printed, TagLayout):
         return list(printed.tags)
-    if isinstance(printed, ChessboardDesign):
-        return []
-    return [(printed.dictionary, tag) for tag in printed.tag_ids()]
+    if isinstance(printed, CharucoDesign | AprilGridDesign):
+        return [(printed.dictionary, tag) for tag in printed.tag_ids()]
+    return []
 
 
 def printed_face(

@@ -3,9 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
-from stcal.cli.help import PLAIN, Commands
+from stcal.cli.help import group
 from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, warn
 from stcal.errors import InputError
@@ -13,12 +11,7 @@ from stcal.errors import InputError
 if TYPE_CHECKING:
     from stcal.io.cameras.difference import LoadedLens
 
-app = typer.Typer(
-    name="stcal camera",
-    help="Show, convert and compare camera files of this and other programs.",
-    cls=Commands,
-    **PLAIN,
-)
+app = group("stcal camera", "Show, convert and compare camera files of this and other programs.")
 
 
 Form = Literal["colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab"]

@@ -3,6 +3,7 @@
 from copy import copy
 from typing import Any
 
+import typer
 from typer.core import TyperCommand, TyperGroup
 
 PLAIN: dict[str, Any] = {
@@ -15,35 +16,20 @@ PLAIN: dict[str, Any] = {
 
 
 PANELS = {
-    "Input": ("setup", "dry_run"),
-    "Method": (),
-    "Output": ("out", "strict", "overwrite", "quiet", "verbose"),
-    "Performance": ("workers", "scheduler", "send_images"),
-    "Input in other forms": (
-        *(
-            "rotation",
-            "length_unit",
-            "poses_are",
-            "first",
-            "second",
-            "key",
-            "quaternions",
-            "undo_flips",
-            "camera_name",
-        ),
-    ),
-    "Noise": (
-        *("sigma_robot_mm", "sigma_robot_deg", "sigma_camera_mm", "sigma_camera_deg", "sigma_board_mm"),
-        *("sigma_px", "sigma_mm", "sigma_rad"),
-    ),
-    "Cross-validation": ("held_out", "splits", "folds", "motions_held_out"),
-    "Clocks of robot and camera": ("time_offset", "image_times", "time_tolerance"),
-    "Errors of the arm itself": ("with_kinematics", "robot_out"),
-    "Files for other programs": (
-        *("ros", "urdf", "opencv", "export", "parent", "child", "camera_frame", "camera_out"),
-    ),
-    "Differential evolution": ("de_bounds_deg", "de_bounds_mm"),
+    "Input": "setup dry_run",
+    "Method": "",
+    "Output": "out strict overwrite quiet verbose",
+    "Performance": "workers scheduler send_images",
+    "Input in other forms": "rotation length_unit poses_are first second key quaternions undo_flips camera_name",
+    "Noise": "sigma_robot_mm sigma_robot_deg sigma_camera_mm sigma_camera_deg sigma_board_mm "
+    "sigma_px sigma_mm sigma_rad",
+    "Cross-validation": "held_out splits folds motions_held_out",
+    "Clocks of robot and camera": "time_offset image_times time_tolerance",
+    "Errors of the arm itself": "with_kinematics robot_out",
+    "Files for other programs": "ros urdf opencv export parent child camera_frame camera_out",
+    "Differential evolution": "de_bounds_deg de_bounds_mm",
 }
+PANELS = {panel: tuple(names.split()) for panel, names in PANELS.items()}
 """Panels of the help text in their order, each with the names of its parameters. All other parameters are in Input if
 they are paths to read, in Output if they are paths to write, and else in Method. ``--help`` is shown in Output."""
 
@@ -112,6 +98,11 @@ class Command(TyperCommand):
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)
+
+
+def group(name: str, text: str) -> typer.Typer:
+    """Returns a group of commands; ``text`` : its help."""
+    return typer.Typer(name=name, help=text, cls=Commands, **PLAIN)
 
 
 class Commands(TyperGroup):

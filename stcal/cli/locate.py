@@ -6,15 +6,12 @@ from typing import Annotated, Literal
 import typer
 
 from stcal.cli import options as shared
-from stcal.cli.help import PLAIN, Commands
+from stcal.cli.help import group
 from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, warn_if_quiet, write, write_if
 
-app = typer.Typer(
-    name="stcal locate",
-    help="Find a planar target of several tags in any light, and judge whether its pose may be trusted.",
-    cls=Commands,
-    **PLAIN,
+app = group(
+    "stcal locate", "Find a planar target of several tags in any light, and judge whether its pose may be trusted."
 )
 NOTHING_ACCEPTED = 3
 

@@ -17,7 +17,7 @@ from typer._completion_classes import completion_init
 
 import stcal
 from stcal.cli import cameras, handeye, locate, register, robot, sfm
-from stcal.cli.help import PLAIN, Commands
+from stcal.cli.help import group
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
 from stcal.errors import NO_MEMORY, InputError, StcalError, at_command_line, lacks_memory
@@ -34,12 +34,7 @@ RESUMED = {"run", "detect"}
 # The class is Click's, which newer versions of Typer contain.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
-app = typer.Typer(
-    name="stcal",
-    help="Calibrate stereo targets from photographs of a single camera, and measure with them.",
-    cls=Commands,
-    **PLAIN,
-)
+app = group("stcal", "Calibrate stereo targets from photographs of a single camera, and measure with them.")
 app.add_typer(sfm.app, name="sfm")
 app.add_typer(robot.app, name="robot")
 app.add_typer(locate.app, name="locate")

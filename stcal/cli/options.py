@@ -73,12 +73,11 @@ class Arg:
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """``annotation`` : of a parameter, for Typer; ``word`` : its name in messages; ``reads``, ``writes`` : whether its
-    value is a path that is read, or written."""
+    """``annotation`` : of a parameter, for Typer; ``word`` : its name in messages; ``writes`` : whether its value is a
+    path that is written."""
 
     annotation: Any
     word: str
-    reads: bool
     writes: bool
 
 
@@ -91,7 +90,7 @@ def declared(parameter: str, annotation: Any) -> Declared:
     info.rich_help_panel = panel_of(parameter, is_path, given.writes)
     # With Annotated, Typer takes an option's first name for its default.
     word = info.default if isinstance(given, Opt) else parameter
-    return Declared(Annotated[kind, info], word, is_path and not given.writes, given.writes)
+    return Declared(Annotated[kind, info], word, given.writes)
 
 
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]

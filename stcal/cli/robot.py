@@ -4,10 +4,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
 from stcal.cli import options as shared
-from stcal.cli.help import PLAIN, Commands
+from stcal.cli.help import group
 from stcal.cli.options import WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import DegenerateError, InputError
@@ -476,12 +474,6 @@ def from_photos(
     say(f"report: {out / 'report.html'}")
 
 
-app = typer.Typer(
-    name="stcal robot",
-    help="Calibrate a robot from measured data of any instrument, and compensate it.",
-    cls=Commands,
-    **PLAIN,
-)
-COMMANDS = (init, axes, identify, evaluate, compensate, verify, design, convert, from_photos)
-for command in COMMANDS:
+app = group("stcal robot", "Calibrate a robot from measured data of any instrument, and compensate it.")
+for command in (init, axes, identify, evaluate, compensate, verify, design, convert, from_photos):
     app.command()(command)

@@ -14,7 +14,7 @@ from stcal.boards.several import load_boards
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.net import net_part
-from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, board_parts, said_mm, target_parts
+from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, board_parts, corners_of, said_mm, target_parts
 from stcal.drawing.sheets import FURNITURE, MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
@@ -38,7 +38,7 @@ def svg(sheet: Sheet) -> str:
     for number, placed in enumerate(sheet.placed):
         if placed.clip is not None:
             lines.append(
-                f'<clipPath id="clip{number}"><path d="{_path(_corners(placed.clip), sheet.height)}"/></clipPath>'
+                f'<clipPath id="clip{number}"><path d="{_path(corners_of(placed.clip), sheet.height)}"/></clipPath>'
             )
         clip = "" if placed.clip is None else f' clip-path="url(#clip{number})"'
         for layer in LAYERS:
@@ -65,11 +65,6 @@ def _element(shape: Shape, height: float) -> str:
     dash = f' stroke-dasharray="{DASH}"' if shape.dashed else ""
     path = _path(shape.points, height, shape.closed)
     return f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="{_number(shape.width)}"{dash}/>'
-
-
-def _corners(box: np.ndarray) -> np.ndarray:
-    (left, below), (right, above) = box.tolist()
-    return np.array([[left, below], [right, below], [right, above], [left, above]])
 
 
 def _path(points: np.ndarray, height: float, closed: bool = True) -> str:
@@ -102,7 +97,7 @@ def pdf(sheets: Sequence[Sheet]) -> bytes:
         for placed in sheet.placed:
             canvas.saveState()
             if placed.clip is not None:
-                canvas.clipPath(_outline(canvas, [_corners(placed.clip)]), stroke=0)
+                canvas.clipPath(_outline(canvas, [corners_of(placed.clip)]), stroke=0)
             for layer in LAYERS:
                 for shape in (layer_shape for layer_shape in placed.shapes if layer_shape.layer == layer):
                     _add(canvas, shape)

@@ -117,6 +117,12 @@ def moved(shape: Shape, x: float, y: float) -> Shape:
     return replace(shape, points=shape.points + np.array([x, y]))
 
 
+def corners_of(box: np.ndarray) -> np.ndarray:
+    """Return the corners (4, 2) of a box (2, 2) of smallest and largest coordinates, anticlockwise."""
+    (left, below), (right, above) = box.tolist()
+    return np.array([[left, below], [right, below], [right, above], [left, above]])
+
+
 def _box(points: np.ndarray) -> np.ndarray:
     return np.array([points.min(0), points.max(0)])
 
@@ -287,8 +293,7 @@ def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:
 
 def _part(name: str, pattern, polarity: Polarity, margin_mm: float, spans=(), table=(), outline=None) -> Part:
     if outline is None:
-        (left, below), (right, above) = extent(pattern) + margin_mm * np.array([[-1.0], [1.0]])
-        outline = np.array([[left, below], [right, below], [right, above], [left, above]])
+        outline = corners_of(extent(pattern) + margin_mm * np.array([[-1.0], [1.0]]))
     outline = np.asarray(outline)
     ground = [Area((outline,), "black", "GROUND")] if polarity == "bright" else []
     return Part(name, outline, (*ground, *pattern), spans, table)

@@ -445,16 +445,13 @@ def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]]
         scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)}{drawn} }},")
     lines += ["scale = [", *scales, "]"] if scales else []
     for face in target.faces:
+        lines += ["", "[[face]]", f"id = {toml_string(face.id)}"]
         if face.printed is not None:
             assert printed is not None, "faces with a board or tags are written by stcal.boards.target"
             pose = _rough_lines(face.rough_target_from_face @ INWARDS) if face.rough_target_from_face else []
-            outline = _outline_lines(face.outline_mm)
-            lines += ["", "[[face]]", f"id = {toml_string(face.id)}", *pose, *outline, *printed(face)]
+            lines += [*pose, *_outline_lines(face.outline_mm), *printed(face)]
             continue
         lines += [
-            "",
-            "[[face]]",
-            f"id = {toml_string(face.id)}",
             "# The face frame: origin at one circle, X through a second one, Y on the side of a third, Z outwards.",
             f"origin = {toml_string(face.origin)}",
             f"x = {toml_string(face.x)}",

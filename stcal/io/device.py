@@ -89,17 +89,14 @@ class OpenCVSource:
                 f"{self.name}: its driver takes no exposure {exposure:g}; give exposures in its unit (V4L2: 100 µs), "
                 "see `v4l2-ctl --list-ctrls`",
             )
-        until, frame = time.monotonic() + settle_s, None
-        read = 0
-        while read < READINGS or time.monotonic() < until:
+        until, frame, read = time.monotonic() + settle_s, None, 0
+        while frame is None or read < READINGS or time.monotonic() < until:
             received, frame = self._capture.read()
             read += 1
             if not received or frame is None:
                 raise InputError(
                     "E-DEVICE-NO-IMAGE", f"{self.name}: no longer gives images; check its cable and other programs"
                 )
-        if frame is None:
-            raise InputError("E-DEVICE-NO-IMAGE", f"{self.name}: gives no image; check it")
         return _grey(frame), float(self._capture.get(cv2.CAP_PROP_EXPOSURE))
 
     def close(self) -> None:

@@ -366,17 +366,14 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
     _refuse_a_tie({size: own for size, own in with_size.items() if len(own) == len(ranked[0])})
     for own in (*ranked, unknown):
         for file in own:
-            try:
-                height, width = decode(file.read(), file.name).shape
-            except (InputError, OSError):
-                continue
-            return (width, height), file.name
+            if shape := _shape(file):
+                return (shape[1], shape[0]), file.name
     return None
 
 
 def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
     """Raise an error if several sizes have the same number of images, and some of these images are readable."""
-    sizes = [size for size, own in equal.items() if any(_is_readable(file) for file in own)] if len(equal) > 1 else []
+    sizes = [size for size, own in equal.items() if any(map(_shape, own))] if len(equal) > 1 else []
     if len(sizes) < 2:
         return
     shown = " and ".join(f"{len(equal[s])} of {s[0]}×{s[1]} px, first {equal[s][0].name}" for s in sizes[:2])
@@ -384,12 +381,12 @@ def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
     raise InputError("E-IMAGES-SIZES", f"images: {shown}: no size is that of the majority; {turn}")
 
 
-def _is_readable(file: ImageFile) -> bool:
+def _shape(file: ImageFile) -> tuple[int, ...]:
+    """Return height and width, px; empty if the image is not readable."""
     try:
-        decode(file.read(), file.name)
+        return decode(file.read(), file.name).shape
     except (InputError, OSError):
-        return False
-    return True
+        return ()
 
 
 def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str]:

@@ -173,18 +173,13 @@ class Table:
 
         Raises InputError: only some of the columns exist, or a matrix is not positive definite.
         """
-        present = [name for name in COVARIANCE if prefix + name in self.columns]
-        if not present:
+        names = [prefix + name for name in COVARIANCE]
+        if not any(name in self for name in names):
             return None
-        if len(present) < len(COVARIANCE):
-            missing = next(prefix + name for name in COVARIANCE if prefix + name not in self.columns)
-            raise InputError(
-                "E-TABLE-COLUMN-MISSING",
-                f"{self.where}: {missing} is missing; all {len(COVARIANCE)} columns cov_… or none needed",
-            )
+        self._need_all(names, f"{len(COVARIANCE)} columns cov_…")
         full = np.zeros((len(self), 6, 6))
         i, j = np.triu_indices(6)
-        full[:, i, j] = full[:, j, i] = np.column_stack([self.numbers(prefix + name) for name in COVARIANCE])
+        full[:, i, j] = full[:, j, i] = np.column_stack([self.numbers(name) for name in names])
         self.require_covariances(full, OF_POSE)
         return full
 
@@ -217,12 +212,7 @@ class Table:
                 f"{self.where}: columns common1_… without columns cov_…, which must include them; give both",
             )
         names = [prefix + name for name in common_columns(count)]
-        for name in names:
-            if name not in self.columns:
-                raise InputError(
-                    "E-TABLE-COLUMN-MISSING",
-                    f"{self.where}: {name} is missing; all columns common1_rx … or none needed",
-                )
+        self._need_all(names, "columns common1_rx …")
         values = np.column_stack([self.numbers(name) for name in names])
         full = np.swapaxes(values.reshape(len(self), count, 6), 1, 2)
         fault = first_fault(covariance - full @ np.swapaxes(full, 1, 2), OF_POSE, definite=True)
@@ -237,6 +227,13 @@ class Table:
         """Return the names of the columns, shortened, for messages."""
         text = ",".join(self.columns)
         return repr(text if len(text) <= 100 else text[:99] + "…")
+
+    def _need_all(self, names: Iterable[str], which: str) -> None:
+        for name in names:
+            if name not in self:
+                raise InputError(
+                    "E-TABLE-COLUMN-MISSING", f"{self.where}: {name} is missing; all {which} or none needed"
+                )
 
     def _need(self, column: str) -> None:
         if column not in self.columns:

@@ -135,20 +135,16 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
             save(path, png(frame.grey))
             written.append((path, frame.number, frame.sharpness))
     usual = float(np.median([sharp for _, _, sharp in written]))
-    for path, _, sharp in written:
-        if sharp < LEAST_SHARPNESS * usual:
-            path.unlink()
     sharp_ones = [each for each in written if each[2] >= LEAST_SHARPNESS * usual]
     spare = np.linspace(0, len(sharp_ones) - 1, min(len(sharp_ones), MOST_FRAMES)).round().astype(int).tolist()
-    for k in set(range(len(sharp_ones))) - set(spare):
-        sharp_ones[k][0].unlink()
     chosen = [sharp_ones[k] for k in spare]
+    for path in {path for path, _, _ in written} - {path for path, _, _ in chosen}:
+        path.unlink()
     if len(chosen) < LEAST_FRAMES:
         raise InputError(
             "E-VIDEO-VIEWS",
             f"video {video}: {len(chosen)} sharp frames with different views, {LEAST_FRAMES} needed; move the target "
-            "or "
-            "the camera more, and slowly, or name a number of frames with --every",
+            "or the camera more, and slowly, or name a number of frames with --every",
         )
     blurred = len(written) - len(sharp_ones)
     warnings.warn(

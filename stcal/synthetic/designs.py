@@ -148,7 +148,12 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
     Raises InputError: the width is not a number above 0, the dictionary or an id in it does not exist, or a face does
     not, or fewer than two remain.
     """
-    whole = _whole_body(kind, size, dictionary, first_id)
+    width, count = width_of(size), 6 if kind == "cube" else 12
+    family = known_tags([(dictionary, first_id + face) for face in range(count)], "--tags, --dictionary")[0][0]
+    if kind == "cube":
+        whole = tag_cube(width, family, first_id)
+    else:
+        whole = tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
     kept, ids = [name.strip() for name in faces.split(",") if name.strip()], [face.id for face in whole.faces]
     if unknown := [name for name in kept if name not in ids]:
         raise InputError(
@@ -157,15 +162,6 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
     if kept and len(set(kept)) < 2:
         raise InputError("E-OPTION-VALUE", f"--faces {faces}: one face; two or more needed, such as 1,2,3")
     return replace(whole, faces=tuple(face for face in whole.faces if not kept or face.id in kept))
-
-
-def _whole_body(kind: Body, size: str | float, dictionary: str, first_id: int) -> TargetDesign:
-    width = width_of(size)
-    faces = 6 if kind == "cube" else 12
-    family = known_tags([(dictionary, first_id + face) for face in range(faces)], "--tags, --dictionary")[0][0]
-    if kind == "cube":
-        return tag_cube(width, family, first_id)
-    return tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
 
 
 def width_of(size: str | float) -> float:

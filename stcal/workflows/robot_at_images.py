@@ -13,6 +13,7 @@ from stcal.handeye.data.inputs import partners, read_robot, require_own, trailin
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.handeye.data.record import Said, require_each_once
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
+from stcal.io.covariance import TWIST
 from stcal.io.table import LENGTHS, read_table
 from stcal.robot import Robot
 from stcal.robot.kinematics.dh import robot_from_chain
@@ -267,9 +268,6 @@ def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples
         )
 
 
-COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
     """A robot at joint values (m, n) moved by small motions of its axes, as
@@ -303,7 +301,7 @@ class Arm:
 
     def names(self) -> tuple[str, ...]:
         """Returns the names (k,) of the parameters: J2 rx in rad, J2 x in mm, in the frame of the joint."""
-        return tuple(f"J{joint + 1} {COMPONENTS[c]}" for joint, c in chain_parameters(self._chain()))
+        return tuple(f"J{joint + 1} {TWIST[c]}" for joint, c in chain_parameters(self._chain()))
 
     def _chain(self) -> Chain:
         return replace(self.robot, world_from_base=Rigid()).chain()

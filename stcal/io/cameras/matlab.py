@@ -19,7 +19,7 @@ from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.foreign import ForeignLens, of_opencv, one_of
+from stcal.io.cameras.foreign import ForeignLens, of_opencv, one_of, refused
 from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.model import CameraModel
 
@@ -252,11 +252,7 @@ def mat(camera: Camera, name: str) -> bytes:
     """Return a ``.mat`` file with a structure of the fields of ``cameraIntrinsics`` and ``toStruct(cameraParams)``."""
     k = camera.distortion
     if camera.fisheye or k[5:].any():
-        raise InputError(
-            "E-CAMERA-FORM",
-            f"matlab has no place for {'the equidistant projection' if camera.fisheye else 'more than k1, k2, k3'} of "
-            f"{camera.colmap_model}; write --form colmap",
-        )
+        raise refused(camera, "matlab", "the equidistant projection" if camera.fisheye else "more than k1, k2, k3")
     (fx, fy), (cx, cy) = camera.focal, camera.centre + PIXEL_ORIGIN
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     radial = [k[0], k[1], k[4]] if k[4] else [k[0], k[1]]

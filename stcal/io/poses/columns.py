@@ -109,13 +109,18 @@ def _all(table: Table, columns: list[str]) -> np.ndarray | None:
     return np.column_stack([table.numbers(column) for column in columns])
 
 
+def _columns(table: Table, prefix: str, names: list[str]) -> tuple[str, ...]:
+    """Return the columns of these names, also with capital letters; none unless all are there."""
+    columns = tuple(column for name in names if (column := find_column(table, prefix, name)) is not None)
+    return columns if len(columns) == len(names) else ()
+
+
 def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
     """Return rotations of three angles, or a rotation vector, by the convention of their names or of the user."""
     for triple, named in TRIPLES.items():
         for unit in (*ANGLES, ""):
-            columns = [find_column(table, prefix, f"{name}_{unit}" if unit else name) for name in triple]
-            names = tuple(column for column in columns if column is not None)
-            if len(names) < len(triple):
+            names = _columns(table, prefix, [f"{name}_{unit}" if unit else name for name in triple])
+            if not names:
                 continue
             what = ", ".join(triple) if triple in BY_AXIS else "".join(triple)
             if rotation is None and unit in named:
@@ -137,9 +142,8 @@ def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
 
 def _four(table: Table, prefix: str, rotation: str | None) -> Turned | None:
     """Return the rotations of quaternions q1 … q4, whose order the user must give."""
-    columns = [find_column(table, prefix, f"q{i}") for i in (1, 2, 3, 4)]
-    names = tuple(column for column in columns if column is not None)
-    if len(names) < len(columns):
+    names = _columns(table, prefix, [f"q{i}" for i in (1, 2, 3, 4)])
+    if not names:
         return None
     values = np.column_stack([table.numbers(column) for column in names])
     turned, words = turned_values(values, rotation, "q1, q2, q3, q4", places_of(table), table.where)
