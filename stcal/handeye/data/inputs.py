@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance, inverse_jacobian
+from stcal.handeye.data.pairs import HandEyePoses, Setup, inverse_covariance, inverse_jacobian
 from stcal.handeye.data.recognise import read_columns, read_content, todays
 from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
@@ -57,7 +57,7 @@ class Told:
 
     pairs: HandEyePoses
     understood: tuple[str, ...]
-    setup: str | None = None
+    setup: Setup | None = None
     left_out: tuple[tuple[str, str], ...] = ()
     timed: Timed | None = None
 
@@ -187,7 +187,7 @@ def _no_poses(table: Table) -> InputError:
 
 
 def _by_time(
-    robot: Posed, camera: Posed, setup: str | None, where: str, tolerance_s: float, always: bool
+    robot: Posed, camera: Posed, setup: Setup | None, where: str, tolerance_s: float, always: bool
 ) -> Told | None:
     """Returns the robot's poses at the camera's times; None without, or, unless ``always``, with equal times."""
     times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
