@@ -209,11 +209,12 @@ def handeye(
 ) -> None:
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.handeye import HandEyeOptions, Noise
-    from stcal.handeye.report.export import FORMS, exported, opencv_yaml, require_export_written, ros_yaml, urdf_joint
+    from stcal.handeye.report import export as forms
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_report
     from stcal.io.files import require_same
+    from stcal.io.poses.programs import messages, read_messages
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye_inputs import without_flips
     from stcal.workflows.handeye_run import calibrate_handeye
@@ -226,7 +227,7 @@ def handeye(
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = shared.exports_of(export or [], FORMS)
+    exports = shared.exports_of(export or [], forms.FORMS)
     _require_frames(ros or urdf, exports, files.setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
@@ -274,15 +275,18 @@ def handeye(
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     write_if(out, lambda: HandEyeFile.of(outcome))
-    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame))
-    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame))
-    write_if(opencv, lambda: opencv_yaml(result))
-    for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
+    both, transforms = forms.named(result), forms.tree(result, parent, child, camera_frame)
+    for path, text, read, held in (
+        (ros, messages(transforms), read_messages, transforms),
+        (urdf, forms.urdf_joint(transforms), forms.read_urdf, transforms),
+        (opencv, forms.opencv_yaml(result), forms.read_opencv, both),
+    ):
         if path:
-            require_export_written(path, kind, result, parent, child, camera_frame)
+            write(path, text)
+            forms.require_export_written(path, read, held)
     write_if(report, document.page)
     for form, path in exports:
-        write(path, text := exported(result, form, path.stem, parent, child, camera_frame))
+        write(path, text := forms.exported(result, transforms, form, path.stem))
         require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
         _save_camera(camera_out, outcome)

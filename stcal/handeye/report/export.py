@@ -1,6 +1,5 @@
 """Export of a hand-eye transform to files of other programs; each file is read back and compared."""
 
-import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +18,9 @@ from stcal.handeye.result import HandEye
 from stcal.io.poses.programs import (
     Static,
     fixed_joint,
-    messages,
     metres,
     plain_numbers,
     pose_of_metres,
-    read_messages,
     read_ros1_launch,
     read_ros2_commands,
     read_ros2_launch,
@@ -105,18 +102,25 @@ def opencv_yaml(result: HandEye) -> str:
     return "\n".join(lines) + "\n"
 
 
+def named(result: HandEye) -> list[Static]:
+    """Returns both transforms of a result."""
+    return [Static(*name.split("_from_"), pose) for name, pose in result.transforms.items()]
+
+
+def read_opencv(text: str) -> list[Static]:
+    """Returns the transforms in a text of :func:`opencv_yaml`."""
+    content = load_yaml(text)
+    frames = FRAMES[content["setup"]]
+    matrices = {name: np.reshape(content[name]["data"], (4, 4)) for name in (frames.camera, frames.board)}
+    return [Static(*name.split("_from_"), Rigid.from_matrix(matrix)) for name, matrix in matrices.items()]
+
+
 IN_HAND = "eye-in-hand"
 
 
-def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """Returns ``geometry_msgs/TransformStamped`` as YAML, in metres: a document for each transform of :func:`tree`."""
-    return messages(tree(result, parent, child, camera_frame))
-
-
-def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); for ``link`` two, in a ``robot`` for
+def urdf_joint(transforms: list[Static]) -> str:
+    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); of several ones, in a ``robot`` for
     xacro."""
-    transforms = tree(result, parent, child, camera_frame)
     joints = [fixed_joint(each) for each in transforms]
     if len(joints) == 1:
         return joints[0]
@@ -232,18 +236,11 @@ FORMS = {
 """All formats, by the word of ``--export``."""
 
 
-def exported(
-    result: HandEye,
-    form: str,
-    name: str = "handeye",
-    parent: str = "",
-    child: str = "",
-    camera_frame: CameraFrame = "optical",
-) -> str:
-    """Returns the text in one of :data:`FORMS`, read back and compared; ``name`` : the file's stem, which easy_handeye
-    holds. Raises InputError: the format is unknown, or cannot hold the name of a frame."""
+def exported(result: HandEye, transforms: list[Static], form: str, name: str = "handeye") -> str:
+    """Returns the text of ``transforms``, of :func:`tree`, in one of :data:`FORMS`, read back and compared; ``name`` :
+    the file's stem, which easy_handeye holds. Raises InputError: the format is unknown, or cannot hold the name of a
+    frame."""
     require_form(form, FORMS)
-    transforms = tree(result, parent, child, camera_frame)
     text = FORMS[form].write(result, transforms, name)
     for static, wanted in zip(FORMS[form].read(text), transforms, strict=False):
         difference = static.pose.inverse() @ wanted.pose
@@ -255,24 +252,10 @@ def exported(
     return text
 
 
-def require_export_written(
-    path: Path,
-    kind: str,
-    result: HandEye,
-    parent: str = "",
-    child: str = "",
-    camera_frame: CameraFrame = "optical",
-) -> None:
-    """Read a written file again, and require the transforms of ``result``; ``kind`` : ``json``, ``opencv``, ``ros`` or
-    ``urdf``."""
+def require_export_written(path: Path, read: Callable[[str], list[Static]], transforms: list[Static]) -> None:
+    """Reads a written file again, and requires the poses of ``transforms``."""
 
     def again() -> Poses:
-        text = path.read_text(encoding="utf-8")
-        if kind in ("ros", "urdf"):
-            return Poses.of(static.pose for static in (read_messages if kind == "ros" else read_urdf)(text))
-        content = json.loads(text) if kind == "json" else load_yaml(text)
-        matrices = [content[name] if kind == "json" else content[name]["data"] for name in result.transforms]
-        return Poses.of(Rigid.from_matrix(np.reshape(matrix, (4, 4))) for matrix in matrices)
+        return Poses.of(each.pose for each in read(path.read_text(encoding="utf-8")))
 
-    statics = tree(result, parent, child, camera_frame) if kind in ("ros", "urdf") else ()
-    require_poses_written(path, again, Poses.of([each.pose for each in statics] or result.transforms.values()))
+    require_poses_written(path, again, Poses.of(each.pose for each in transforms))
