@@ -226,12 +226,12 @@ def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) ->
     if views is None:
         residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
         return np.linalg.norm(residuals[:, 3:], axis=1)
-    camera, adjusted_views = _as_adjusted(result, views)
-    poses = zip(adjusted_views, _by_robot(result, loop), strict=True)
+    camera, adjusted_views = as_adjusted(result, views)
+    poses = zip(adjusted_views, poses_by_robot(result, loop), strict=True)
     return np.array([_beside(view, camera, pose) for view, pose in poses])
 
 
-def _as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
+def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
     """Returns the camera of the result, and the views with the corners at their places on its board."""
     board = result.reprojection
     if board is None:
@@ -239,7 +239,7 @@ def _as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
     return board.camera, [view.moved(board.board(view.xyz_board)) for view in views.views]
 
 
-def _by_robot(result: HandEye, loop: Loop) -> Poses:
+def poses_by_robot(result: HandEye, loop: Loop) -> Poses:
     """Returns camera_from_board as the robot's poses give it."""
     return result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
 
@@ -253,12 +253,12 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
             "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
             "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
         }
-    camera, adjusted_views = _as_adjusted(result, views)
+    camera, adjusted_views = as_adjusted(result, views)
     pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
     residuals = replace(loop, camera_from_board=pose_by_view).residuals(
         result.mount_from_camera, result.stand_from_board
     )
-    pose_by_robot = _by_robot(result, loop)
+    pose_by_robot = poses_by_robot(result, loop)
     return {
         "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
         "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),

@@ -333,14 +333,14 @@ def coverage_blocks(outcome: Outcome) -> list[Block]:
         measured, residuals = np.concatenate(used), board.residuals_px
     finite = np.isfinite(residuals).all(1)
     size, residuals = (views.camera.width, views.camera.height), residuals[finite]
-    covered, factor = image_coverage(views), enlargement(residuals, views.camera.width)
+    counts, factor = image_coverage(views), enlargement(residuals, views.camera.width)
     by = "the adjustment" if board is not None else "robot and transforms"
     return [
-        f"The board lay over {covered.share:.0%} of the image in one photograph or another. Where it never was, "
+        f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
         "nothing checks the distortion of the lens",
         plots(
             plot(
-                lambda: image_figure(size, covered, measured[finite], residuals),
+                lambda: image_figure(size, counts, measured[finite], residuals),
                 "coverage of the image",
                 f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
                 "",
@@ -381,11 +381,12 @@ def _turns(outcome: Outcome) -> list[Block]:
 
 def photograph_blocks(outcome: Outcome) -> list[Block]:
     """Returns some photographs with their corners; read when the page is written."""
-    if outcome.pairs is None or outcome.views is None or outcome.folder is None:
+    pairs, views, folder = outcome.pairs, outcome.views, outcome.folder
+    if pairs is None or views is None or folder is None:
         return []
 
     def photographs():
-        shown, missing = overlays(outcome)
+        shown, missing = overlays(outcome.result, pairs, views, folder)
         explained = (
             "Circles: corners as measured. Lines lead to where they would be by the robot's pose as it was reported "
             "and the transforms above, enlarged: the combined error of robot, transforms, camera and board"
