@@ -222,12 +222,10 @@ def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEye
 
 def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
     """Returns errors (k,), mm, that choose among solutions: ``board_mm``, or ``translation_mm`` without views."""
-    loop, scale = Loop.of(pairs, result.setup), result.scale
     if views is None:
-        residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
-        return np.linalg.norm(residuals[:, 3:], axis=1)
+        return predicted(result, pairs, None)["translation_mm"]
     camera, adjusted_views = as_adjusted(result, views)
-    poses = zip(adjusted_views, poses_by_robot(result, loop), strict=True)
+    poses = zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
     return np.array([_beside(view, camera, pose) for view, pose in poses])
 
 
@@ -246,32 +244,21 @@ def poses_by_robot(result: HandEye, loop: Loop) -> Poses:
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
     """Returns the errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views unknown to the result."""
-    scale, loop = result.scale, Loop.of(pairs, result.setup)
+    loop, x, z = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board
     if views is None:
-        residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
-        return {
-            "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
-            "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
-        }
-    camera, adjusted_views = as_adjusted(result, views)
-    pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
-    residuals = replace(loop, camera_from_board=pose_by_view).residuals(
-        result.mount_from_camera, result.stand_from_board
-    )
-    pose_by_robot = poses_by_robot(result, loop)
-    return {
-        "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
-        "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
-        "board_mm": np.array(
-            [_beside(view, camera, pose) for view, pose in zip(adjusted_views, pose_by_robot, strict=True)]
-        ),
-        "pose_mm": np.array(
-            [
-                np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
-                for view, first, second in zip(adjusted_views, pose_by_robot, pose_by_view, strict=True)
-            ]
-        ),
-    }
+        turns, shifts = np.split(loop.residuals(x, z, result.scale), 2, axis=1)
+        at_board = {}
+    else:
+        camera, adjusted_views = as_adjusted(result, views)
+        pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
+        turns, shifts = np.split(replace(loop, camera_from_board=pose_by_view).residuals(x, z), 2, axis=1)
+        pose_mm = [
+            np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
+            for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), pose_by_view, strict=True)
+        ]
+        at_board = {"board_mm": deciding_error(result, pairs, views), "pose_mm": np.array(pose_mm)}
+    lengths = {"rotation_rad": np.linalg.norm(turns, axis=1), "translation_mm": np.linalg.norm(shifts, axis=1)}
+    return lengths | at_board
 
 
 @one_thread()

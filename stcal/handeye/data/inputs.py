@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.pairs import HandEyePoses, Setup, inverse_covariance, inverse_jacobian
+from stcal.handeye.data.pairs import HandEyePoses, Setup, inverted
 from stcal.handeye.data.recognise import read_columns, read_content, todays
 from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
@@ -79,7 +79,7 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
         raise InputError(
             "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
         )
-    robot, camera = (settled(_side(content, role, path), role, content, path, statements) for role in FRAMES)
+    robot, camera = (settled(content, role, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         raise InputError(
             "E-POSES-UNITS",
@@ -120,7 +120,7 @@ def read_two(
             content = read_columns(table, own, statements)
             if content is None:
                 raise _no_poses(table)
-        sides.append(settled(_side(content, role, path), role, content, path, statements))
+        sides.append(settled(content, role, path, statements))
     robot, camera = sides
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
     if (
@@ -154,7 +154,7 @@ def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
     """Returns the robot's poses of a file; None where it is one of the package's own tables."""
     content = read_content(path, statements.of("robot"), key, quaternions)
-    return None if content is None else settled(_side(content, "robot", path), "robot", content, path, statements)
+    return None if content is None else settled(content, "robot", path, statements)
 
 
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
@@ -236,9 +236,9 @@ def _side(content: Content, role: Role, path: Path) -> Side:
     return side
 
 
-def settled(side: Side, role: Role, content: Content, path: Path, statements: Said) -> Posed:
-    """Returns poses in the direction that is needed, mm, with a line on how they were read."""
-    statements = statements.of(role)
+def settled(content: Content, role: Role, path: Path, statements: Said) -> Posed:
+    """Returns poses of a role in the direction that is needed, mm, with a line on how they were read."""
+    side, statements = _side(content, role, path), statements.of(role)
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
     if len(far):
         measured = np.abs(side.translation[far[0]]).max()
@@ -251,9 +251,7 @@ def settled(side: Side, role: Role, content: Content, path: Path, statements: Sa
     covariance, common = side.covariance, side.common
     wanted = FRAMES[role][0]
     if frames.name != wanted:
-        covariance = None if covariance is None else inverse_covariance(poses, covariance)
-        common = None if common is None else inverse_jacobian(poses) @ common
-        poses = poses.inverse()
+        poses, covariance, common = inverted(poses, covariance, common)
     parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
     if content.passed_over:
         ellipsis = " …" if len(content.passed_over) > SHOWN else ""

@@ -237,8 +237,13 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
         )
     poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
     common = table.common_errors(covariance, names[0] + "_")
-    if names[0] == wanted:
-        return poses, covariance, common
+    return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)
+
+
+def inverted(
+    poses: Poses, covariance: np.ndarray | None, common: np.ndarray | None
+) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
+    """Returns the inverses of poses, with their covariances (m, 6, 6) and common errors (m, 6, k), where known."""
     carried = inverse_jacobian(poses)
     return (
         poses.inverse(),
@@ -254,12 +259,6 @@ def inverse_jacobian(poses: Poses) -> np.ndarray:
     derivative[:, :3, :3] = derivative[:, 3:, 3:] = -transposed
     derivative[:, 3:, :3] = -transposed @ skew(poses.translation)
     return derivative
-
-
-def inverse_covariance(poses: Poses, covariance: np.ndarray) -> np.ndarray:
-    """Returns the covariances (m, 6, 6) of the inverses of poses with these covariances (m, 6, 6)."""
-    jacobian = inverse_jacobian(poses)
-    return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
 
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
