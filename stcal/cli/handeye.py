@@ -224,8 +224,7 @@ def handeye(
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     timing = Timing(time_tolerance, image_times, time_offset)
     pairs, folder = files.pairs(timing), files.source is not None and files.source.is_dir()
-    _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
-    _require_arm(folder, method, four_dof, with_kinematics, robot_out)
+    _require_compatible(folder, method, refine_camera, camera_out, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
     exports = shared.exports_of(export or [], forms.FORMS)
     _require_frames(ros or urdf, exports, files.setup or "eye-in-hand", parent, child, camera_frame)
@@ -297,10 +296,30 @@ def handeye(
     shared.require_passed(strict, judged(outcome).failed(), report, judged(outcome).doubt())
 
 
-def _require_arm(
-    folder: bool, method: str | None, four_dof: bool, with_kinematics: Path | None, robot_out: Path | None
+def _require_compatible(
+    folder: bool,
+    method: str | None,
+    refine_camera: bool,
+    camera_out: Path | None,
+    four_dof: bool,
+    with_kinematics: Path | None,
+    robot_out: Path | None,
 ) -> None:
-    """Checks that the options of the arm are compatible."""
+    """Checks that the options of camera, method and arm are compatible."""
+    from stcal.handeye import METHODS
+    from stcal.workflows.handeye_run import ALL
+
+    if camera_out and not (refine_camera or with_kinematics):
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
+        )
+    if refine_camera and not folder:
+        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
+    if camera_out and method not in (None, ALL, "reprojection"):
+        raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
+    if method not in (None, ALL, *METHODS):
+        raise InputError("E-OPTION-METHOD", f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
     if robot_out and not with_kinematics:
         raise InputError(
             "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file"
@@ -320,26 +339,6 @@ def _require_arm(
         )
 
 
-def _require_fitting(
-    of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None, with_arm: bool
-) -> None:
-    """Checks that the options of camera and method are compatible."""
-    from stcal.handeye import METHODS
-    from stcal.workflows.handeye_run import ALL
-
-    if camera_out and not (refine_camera or with_arm):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
-        )
-    if refine_camera and of_poses:
-        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
-    if camera_out and method not in (None, ALL, "reprojection"):
-        raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
-    if method not in (None, ALL, *METHODS):
-        raise InputError("E-OPTION-METHOD", f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
-
-
 def _require_frames(
     ros: Path | None,
     exports: list[tuple[str, Path]],
@@ -349,14 +348,14 @@ def _require_frames(
     camera_frame: "CameraFrame",
 ) -> None:
     """Checks that frames are named only for outputs with frames, and that their names differ."""
-    from stcal.handeye.report.export import frame_names, require_frame_names
+    from stcal.handeye.report.export import frame_names
 
     if (parent or child or camera_frame != "optical") and not (ros or exports):
         raise InputError(
             "E-OPTION-NEEDS",
             "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
         )
-    require_frame_names(*frame_names(setup, parent, child, camera_frame))
+    frame_names(setup, parent, child, camera_frame)
 
 
 def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":

@@ -259,16 +259,14 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if method == "de":
             notes = (*notes, Aside(task.options.evolution.in_words(unit_mm)))
         z = closed_form.mean_pose(task.loop.chain(x))
-    outliers = np.zeros(len(task.loop), bool)
-    residuals = task.loop.residuals(x, z)
     return HandEye(
         method=method,
         setup=task.setup,
         mount_from_camera=x,
         stand_from_board=z,
-        residuals=residuals,
+        residuals=task.loop.residuals(x, z),
         names=task.pairs.names,
-        outliers=outliers,
+        outliers=np.zeros(len(task.loop), bool),
         observability=task.seen,
         notes=notes,
     )

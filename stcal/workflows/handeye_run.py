@@ -445,7 +445,12 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
     if robot is None:
         return Planned(result, plan_poses(given.pairs, result, count, outline, camera, None, seed), {}, ())
     near, notes = _taken(robot, given)
-    planned = plan_poses(given.pairs, result, count, outline, camera, _reach(robot, near), seed)
+
+    def reachable(flange: Poses) -> np.ndarray:
+        """Returns True where a pose is within the limits and its joint values are determined."""
+        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
+
+    planned = plan_poses(given.pairs, result, count, outline, camera, reachable, seed)
     q = inverse(robot, planned.base_from_flange, near).q
     joints = dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))
     return Planned(result, planned, joints, notes)
@@ -453,8 +458,8 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
 def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
     """Returns the joint values (n,) of the last pose that the robot reaches, and notes on those that it does not."""
-    flange = given.pairs.base_from_flange
-    solutions = inverse(robot, flange, _middle(robot))
+    flange, middle = given.pairs.base_from_flange, robot.limits().mean(1)
+    solutions = inverse(robot, flange, np.where(np.isfinite(middle), middle, 0.0))  # joints without limits from 0
     beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
     message = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
     if len(beyond) > (1 - LEAST_REACHED) * len(flange):
@@ -465,17 +470,3 @@ def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ..
         )
     notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
     return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes
-
-
-def _middle(robot: Robot) -> np.ndarray:
-    """Returns the middle (n,) of the joint limits, 0 where there are none."""
-    middle = robot.limits().mean(1)
-    return np.where(np.isfinite(middle), middle, 0.0)
-
-
-def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
-    def reachable(flange: Poses) -> np.ndarray:
-        """Returns True where a pose is within the limits and its joint values are determined."""
-        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
-
-    return reachable

@@ -121,11 +121,9 @@ def read_two(
             if content is None:
                 raise _no_poses(table)
         sides.append(settled(content, role, path, statements))
-    robot, camera = sides
+    (robot, camera), where = sides, f"{first.name} with {second.name}"
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
-    if (
-        told_by_time := _by_time(robot, camera, setup, f"{first.name} with {second.name}", tolerance_s, timed)
-    ) is not None:
+    if (told_by_time := _by_time(robot, camera, setup, where, tolerance_s, timed)) is not None:
         return told_by_time
     rows, how = matched(robot, camera, key)
     notes = () if not how else (f"rows joined {how}",)
@@ -135,7 +133,6 @@ def read_two(
     alone = sorted(set(range(len(robot))) - set(a)) if stamped is None else ()  # samples between images are no mistake
     left_out = [(robot.called(i), f"in {first.name} alone") for i in alone]
     left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
-    where = f"{first.name} with {second.name}"
     pairs = _pairs(robot, camera, a, b, names, where)
     return Told(pairs, (*_both(robot, camera), *notes), setup, tuple(left_out), stamped)
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.handeye.data.pairs import FRAMES, Loop, Setup
 from stcal.io.table import LENGTHS, UNIT_WORDS
 
@@ -51,7 +51,7 @@ class Observability:
 
     def __post_init__(self):
         for name, shape in (("turns_rad", (3,)), ("axes", (3, 3)), ("mount_axis", (3,))):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+            freeze(self, name, shape, name)
 
     @classmethod
     def of(cls, loop: Loop) -> "Observability":

@@ -51,7 +51,6 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
     Raises InputError: a name is invalid, or the names are not all different.
     """
     mount, *names = frame_names(result.setup, parent, child, camera_frame)
-    require_frame_names(mount, *names)
     if camera_frame == "optical":
         return [Static(mount, names[0], result.mount_from_camera)]
     link, optical = names
@@ -60,22 +59,22 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
 
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
-    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame."""
-    mount = parent or FRAMES[setup].mount
+    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame.
+
+    Raises InputError: a name has a control character, or occurs twice.
+    """
+    names = [parent or FRAMES[setup].mount]
     if camera_frame == "optical":
-        return mount, child or CAMERA_FRAME
-    link = child or CAMERA_LINK
-    return mount, link, f"{link.removesuffix('_link')}_optical_frame"
-
-
-def require_frame_names(*names: str) -> None:
-    """Raises InputError if a frame's name has a control character, or occurs twice; empty ones are defaults."""
-    given = [name for name in names if name]
-    for name in given:
+        names.append(child or CAMERA_FRAME)
+    else:
+        link = child or CAMERA_LINK
+        names += [link, f"{link.removesuffix('_link')}_optical_frame"]
+    for name in names:
         if not name.isprintable():
             raise InputError("E-FRAME-NAME", f"frames: {name!r} has control characters; give a name in letters")
-        if given.count(name) > 1:
+        if names.count(name) > 1:
             raise InputError("E-FRAME-NAME", f"frames: parent and child are both {name!r}; two names needed")
+    return tuple(names)
 
 
 def said_of(result: HandEye) -> list[str]:

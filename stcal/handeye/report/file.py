@@ -10,7 +10,7 @@ from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.judge.remarks import Verdict, Word
+from stcal.handeye.judge.remarks import Word
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
@@ -237,14 +237,14 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
+        found = judged(outcome)
         result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
         poses = {name: pose.matrix() for name, pose in result.transforms.items()}
         compared = [_method(each, names) for each in outcome.compared]
         optional: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
         optional |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
         optional |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
-        if (offset := outcome.time_offset) is not None:
-            optional["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
+        optional |= {} if outcome.time_offset is None else {"time_offset": outcome.time_offset}
         optional |= {"understood": outcome.understood} if outcome.understood else {}
         optional |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
@@ -252,7 +252,7 @@ class HandEyeFile(ResultFile):
                 "format": "stcal handeye 1",
                 "version": stcal.__version__,
                 "where": outcome.where,
-                "verdict": verdict_part(judged(outcome)),
+                "verdict": {"word": found.word, "sentence": found.sentence(), "findings": found.findings},
                 "setup": result.setup,
                 "method": result.method,
                 **poses,
@@ -273,11 +273,6 @@ class HandEyeFile(ResultFile):
                 **optional,
             }
         )
-
-
-def verdict_part(found: Verdict) -> VerdictPart:
-    rows = [FindingRow(**{name: getattr(each, name) for name in FindingRow.model_fields}) for each in found.findings]
-    return VerdictPart(word=found.word, sentence=found.sentence(), findings=rows)
 
 
 def board_part(outcome: Outcome) -> BoardSize:

@@ -8,7 +8,6 @@ from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
-from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import Aside, Verdict, spoken
 from stcal.handeye.report.figures import (
     BAD,
@@ -91,22 +90,10 @@ def _headline(outcome: Outcome) -> str:
     return f"{result.setup}, {result.method}: {len(result.names) - len(bad)} poses{without}"
 
 
-def _transforms(result: HandEye) -> list[tuple[str, Rigid, np.ndarray | None]]:
-    covariances = (result.covariance, result.stand_covariance)
-    return [(*item, covariance) for item, covariance in zip(result.transforms.items(), covariances, strict=True)]
-
-
 def _splits_text(outcome: Outcome) -> str:
     every = (outcome.held_out, *(each.held_out for each in outcome.compared))
     known = [found.rows.shape for found in every if found is not None]
     return f"{known[0][0]} × {known[0][1]} of {len(outcome.result.names)} poses" if known else "no poses"
-
-
-def _agreeing_text(outcome: Outcome) -> list[str]:
-    """Returns the errors without outliers in words, or nothing if there are no outliers."""
-    bad = outcome.result.outliers
-    means = outcome.held_out.means(~bad) if bad.any() and outcome.held_out is not None else {}
-    return [f"without the {bad.sum()} left out above: {means_text(means)}"] if means else []
 
 
 def means_text(means: dict[str, float]) -> str:
@@ -130,11 +117,6 @@ def sigma_rows(outcome: Outcome) -> list[list[str]]:
     return rows
 
 
-def turns_text(observability: Observability) -> str:
-    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(observability.turns_rad))
-    return f"the flange turns between poses by {turns} (RMS) about its principal axes"
-
-
 def _off(each: Compared, result: HandEye) -> list[str]:
     if each.result is None:
         return [NONE, NONE]
@@ -146,13 +128,20 @@ def outcome_report(outcome: Outcome) -> Document:
     """Returns the report of ``handeye``."""
     result, frames = outcome.result, FRAMES[outcome.result.setup]
     turn, shift = result.rms()
+    covariances, bad, seen = (result.covariance, result.stand_covariance), result.outliers, result.observability
     held_out = []
     if outcome.held_out is not None:
         held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
-        held_out += [f"held out, mean {text}" for text in _agreeing_text(outcome)]
+        if bad.any() and (agreeing := outcome.held_out.means(~bad)):
+            held_out.append(f"held out, mean without the {bad.sum()} left out above: {means_text(agreeing)}")
+    turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
     answer: list[Block] = [
         tiles(_tiles(outcome)),
-        *(block for item in _transforms(result) for block in transform_blocks(*item)),
+        *(
+            block
+            for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True)
+            for block in transform_blocks(name, pose, covariance)
+        ),
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
@@ -160,7 +149,7 @@ def outcome_report(outcome: Outcome) -> Document:
         outcome.sentence(),
         Table(["<what errs, and by how much", "σ", "<"], sigma_rows(outcome)),
         "" if result.sigma_scale is None else scale_text(outcome, result.sigma_scale),
-        "" if result.observability is None else turns_text(result.observability),
+        f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
         fold(
             "Camera, as adjusted (first pixel's centre at 0, 0)",
             Table(["<", "value", "± σ", "<unit"], adjusted(outcome)),
