@@ -15,10 +15,8 @@ from stcal.errors import InputError
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
-    from stcal.handeye.data.pairs import Setup
     from stcal.handeye.data.record import Said
     from stcal.handeye.methods.evolution import Bounds
-    from stcal.handeye.report.export import CameraFrame
     from stcal.handeye.report.outcome import Outcome
     from stcal.parallel import Progress
     from stcal.robot import Robot
@@ -227,7 +225,12 @@ def handeye(
     _require_compatible(folder, method, refine_camera, camera_out, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
     exports = shared.exports_of(export or [], forms.FORMS)
-    _require_frames(ros or urdf, exports, files.setup or "eye-in-hand", parent, child, camera_frame)
+    if (parent or child or camera_frame != "optical") and not (ros or urdf or exports):
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
+        )
+    forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "E-OPTION-NEEDS",
@@ -337,25 +340,6 @@ def _require_compatible(
             "E-OPTION-CONFLICT",
             "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
         )
-
-
-def _require_frames(
-    ros: Path | None,
-    exports: list[tuple[str, Path]],
-    setup: "Setup",
-    parent: str,
-    child: str,
-    camera_frame: "CameraFrame",
-) -> None:
-    """Checks that frames are named only for outputs with frames, and that their names differ."""
-    from stcal.handeye.report.export import frame_names
-
-    if (parent or child or camera_frame != "optical") and not (ros or exports):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
-        )
-    frame_names(setup, parent, child, camera_frame)
 
 
 def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":

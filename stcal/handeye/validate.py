@@ -65,6 +65,11 @@ class HeldOutPoses(Brief):
         if self.mount_from_camera is not None:
             freeze(self, "mount_from_camera", (len(self.rows), 4, 4), "solutions")
 
+    @classmethod
+    def of_splits(cls, rows: np.ndarray, errors: list[dict[str, np.ndarray]]) -> "HeldOutPoses":
+        """Returns the errors of all splits, from the fields of each by name."""
+        return cls(rows, **{name: np.array([each[name] for each in errors]) for name in errors[0]})
+
     def means(self, of: np.ndarray | None = None) -> dict[str, float]:
         """Returns the mean of every available error over all splits, by name.
 
@@ -176,10 +181,7 @@ def cross_validate(
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
     slow = views is not None and method in (None, "reprojection")
-    errors_of_split = run_in_order(errors_without, jobs, workers if slow else 1, progress)
-    return HeldOutPoses(
-        rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
-    )
+    return HeldOutPoses.of_splits(rows, run_in_order(errors_without, jobs, workers if slow else 1, progress))
 
 
 def errors_without(

@@ -252,7 +252,8 @@ FALLS = 0.98
 """Largest ratio of the mean squares of residuals with and without an offset at which the offset is reported although it
 does no harm."""
 HARMFUL = 1.0
-"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong."""
+"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong; without σ it
+is always."""
 ROW_S = 0.05
 """Time assumed between rows if poses have no times but follow one another smoothly: a scan of ±1 s then covers ±20
 rows."""
@@ -324,7 +325,8 @@ def lag_tried(
     except StcalError:  # the motions tell no offset
         return result, ()
     fits = [float((np.linalg.norm(each.residuals[~each.outliers, 3:], axis=1) ** 2).mean()) for each in (before, after)]
-    harmful = _shift(result, lag) > HARMFUL
+    moved = np.abs(lag.seconds * lag.slope[:6])
+    harmful = result.covariance is None or (moved / np.sqrt(np.diag(result.covariance))).max() > HARMFUL
     if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
@@ -384,13 +386,6 @@ def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> 
     step = -covariance @ (flat.T @ left)
     variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
     return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
-
-
-def _shift(result: HandEye, lag: TimeOffset) -> float:
-    """Returns the largest change of X by the offset, in σ of X; infinite where X has no σ."""
-    if result.covariance is None:
-        return float("inf")
-    return float((np.abs(lag.seconds * lag.slope[:6]) / np.sqrt(np.diag(result.covariance))).max())
 
 
 LEAST_REACHED = 0.5

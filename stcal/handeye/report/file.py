@@ -9,7 +9,6 @@ import stcal
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
-from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import Word
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
@@ -237,7 +236,7 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
-        found = judged(outcome)
+        found, seen = judged(outcome), outcome.result.observability
         result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
         poses = {name: pose.matrix() for name, pose in result.transforms.items()}
         compared = [_method(each, names) for each in outcome.compared]
@@ -268,7 +267,13 @@ class HandEyeFile(ResultFile):
                 "outliers": outcome.outliers(),
                 "left_out": [NamedReason(name=name, reason=reason) for name, reason in outcome.left_out],
                 "held_out": _held_out(outcome.held_out, result.outliers),
-                "observability": _observability(result.observability),
+                "observability": seen
+                and {
+                    "turns_rad": seen.turns_rad,
+                    "axes_flange": seen.axes,
+                    "sigma_rad": seen.sigma_rad,
+                    "sigma_mm": seen.sigma_mm,
+                },
                 "notes": outcome.all_notes(),
                 **optional,
             }
@@ -364,13 +369,4 @@ def _method(each: Compared, names: tuple[str, ...]) -> MethodRow:
         held_out=_held_out(each.held_out, bad),
         **{name: pose.matrix() for name, pose in transforms.items()},
         splits=_splits(each.held_out, names),
-    )
-
-
-def _observability(observability: Observability | None) -> SeenTurns | None:
-    return observability and SeenTurns(
-        turns_rad=observability.turns_rad,
-        axes_flange=observability.axes,
-        sigma_rad=observability.sigma_rad,
-        sigma_mm=observability.sigma_mm,
     )

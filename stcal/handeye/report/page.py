@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
@@ -22,6 +21,7 @@ from stcal.handeye.report.figures import (
     turns_between,
     turns_figure,
 )
+from stcal.handeye.report.file import camera_part
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
@@ -413,18 +413,12 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
 
 def adjusted(outcome: Outcome) -> list[list[str]]:
     """Returns rows of the camera's parameters; none if they were not adjusted."""
-    adjustment = outcome.result.reprojection
-    if adjustment is None or adjustment.camera_covariance is None:
-        return []
-    sigma = dict(
-        zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(adjustment.camera_covariance)), strict=True)
-    )
-    rows = []
-    for name, value in zip(PARAMETER_NAMES, adjustment.camera.parameters(), strict=True):
-        sigma_of_parameter = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
-        if value or sigma_of_parameter:
+    camera, rows = camera_part(outcome), []
+    for name, value in camera.parameters.items() if camera else ():
+        sigma = camera.sigma.get(name, camera.sigma.get("f") if name in ("fx", "fy") else None)
+        if value or sigma:
             digits, unit = (3, "px") if name[0] in "fc" else (6, "")
-            rows.append([name, number(value, digits), number(sigma_of_parameter, digits), unit])
+            rows.append([name, number(value, digits), number(sigma, digits), unit])
     return rows
 
 
