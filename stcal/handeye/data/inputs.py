@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
 from stcal.handeye.data.pairs import HandEyePoses, Setup, inverted
 from stcal.handeye.data.recognise import read_columns, read_content, todays
-from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
+from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, Unit, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
@@ -277,13 +277,11 @@ def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
 
 def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
     """Returns the factor to mm, how the unit is known, and the unit if it was guessed from the size of lengths."""
-    stated = side.unit
-    if stated is not None and stated.stated:
-        return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
-    if statements.length_unit is not None:
-        return LENGTHS[statements.length_unit], f"{statements.length_unit} as you say", ""
-    if stated is not None:
-        return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
+    unit, option = side.unit, statements.length_unit
+    if option is not None and not (unit is not None and unit.stated):
+        unit = Unit(option, "as you say")
+    if unit is not None:
+        return LENGTHS[unit.name], f"{unit.name} {unit.by}", ""
     distances = np.linalg.norm(side.translation, axis=1)
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
@@ -299,8 +297,8 @@ def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, s
             f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
             f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
         )
-    unit = "m" if farthest <= METRES_UP_TO else "mm"
-    return LENGTHS[unit], f"{unit} by their size, up to {farthest:.4g}", unit
+    guess = "m" if farthest <= METRES_UP_TO else "mm"
+    return LENGTHS[guess], f"{guess} by their size, up to {farthest:.4g}", guess
 
 
 def _pairs(

@@ -91,10 +91,7 @@ class Stream:
     def rest(self) -> tuple[float, float]:
         """Returns σ of one sample (rad, mm), by samples' deviations from the cubic through their four neighbours; NaN
         if fewer than five. It holds where these are noise."""
-        n = len(self)
-        if n < WINDOW + 1:
-            return float("nan"), float("nan")
-        samples = np.arange(2, n - 2)
+        samples = np.arange(2, len(self) - 2)
         nodes = samples[:, None] + np.array([-2, -1, 1, 2])
         close = self.seconds[nodes[:, -1]] - self.seconds[nodes[:, 0]] <= WINDOW * LONGEST_S
         samples, nodes = samples[close], nodes[close]

@@ -98,18 +98,15 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
         )
     observability = Observability.of(loop)
     if four_dof:
-        turns = _list(np.degrees(observability.turns_rad))
+        fault = ""
         if observability.turns_rad[0] < LEAST_TURN:
+            fault = f"; rotate it about {in_words(observability.axes[0])} by {WANTED_DEG}° or more"
+        elif not observability.one_axis:
+            fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
+        if fault:
+            turns = f"{_list(np.degrees(observability.turns_rad))}° (RMS)"
             raise DegenerateError(
-                "E-HANDEYE-AXES",
-                f"{where}: the flange turns by {turns}° (RMS) about its principal axes; "
-                f"rotate it about {in_words(observability.axes[0])} by {WANTED_DEG}° or more",
-            )
-        if not observability.one_axis:
-            raise DegenerateError(
-                "E-HANDEYE-AXES",
-                f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out",
+                "E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about its principal axes{fault}"
             )
     elif observability.useless:
         slides = (
