@@ -14,7 +14,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
 from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
@@ -365,9 +365,8 @@ def _moving(given: HandEyeInput) -> Timed | None:
         seconds = ROW_S * np.arange(len(pairs))
         timed = Timed(Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where), seconds)
     poses = timed.stream.base_from_flange
-    steps = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
-    steps_rms = np.sqrt((steps**2).sum(2).mean(0))
-    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps_rms, strict=True))
+    steps = rms_of(poses[1:].difference(poses[:-1]))
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
     return timed if smooth else None
 
 

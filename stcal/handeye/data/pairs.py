@@ -117,17 +117,10 @@ class HandEyePoses(Brief):
     def __getitem__(self, index) -> "HandEyePoses":
         """Returns the pairs selected by a mask, slice or list."""
         rows = np.arange(len(self))[index]
-        of_flange, of_board = self.base_from_flange_covariance, self.camera_from_board_covariance
-        common = self.camera_from_board_common
-        return HandEyePoses(
-            self.base_from_flange[rows],
-            self.camera_from_board[rows],
-            None if of_flange is None else of_flange[rows],
-            None if of_board is None else of_board[rows],
-            tuple(self.names[i] for i in rows),
-            self.where,
-            None if common is None else common[rows],
-        )
+        known = (self.base_from_flange_covariance, self.camera_from_board_covariance, self.camera_from_board_common)
+        of_flange, of_board, common = (None if values is None else values[rows] for values in known)
+        flange, board, names = self.base_from_flange[rows], self.camera_from_board[rows], [self.names[i] for i in rows]
+        return HandEyePoses(flange, board, of_flange, of_board, tuple(names), self.where, common)
 
     def _check_copies(self):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
@@ -192,6 +185,12 @@ def apart(poses: Poses, rows: np.ndarray) -> np.ndarray:
     first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
     turns = Rotation.from_matrix(np.swapaxes(poses.rotation[first], 1, 2) @ poses.rotation[second]).magnitude()
     return np.column_stack([turns, np.linalg.norm(poses.translation[first] - poses.translation[second], axis=1)])
+
+
+def rms_of(differences: np.ndarray) -> tuple[float, float]:
+    """Returns the RMS lengths of differences of poses, (m, 6): rad, mm."""
+    turn, shift = np.sqrt((differences.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+    return float(turn), float(shift)
 
 
 def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEyePoses:
