@@ -409,8 +409,9 @@ def dry_run(
     else:
         inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)
         stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
-        own_table = not (isinstance(source, Told) or inputs.understood)
-        lines = own_told(source, quaternions) if own_table else list(inputs.understood)
+        lines = list(inputs.understood)
+        if not lines and not isinstance(source, Told):
+            lines = own_told(source, quaternions)
         count = f"pairs: {len(inputs.pairs)}"
     setup = stated or "eye-in-hand"
     origin = "as you say" if statements.setup else "as the file says" if stated else "by default"

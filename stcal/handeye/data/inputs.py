@@ -122,7 +122,8 @@ def read_two(
                 raise _no_poses(table)
         sides.append(settled(content, role, path, statements))
     (robot, camera), where = sides, f"{first.name} with {second.name}"
-    setup = next((content.setup for content in contents if content is not None and content.setup), None)
+    setups: list[Setup] = [content.setup for content in contents if content is not None and content.setup]
+    setup = setups[0] if setups else None
     if (told_by_time := _by_time(robot, camera, setup, where, tolerance_s, timed)) is not None:
         return told_by_time
     rows, how = matched(robot, camera, key)

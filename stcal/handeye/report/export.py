@@ -103,7 +103,12 @@ def opencv_yaml(result: HandEye) -> str:
 
 def named(result: HandEye) -> list[Static]:
     """Returns both transforms of a result."""
-    return [Static(*name.split("_from_"), pose) for name, pose in result.transforms.items()]
+    return [_static(name, pose) for name, pose in result.transforms.items()]
+
+
+def _static(name: str, pose: Rigid) -> Static:
+    parent, _, child = name.partition("_from_")
+    return Static(parent, child, pose)
 
 
 def read_opencv(text: str) -> list[Static]:
@@ -111,7 +116,7 @@ def read_opencv(text: str) -> list[Static]:
     content = load_yaml(text)
     frames = FRAMES[content["setup"]]
     matrices = {name: np.reshape(content[name]["data"], (4, 4)) for name in (frames.camera, frames.board)}
-    return [Static(*name.split("_from_"), Rigid.from_matrix(matrix)) for name, matrix in matrices.items()]
+    return [_static(name, Rigid.from_matrix(matrix)) for name, matrix in matrices.items()]
 
 
 IN_HAND = "eye-in-hand"

@@ -414,7 +414,9 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
 def adjusted(outcome: Outcome) -> list[list[str]]:
     """Returns rows of the camera's parameters; none if they were not adjusted."""
     camera, rows = camera_part(outcome), []
-    for name, value in camera.parameters.items() if camera else ():
+    if camera is None:
+        return []
+    for name, value in camera.parameters.items():
         sigma = camera.sigma.get(name, camera.sigma.get("f") if name in ("fx", "fy") else None)
         if value or sigma:
             digits, unit = (3, "px") if name[0] in "fc" else (6, "")
