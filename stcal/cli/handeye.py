@@ -15,10 +15,8 @@ from stcal.errors import InputError
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
-    from stcal.handeye.data.pairs import Setup
     from stcal.handeye.data.record import Said
     from stcal.handeye.methods.evolution import Bounds
-    from stcal.handeye.report.export import CameraFrame
     from stcal.handeye.report.outcome import Outcome
     from stcal.parallel import Progress
     from stcal.robot import Robot
@@ -96,29 +94,12 @@ class PoseFiles:
         images = self.poses, self.camera, self.board
         return dry_run(pairs, *images, self.quaternions, self.statements(), timing, robot)
 
-    def read(
-        self, pairs: "Source", timing: "Timing", robot: "Robot | None", progress: "Progress | None"
-    ) -> "HandEyeInput":
+    def read(self, pairs: "Source", timing: "Timing", robot: "Robot | None", progress: "Progress") -> "HandEyeInput":
         """Returns the poses, from :meth:`pairs`."""
-        from stcal.workflows.handeye_inputs import read_handeye
+        from stcal.workflows.handeye_inputs import read_input
 
-        return read_handeye(
-            pairs,
-            self.poses,
-            self.camera,
-            self.board,
-            setup=self.setup,
-            rotation=self.rotation or (),
-            length_unit=self.length_unit or (),
-            poses_are=self.poses_are or (),
-            quaternions=self.quaternions,
-            tolerance_s=timing.tolerance_s,
-            image_times=timing.image_times,
-            time_offset=timing.offset,
-            robot=robot,
-            workers=self.workers,
-            progress=progress,
-        )
+        images, said = (self.poses, self.camera, self.board), self.statements()
+        return read_input(pairs, *images, self.workers, progress, self.quaternions, said, timing, robot)
 
 
 POSE_FILES = PoseFiles()
@@ -226,11 +207,12 @@ def handeye(
 ) -> None:
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.handeye import HandEyeOptions, Noise
-    from stcal.handeye.report.export import FORMS, exported, opencv_yaml, require_export_written, ros_yaml, urdf_joint
+    from stcal.handeye.report import export as forms
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_report
     from stcal.io.files import require_same
+    from stcal.io.poses.programs import messages, read_messages
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye_inputs import without_flips
     from stcal.workflows.handeye_run import calibrate_handeye
@@ -240,11 +222,15 @@ def handeye(
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     timing = Timing(time_tolerance, image_times, time_offset)
     pairs, folder = files.pairs(timing), files.source is not None and files.source.is_dir()
-    _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
-    _require_arm(folder, method, four_dof, with_kinematics, robot_out)
+    _require_compatible(folder, method, refine_camera, camera_out, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = shared.exports_of(export or [], FORMS)
-    _require_frames(ros or urdf, exports, files.setup or "eye-in-hand", parent, child, camera_frame)
+    exports = shared.exports_of(export or [], forms.FORMS)
+    if (parent or child or camera_frame != "optical") and not (ros or urdf or exports):
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
+        )
+    forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "E-OPTION-NEEDS",
@@ -291,15 +277,18 @@ def handeye(
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     write_if(out, lambda: HandEyeFile.of(outcome))
-    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame))
-    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame))
-    write_if(opencv, lambda: opencv_yaml(result))
-    for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
+    both, transforms = forms.named(result), forms.tree(result, parent, child, camera_frame)
+    for path, text, read, held in (
+        (ros, messages(transforms), read_messages, transforms),
+        (urdf, forms.urdf_joint(transforms), forms.read_urdf, transforms),
+        (opencv, forms.opencv_yaml(result), forms.read_opencv, both),
+    ):
         if path:
-            require_export_written(path, kind, result, parent, child, camera_frame)
+            write(path, text)
+            forms.require_export_written(path, read, held)
     write_if(report, document.page)
     for form, path in exports:
-        write(path, text := exported(result, form, path.stem, parent, child, camera_frame))
+        write(path, text := forms.exported(result, transforms, form, path.stem))
         require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
         _save_camera(camera_out, outcome)
@@ -310,10 +299,30 @@ def handeye(
     shared.require_passed(strict, judged(outcome).failed(), report, judged(outcome).doubt())
 
 
-def _require_arm(
-    folder: bool, method: str | None, four_dof: bool, with_kinematics: Path | None, robot_out: Path | None
+def _require_compatible(
+    folder: bool,
+    method: str | None,
+    refine_camera: bool,
+    camera_out: Path | None,
+    four_dof: bool,
+    with_kinematics: Path | None,
+    robot_out: Path | None,
 ) -> None:
-    """Checks that the options of the arm are compatible."""
+    """Checks that the options of camera, method and arm are compatible."""
+    from stcal.handeye import METHODS
+    from stcal.workflows.handeye_run import ALL
+
+    if camera_out and not (refine_camera or with_kinematics):
+        raise InputError(
+            "E-OPTION-NEEDS",
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
+        )
+    if refine_camera and not folder:
+        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
+    if camera_out and method not in (None, ALL, "reprojection"):
+        raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
+    if method not in (None, ALL, *METHODS):
+        raise InputError("E-OPTION-METHOD", f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
     if robot_out and not with_kinematics:
         raise InputError(
             "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file"
@@ -331,45 +340,6 @@ def _require_arm(
             "E-OPTION-CONFLICT",
             "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
         )
-
-
-def _require_fitting(
-    of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None, with_arm: bool
-) -> None:
-    """Checks that the options of camera and method are compatible."""
-    from stcal.handeye import METHODS
-    from stcal.workflows.handeye_run import ALL
-
-    if camera_out and not (refine_camera or with_arm):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
-        )
-    if refine_camera and of_poses:
-        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
-    if camera_out and method not in (None, ALL, "reprojection"):
-        raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
-    if method not in (None, ALL, *METHODS):
-        raise InputError("E-OPTION-METHOD", f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
-
-
-def _require_frames(
-    ros: Path | None,
-    exports: list[tuple[str, Path]],
-    setup: "Setup",
-    parent: str,
-    child: str,
-    camera_frame: "CameraFrame",
-) -> None:
-    """Checks that frames are named only for outputs with frames, and that their names differ."""
-    from stcal.handeye.report.export import frame_names, require_frame_names
-
-    if (parent or child or camera_frame != "optical") and not (ros or exports):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
-        )
-    require_frame_names(*frame_names(setup, parent, child, camera_frame))
 
 
 def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":

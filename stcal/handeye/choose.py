@@ -282,14 +282,13 @@ def choose(
         trial = _Trial({candidate: own for candidate, own in succeeded.items() if candidate not in CLOSED_FORMS}, rows)
         chosen = trial.best()
         result = trial.outcomes[chosen].result
-    errors_of_split = []
-    for k, out in enumerate(rows):
-        part = trial.outcomes[trial.best(k)].partial[k]
-        errors = predicted(part, pairs[out], None if views is None else views[out])
-        errors_of_split.append(errors | {"mount_from_camera": part.mount_from_camera.matrix()})
-    held_out = HeldOutPoses(
-        rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
-    )
+    best_of_splits = [trial.outcomes[trial.best(k)].partial[k] for k in range(len(rows))]
+    errors = [
+        predicted(part, pairs[out], None if views is None else views[out])
+        | {"mount_from_camera": part.mount_from_camera.matrix()}
+        for part, out in zip(best_of_splits, rows, strict=True)
+    ]
+    held_out = HeldOutPoses.of_splits(rows, errors)
     tried = tuple(
         Tried(candidate, outcome.error_mm)
         if isinstance(outcome, _Outcome)

@@ -7,7 +7,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.pairs import FRAMES, Setup
+from stcal.handeye.data.pairs import FRAMES, Setup, rms_of
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import Verdict
 from stcal.handeye.methods.reprojection import Reprojection
@@ -131,5 +131,4 @@ class HandEye(Brief):
 
     def rms(self) -> tuple[float, float]:
         """Returns the RMS lengths of the residuals of all poses except outliers: rad, mm."""
-        squared = (self.residuals[~self.outliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0)
-        return float(np.sqrt(squared[0])), float(np.sqrt(squared[1]))
+        return rms_of(self.residuals[~self.outliers])

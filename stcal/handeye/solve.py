@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -126,15 +126,6 @@ class _Task:
         return replace(self, pairs=self.pairs[rows], loop=self.loop[rows], views=views)
 
 
-def _guess(
-    options: HandEyeOptions, observability: Observability, loop: Loop, with_scale: bool
-) -> tuple[Rigid, Rigid, float]:
-    """Returns the first X, Z and scale."""
-    if options.four_dof:
-        return closed_form.about_one_axis(loop, observability.mount_axis, with_scale)
-    return closed_form.robust(loop, with_scale)
-
-
 @one_thread()
 def handeye(
     pairs: HandEyePoses,
@@ -227,7 +218,14 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
         pairs, views, notes = repaired.pairs, repaired.views, repaired.notes()
     if options.arm is None:
         pairs.require_moving_flange()
-    loop, guess = Loop.of(pairs, setup), cache(partial(_guess, options, observability))
+    loop = Loop.of(pairs, setup)
+
+    @cache
+    def guess(loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
+        if options.four_dof:
+            return closed_form.about_one_axis(loop, observability.mount_axis, with_scale)
+        return closed_form.robust(loop, with_scale)
+
     if not part:
         notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
     return _Task(pairs, loop, setup, views, options, guess, observability, notes, part)
@@ -259,16 +257,14 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if method == "de":
             notes = (*notes, Aside(task.options.evolution.in_words(unit_mm)))
         z = closed_form.mean_pose(task.loop.chain(x))
-    outliers = np.zeros(len(task.loop), bool)
-    residuals = task.loop.residuals(x, z)
     return HandEye(
         method=method,
         setup=task.setup,
         mount_from_camera=x,
         stand_from_board=z,
-        residuals=residuals,
+        residuals=task.loop.residuals(x, z),
         names=task.pairs.names,
-        outliers=outliers,
+        outliers=np.zeros(len(task.loop), bool),
         observability=task.seen,
         notes=notes,
     )

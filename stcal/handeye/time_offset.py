@@ -13,7 +13,7 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import Stream
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.noise import Noise
@@ -136,10 +136,10 @@ def estimate_offset(
         offset += float(np.clip(step, -MOST_STEP_S, MOST_STEP_S))
         if abs(step) < SETTLED * sigma:
             within = _inside(stream, seconds + offset)
-            turn, travel = np.sqrt((speed.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+            turn, travel = rms_of(speed)
             slope = inverse[:UNKNOWNS, count] / inverse[count, count]
             at = stream.at(seconds[within] + offset)
-            return TimeOffset(offset, sigma, slope, within, at, float(turn), float(travel))
+            return TimeOffset(offset, sigma, slope, within, at, turn, travel)
     raise ConvergenceError(
         "E-TIME-OFFSET-UNSETTLED",
         f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses",

@@ -65,6 +65,11 @@ class HeldOutPoses(Brief):
         if self.mount_from_camera is not None:
             freeze(self, "mount_from_camera", (len(self.rows), 4, 4), "solutions")
 
+    @classmethod
+    def of_splits(cls, rows: np.ndarray, errors: list[dict[str, np.ndarray]]) -> "HeldOutPoses":
+        """Returns the errors of all splits, from the fields of each by name."""
+        return cls(rows, **{name: np.array([each[name] for each in errors]) for name in errors[0]})
+
     def means(self, of: np.ndarray | None = None) -> dict[str, float]:
         """Returns the mean of every available error over all splits, by name.
 
@@ -176,10 +181,7 @@ def cross_validate(
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
     slow = views is not None and method in (None, "reprojection")
-    errors_of_split = run_in_order(errors_without, jobs, workers if slow else 1, progress)
-    return HeldOutPoses(
-        rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
-    )
+    return HeldOutPoses.of_splits(rows, run_in_order(errors_without, jobs, workers if slow else 1, progress))
 
 
 def errors_without(
@@ -222,16 +224,14 @@ def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEye
 
 def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
     """Returns errors (k,), mm, that choose among solutions: ``board_mm``, or ``translation_mm`` without views."""
-    loop, scale = Loop.of(pairs, result.setup), result.scale
     if views is None:
-        residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
-        return np.linalg.norm(residuals[:, 3:], axis=1)
-    camera, adjusted_views = _as_adjusted(result, views)
-    poses = zip(adjusted_views, _by_robot(result, loop), strict=True)
+        return predicted(result, pairs, None)["translation_mm"]
+    camera, adjusted_views = as_adjusted(result, views)
+    poses = zip(adjusted_views, poses_by_robot(result, Loop.of(pairs, result.setup)), strict=True)
     return np.array([_beside(view, camera, pose) for view, pose in poses])
 
 
-def _as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
+def as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
     """Returns the camera of the result, and the views with the corners at their places on its board."""
     board = result.reprojection
     if board is None:
@@ -239,39 +239,28 @@ def _as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
     return board.camera, [view.moved(board.board(view.xyz_board)) for view in views.views]
 
 
-def _by_robot(result: HandEye, loop: Loop) -> Poses:
+def poses_by_robot(result: HandEye, loop: Loop) -> Poses:
     """Returns camera_from_board as the robot's poses give it."""
     return result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
 
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
     """Returns the errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views unknown to the result."""
-    scale, loop = result.scale, Loop.of(pairs, result.setup)
+    loop, x, z = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board
     if views is None:
-        residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
-        return {
-            "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
-            "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
-        }
-    camera, adjusted_views = _as_adjusted(result, views)
-    pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
-    residuals = replace(loop, camera_from_board=pose_by_view).residuals(
-        result.mount_from_camera, result.stand_from_board
-    )
-    pose_by_robot = _by_robot(result, loop)
-    return {
-        "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
-        "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
-        "board_mm": np.array(
-            [_beside(view, camera, pose) for view, pose in zip(adjusted_views, pose_by_robot, strict=True)]
-        ),
-        "pose_mm": np.array(
-            [
-                np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
-                for view, first, second in zip(adjusted_views, pose_by_robot, pose_by_view, strict=True)
-            ]
-        ),
-    }
+        turns, shifts = np.split(loop.residuals(x, z, result.scale), 2, axis=1)
+        at_board = {}
+    else:
+        camera, adjusted_views = as_adjusted(result, views)
+        pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
+        turns, shifts = np.split(replace(loop, camera_from_board=pose_by_view).residuals(x, z), 2, axis=1)
+        pose_mm = [
+            np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
+            for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), pose_by_view, strict=True)
+        ]
+        at_board = {"board_mm": deciding_error(result, pairs, views), "pose_mm": np.array(pose_mm)}
+    lengths = {"rotation_rad": np.linalg.norm(turns, axis=1), "translation_mm": np.linalg.norm(shifts, axis=1)}
+    return lengths | at_board
 
 
 @one_thread()

@@ -14,21 +14,21 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
-from stcal.handeye.data.pairs import SETUPS, Loop, Setup
+from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.record import Said
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.judge.mistakes import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.solve import handeye
-from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
+from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.join import join_tables
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
-from stcal.workflows.board_views import detect_boards, kind_of
-from stcal.workflows.robot_at_images import Arm, RobotPoses, Timing, read_arm, read_robot_poses, robot_at_images
+from stcal.workflows.board_views import Board, detect_boards, kind_of
+from stcal.workflows.robot_at_images import Arm, AtImages, Timing, read_arm, read_robot_poses, robot_at_images
 
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
@@ -45,9 +45,9 @@ class HandEyeInput:
 
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : where a file states it; ``folder`` : of the images; ``arm`` :
-    at the joint values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in
-    the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
+    file that is not a table of the package; ``setup`` : where the user or a file states it; ``folder`` : of the images;
+    ``arm`` : at the joint values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the
+    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
     """
 
     where: str
@@ -178,9 +178,7 @@ def read_handeye(
     if isinstance(place, Path) and not place.is_dir():
         place, notes = one_source(place, _path(second), key, statements, quaternions, timing)
     files = _path(poses), _path(camera), _path(board)
-    given = read_input(place, *files, workers, told, quaternions, statements, timing, robot)
-    chosen = given.setup if setup is None else setup_of(statements, given.setup, given.where)
-    return replace(given, setup=chosen, notes=notes)
+    return replace(read_input(place, *files, workers, told, quaternions, statements, timing, robot), notes=notes)
 
 
 def _path(path: str | Path | None) -> Path | None:
@@ -207,13 +205,9 @@ def read_input(
     joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
     """
     if isinstance(source, Path) and source.is_dir():
-        poses, camera, board = _all_three(source, poses, camera, board)
-        if robot is None:
-            robot_poses = read_robot_poses(poses, quaternions, statements)
-            return _from_images(source, robot_poses, poses, camera, board, workers, progress, timing)
-        _require_by_name(timing)
-        robot_poses, arm = read_arm(poses, robot, quaternions)
-        return _from_images(source, robot_poses, poses, camera, board, workers, progress, None, arm)
+        files = _all_three(source, poses, camera, board)
+        photographs = _photographs(source, files, quaternions, statements, timing, robot)
+        return _from_images(source, files[0], photographs, statements, workers, progress)
     if robot is not None:
         raise InputError(
             "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
@@ -221,7 +215,7 @@ def read_input(
     _require_no_images(source, poses, camera, board)
     _require_timed(source, timing)
     if isinstance(source, Table):
-        return HandEyeInput(source.where, read_poses(source, quaternions))
+        return HandEyeInput(source.where, read_poses(source, quaternions), setup=statements.setup)
     if isinstance(source, Told):
         return _from_told(source, statements)
     told = read_pairs(source, statements, quaternions=quaternions)
@@ -229,7 +223,7 @@ def read_input(
         return _from_told(told, statements)
     pairs = read_poses(source, quaternions)  # first: a table that is not understood is no table whose columns say all
     _require_unsaid(statements, str(source))
-    return HandEyeInput(source.name, pairs)
+    return HandEyeInput(source.name, pairs, setup=statements.setup)
 
 
 def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Path | None) -> tuple[Path, Path, Path]:
@@ -252,15 +246,6 @@ def _require_no_images(source: Source, poses: Path | None, camera: Path | None, 
     if extra:
         held = "is a file of poses" if isinstance(source, Path) else "are poses"
         raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {_place(source)} {held}")
-
-
-def _require_by_name(timing: Timing) -> None:
-    if timing.offset or timing.image_times is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by name; "
-            "name the images in the column image",
-        )
 
 
 def _require_timed(source: Source, timing: Timing) -> None:
@@ -287,101 +272,115 @@ def _require_unsaid(statements: Said, where: str) -> None:
         )
 
 
-def setup_of(statements: Said, told: str | None, where: str) -> Setup:
-    """Returns the setup that the user states, or that a file states, or eye-in-hand."""
-    if statements.setup and told and statements.setup != told:
-        raise InputError(
-            "E-OPTION-CONTRADICTS", f"{where}: of a setup {told}, --setup {statements.setup}; leave the option out"
-        )
-    name = statements.setup or told or SETUPS[0]
-    return "eye-to-hand" if name == "eye-to-hand" else "eye-in-hand"
-
-
 def _from_told(told: Told, statements: Said) -> HandEyeInput:
-    setup = setup_of(statements, told.setup, told.pairs.where)
+    where, stated = told.pairs.where, statements.setup
+    if stated and told.setup and stated != told.setup:
+        raise InputError(
+            "E-OPTION-CONTRADICTS", f"{where}: of a setup {told.setup}, --setup {stated}; leave the option out"
+        )
+    setup = stated or told.setup
     return HandEyeInput(
-        told.pairs.where,
-        told.pairs,
-        left_out=told.left_out,
-        understood=told.understood,
-        setup=setup if told.setup else None,
-        timed=told.timed,
+        where, told.pairs, left_out=told.left_out, understood=told.understood, setup=setup, timed=told.timed
     )
 
 
-def _from_images(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Photographs:
+    """Images of a folder with the robot's poses, before the board is looked for.
+
+    ``row_of`` : row of the robot's pose by image; ``matching`` : how these were matched; ``skipped``, ``unpaired`` :
+    (image, why).
+    """
+
+    design: Board
+    model: CameraModel
+    files: list[ImageFile]
+    at_images: AtImages
+    arm: Arm | None
+    row_of: dict[str, int]
+    matching: str
+    skipped: list[tuple[str, str]]
+    unpaired: list[tuple[str, str]]
+
+    def robot_lines(self) -> tuple[str, ...]:
+        """Returns lines on how the robot's poses were read and matched."""
+        matched = (f"images matched {self.matching}",) if self.matching else ()
+        return f"robot: {self.at_images.robot.understood}", *matched
+
+
+def _photographs(
     source: Path,
-    robot: RobotPoses,
-    poses: Path,
-    camera: Path,
-    board: Path,
-    workers: int | None,
-    progress: Progress,
-    timing: Timing | None,
-    arm: Arm | None = None,
-) -> HandEyeInput:
-    """Returns the pairs of all images that show the board and have a pose."""
+    files_of: tuple[Path, Path, Path],
+    quaternions: Order,
+    statements: Said,
+    timing: Timing,
+    robot: Robot | None,
+) -> _Photographs:
+    """Returns the images of a folder, matched with the poses in the first of the files of :func:`_all_three`."""
+    (poses, camera, board), arm = files_of, None
+    if robot is None:
+        robot_poses = read_robot_poses(poses, quaternions, statements)
+    elif timing.offset or timing.image_times is not None:
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by name; "
+            "name the images in the column image",
+        )
+    else:
+        robot_poses, arm = read_arm(poses, robot, quaternions)
     design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
-    at_images = robot_at_images(robot, [file.name for file in files], timing)
-    robot, late = at_images.robot, dict(at_images.left_out)
-    files = [file for file in files if file.name not in late]
-    row_of, missing, matching = _rows_of_images(robot, files, source)
-    with_pose = [file for file in files if file.name in row_of]
-    detections = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
-    left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in (*skipped, *detections.skipped)]
-    left_out += [*late.items(), *_without_partner(files, row_of, missing, robot.file)]
-    if not (found := detections.views()):
-        first = f"{detections.skipped[0].name}: {detections.skipped[0].reason}"
+    at_images = robot_at_images(robot_poses, [file.name for file in files], timing if arm is None else None)
+    robot_poses, late = at_images.robot, dict(at_images.left_out)
+    names = [file.name for file in files if file.name not in late]
+    row_of, missing, matching = robot_poses.pairing(names)
+    if not row_of:
         raise InputError(
-            "E-IMAGES-NO-BOARD", f"image folder {source}: the board is in none of {len(with_pose)} images: {first}"
+            "E-POSES-UNMATCHED",
+            f"{robot_poses.where}: no row is of an image in {source}: {robot_poses.images[0]} … there, {names[0]} … "
+            "here; correct them",
+        )
+    unpaired = list(late.items()) + [(name, f"no row in {poses.name}") for name in names if name not in row_of]
+    unpaired += [(name, f"no such image, in a row of {poses.name}") for name in missing]
+    reasons = [(each.name, each.reason) for each in skipped]
+    return _Photographs(design, model, files, at_images, arm, row_of, matching, reasons, unpaired)
+
+
+def _from_images(
+    source: Path, poses: Path, own: _Photographs, statements: Said, workers: int | None, progress: Progress
+) -> HandEyeInput:
+    """Returns the pairs of all images that show the board and have a pose."""
+    robot, with_pose = own.at_images.robot, [file for file in own.files if file.name in own.row_of]
+    detections = detect_boards(with_pose, own.model, own.design, (), workers, partial(progress, "board"))
+    without_board = [(each.name, each.reason) for each in detections.skipped]
+    if not (found := detections.views()):
+        raise InputError(
+            "E-IMAGES-NO-BOARD",
+            f"image folder {source}: the board is in none of {len(with_pose)} images: {': '.join(without_board[0])}",
         )
     views = Views(
         detections.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values())
     )
-    rows = np.array([row_of[name] for name in found])
+    rows = np.array([own.row_of[name] for name in found])
     pairs = pairs_of_views(robot.base_from_flange[rows], views, tuple(found), str(source))
     if robot.covariance is not None:
         pairs = replace(pairs, base_from_flange_covariance=robot.covariance[rows])
-    understood = _robot_lines(robot, matching) if not robot.own else ()
+    understood = own.robot_lines() if not robot.own else ()
     understood += tuple(f"board: {part}" for part in detections.unused())
     return HandEyeInput(
         f"{source.name}, {poses.name}",
         pairs,
         views,
         detections.symmetries,
-        camera_prior(refinable(model.calibrated(detections.camera.width, detections.camera.height))),
-        next((getattr(design, key) for key in PITCHES if hasattr(design, key)), None),
-        tuple(left_out),
+        camera_prior(refinable(own.model.calibrated(detections.camera.width, detections.camera.height))),
+        next((getattr(own.design, key) for key in PITCHES if hasattr(own.design, key)), None),
+        (*own.skipped, *without_board, *own.unpaired),
         understood,
+        statements.setup,
         folder=source,
-        arm=arm and arm[rows],
-        timed=at_images.timed(tuple(found)),
+        arm=own.arm and own.arm[rows],
+        timed=own.at_images.timed(tuple(found)),
     )
-
-
-def _rows_of_images(
-    robot: RobotPoses, files: list[ImageFile], source: Path
-) -> tuple[dict[str, int], tuple[str, ...], str]:
-    rows, missing, matching = robot.pairing([file.name for file in files])
-    if not rows:
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{robot.where}: no row is of an image in {source}: {robot.images[0]} … there, {files[0].name} … here; "
-            "correct them",
-        )
-    return rows, missing, matching
-
-
-def _without_partner(
-    files: list[ImageFile], rows: dict[str, int], missing: tuple[str, ...], poses: str
-) -> list[tuple[str, str]]:
-    left_out = [(file.name, f"no row in {poses}") for file in files if file.name not in rows]
-    return left_out + [(name, f"no such image, in a row of {poses}") for name in missing]
-
-
-def _robot_lines(robot: RobotPoses, how: str) -> tuple[str, ...]:
-    return (f"robot: {robot.understood}", *((f"images matched {how}",) if how else ()))
 
 
 def dry_run(
@@ -396,48 +395,27 @@ def dry_run(
 ) -> list[str]:
     """Returns lines on how the inputs are understood, without looking for the board in images."""
     if isinstance(source, Path) and source.is_dir():
-        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, statements, timing, robot)
-    inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)
-    lines = list(inputs.understood) if isinstance(source, Told) or inputs.understood else own_told(source, quaternions)
-    setup = setup_of(statements, inputs.setup, inputs.where)
-    origin = "as you say" if statements.setup else "as the file says" if inputs.setup else "by default"
-    lines += [f"setup: {setup}, {origin}", f"pairs: {len(inputs.pairs)}"]
-    lines += spread_text(inputs.pairs.base_from_flange, setup)
-    return lines + [f"left out {name}: {reason}" for name, reason in inputs.left_out]
-
-
-def _dry_images(
-    source: Path,
-    poses: Path,
-    camera: Path,
-    board: Path,
-    quaternions: Order,
-    statements: Said,
-    timing: Timing,
-    arm: Robot | None,
-) -> list[str]:
-    """Returns the lines on a folder of images."""
-    if arm is not None:
-        _require_by_name(timing)
-    robot = read_robot_poses(poses, quaternions, statements) if arm is None else read_arm(poses, arm, quaternions)[0]
-    design, model = load_boards(board), read_camera(camera)
-    files, skipped = find_images(source)
-    at_images = robot_at_images(robot, [file.name for file in files], None if arm else timing)
-    robot, every = at_images.robot, len(files)
-    files = [file for file in files if file.name not in dict(at_images.left_out)]
-    rows, missing, matching = _rows_of_images(robot, files, source)
-    setup = setup_of(statements, None, source.name)
-    kind = kind_of(design)
-    lines = [
-        *_robot_lines(robot, matching),
-        f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",
-        f"board: {board.name}: {kind}",
-        f"setup: {setup}, {'as you say' if statements.setup else 'by default'}",
-        f"images: {len(rows)} of {every} with a pose of the robot; the board was not looked for",
-        *spread_text(robot.base_from_flange[list(rows.values())], setup),
-    ]
-    left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in skipped] + list(at_images.left_out)
-    left_out += _without_partner(files, rows, missing, poses.name)
+        files = _all_three(source, poses, camera, board)
+        own = _photographs(source, files, quaternions, statements, timing, robot)
+        stated, flange = statements.setup, own.at_images.robot.base_from_flange[list(own.row_of.values())]
+        (width, height), focal_px = (own.model.width, own.model.height), own.model.focal[0]
+        lines = [
+            *own.robot_lines(),
+            f"camera: {files[1].name}: {width} × {height} px, focal length {focal_px:.6g} px",
+            f"board: {files[2].name}: {kind_of(own.design)}",
+        ]
+        count = f"images: {len(own.row_of)} of {len(own.files)} with a pose of the robot; the board was not looked for"
+        left_out = [*own.skipped, *own.unpaired]
+    else:
+        inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)
+        stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
+        lines = list(inputs.understood)
+        if not lines and not isinstance(source, Told):
+            lines = own_told(source, quaternions)
+        count = f"pairs: {len(inputs.pairs)}"
+    setup = stated or "eye-in-hand"
+    origin = "as you say" if statements.setup else "as the file says" if stated else "by default"
+    lines += [f"setup: {setup}, {origin}", count, *spread_text(flange, setup)]
     return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 

@@ -14,7 +14,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
 from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.judge.remarks import Aside, Grave, SizeDoubt, of_setup
@@ -252,7 +252,8 @@ FALLS = 0.98
 """Largest ratio of the mean squares of residuals with and without an offset at which the offset is reported although it
 does no harm."""
 HARMFUL = 1.0
-"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong."""
+"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong; without σ it
+is always."""
 ROW_S = 0.05
 """Time assumed between rows if poses have no times but follow one another smoothly: a scan of ±1 s then covers ±20
 rows."""
@@ -324,7 +325,8 @@ def lag_tried(
     except StcalError:  # the motions tell no offset
         return result, ()
     fits = [float((np.linalg.norm(each.residuals[~each.outliers, 3:], axis=1) ** 2).mean()) for each in (before, after)]
-    harmful = _shift(result, lag) > HARMFUL
+    moved = np.abs(lag.seconds * lag.slope[:6])
+    harmful = result.covariance is None or (moved / np.sqrt(np.diag(result.covariance))).max() > HARMFUL
     if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
@@ -363,9 +365,8 @@ def _moving(given: HandEyeInput) -> Timed | None:
         seconds = ROW_S * np.arange(len(pairs))
         timed = Timed(Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where), seconds)
     poses = timed.stream.base_from_flange
-    steps = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
-    steps_rms = np.sqrt((steps**2).sum(2).mean(0))
-    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps_rms, strict=True))
+    steps = rms_of(poses[1:].difference(poses[:-1]))
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps, strict=True))
     return timed if smooth else None
 
 
@@ -384,13 +385,6 @@ def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> 
     step = -covariance @ (flat.T @ left)
     variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
     return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
-
-
-def _shift(result: HandEye, lag: TimeOffset) -> float:
-    """Returns the largest change of X by the offset, in σ of X; infinite where X has no σ."""
-    if result.covariance is None:
-        return float("inf")
-    return float((np.abs(lag.seconds * lag.slope[:6]) / np.sqrt(np.diag(result.covariance))).max())
 
 
 LEAST_REACHED = 0.5
@@ -445,7 +439,12 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
     if robot is None:
         return Planned(result, plan_poses(given.pairs, result, count, outline, camera, None, seed), {}, ())
     near, notes = _taken(robot, given)
-    planned = plan_poses(given.pairs, result, count, outline, camera, _reach(robot, near), seed)
+
+    def reachable(flange: Poses) -> np.ndarray:
+        """Returns True where a pose is within the limits and its joint values are determined."""
+        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
+
+    planned = plan_poses(given.pairs, result, count, outline, camera, reachable, seed)
     q = inverse(robot, planned.base_from_flange, near).q
     joints = dict(zip(joint_columns(robot), np.where(robot.prismatic, q, np.degrees(q)).T, strict=True))
     return Planned(result, planned, joints, notes)
@@ -453,8 +452,8 @@ def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None
 
 def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
     """Returns the joint values (n,) of the last pose that the robot reaches, and notes on those that it does not."""
-    flange = given.pairs.base_from_flange
-    solutions = inverse(robot, flange, _middle(robot))
+    flange, middle = given.pairs.base_from_flange, robot.limits().mean(1)
+    solutions = inverse(robot, flange, np.where(np.isfinite(middle), middle, 0.0))  # joints without limits from 0
     beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
     message = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
     if len(beyond) > (1 - LEAST_REACHED) * len(flange):
@@ -465,17 +464,3 @@ def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ..
         )
     notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
     return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes
-
-
-def _middle(robot: Robot) -> np.ndarray:
-    """Returns the middle (n,) of the joint limits, 0 where there are none."""
-    middle = robot.limits().mean(1)
-    return np.where(np.isfinite(middle), middle, 0.0)
-
-
-def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
-    def reachable(flange: Poses) -> np.ndarray:
-        """Returns True where a pose is within the limits and its joint values are determined."""
-        return np.array([status == REACHED for status in inverse(robot, flange, near).status])
-
-    return reachable

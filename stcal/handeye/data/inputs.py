@@ -9,9 +9,9 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
-from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance, inverse_jacobian
+from stcal.handeye.data.pairs import HandEyePoses, Setup, inverted
 from stcal.handeye.data.recognise import read_columns, read_content, todays
-from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, inverse_name
+from stcal.handeye.data.record import FRAMES, Content, Frames, Role, Said, Side, Unit, inverse_name
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
@@ -57,7 +57,7 @@ class Told:
 
     pairs: HandEyePoses
     understood: tuple[str, ...]
-    setup: str | None = None
+    setup: Setup | None = None
     left_out: tuple[tuple[str, str], ...] = ()
     timed: Timed | None = None
 
@@ -79,7 +79,7 @@ def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Or
         raise InputError(
             "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
         )
-    robot, camera = (settled(_side(content, role, path), role, content, path, statements) for role in FRAMES)
+    robot, camera = (settled(content, role, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         raise InputError(
             "E-POSES-UNITS",
@@ -120,12 +120,11 @@ def read_two(
             content = read_columns(table, own, statements)
             if content is None:
                 raise _no_poses(table)
-        sides.append(settled(_side(content, role, path), role, content, path, statements))
-    robot, camera = sides
-    setup = next((content.setup for content in contents if content is not None and content.setup), None)
-    if (
-        told_by_time := _by_time(robot, camera, setup, f"{first.name} with {second.name}", tolerance_s, timed)
-    ) is not None:
+        sides.append(settled(content, role, path, statements))
+    (robot, camera), where = sides, f"{first.name} with {second.name}"
+    setups: list[Setup] = [content.setup for content in contents if content is not None and content.setup]
+    setup = setups[0] if setups else None
+    if (told_by_time := _by_time(robot, camera, setup, where, tolerance_s, timed)) is not None:
         return told_by_time
     rows, how = matched(robot, camera, key)
     notes = () if not how else (f"rows joined {how}",)
@@ -135,7 +134,6 @@ def read_two(
     alone = sorted(set(range(len(robot))) - set(a)) if stamped is None else ()  # samples between images are no mistake
     left_out = [(robot.called(i), f"in {first.name} alone") for i in alone]
     left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
-    where = f"{first.name} with {second.name}"
     pairs = _pairs(robot, camera, a, b, names, where)
     return Told(pairs, (*_both(robot, camera), *notes), setup, tuple(left_out), stamped)
 
@@ -154,7 +152,7 @@ def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
     """Returns the robot's poses of a file; None where it is one of the package's own tables."""
     content = read_content(path, statements.of("robot"), key, quaternions)
-    return None if content is None else settled(_side(content, "robot", path), "robot", content, path, statements)
+    return None if content is None else settled(content, "robot", path, statements)
 
 
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
@@ -187,7 +185,7 @@ def _no_poses(table: Table) -> InputError:
 
 
 def _by_time(
-    robot: Posed, camera: Posed, setup: str | None, where: str, tolerance_s: float, always: bool
+    robot: Posed, camera: Posed, setup: Setup | None, where: str, tolerance_s: float, always: bool
 ) -> Told | None:
     """Returns the robot's poses at the camera's times; None without, or, unless ``always``, with equal times."""
     times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
@@ -236,9 +234,9 @@ def _side(content: Content, role: Role, path: Path) -> Side:
     return side
 
 
-def settled(side: Side, role: Role, content: Content, path: Path, statements: Said) -> Posed:
-    """Returns poses in the direction that is needed, mm, with a line on how they were read."""
-    statements = statements.of(role)
+def settled(content: Content, role: Role, path: Path, statements: Said) -> Posed:
+    """Returns poses of a role in the direction that is needed, mm, with a line on how they were read."""
+    side, statements = _side(content, role, path), statements.of(role)
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
     if len(far):
         measured = np.abs(side.translation[far[0]]).max()
@@ -251,9 +249,7 @@ def settled(side: Side, role: Role, content: Content, path: Path, statements: Sa
     covariance, common = side.covariance, side.common
     wanted = FRAMES[role][0]
     if frames.name != wanted:
-        covariance = None if covariance is None else inverse_covariance(poses, covariance)
-        common = None if common is None else inverse_jacobian(poses) @ common
-        poses = poses.inverse()
+        poses, covariance, common = inverted(poses, covariance, common)
     parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
     if content.passed_over:
         ellipsis = " …" if len(content.passed_over) > SHOWN else ""
@@ -282,13 +278,11 @@ def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
 
 def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
     """Returns the factor to mm, how the unit is known, and the unit if it was guessed from the size of lengths."""
-    stated = side.unit
-    if stated is not None and stated.stated:
-        return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
-    if statements.length_unit is not None:
-        return LENGTHS[statements.length_unit], f"{statements.length_unit} as you say", ""
-    if stated is not None:
-        return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
+    unit, option = side.unit, statements.length_unit
+    if option is not None and not (unit is not None and unit.stated):
+        unit = Unit(option, "as you say")
+    if unit is not None:
+        return LENGTHS[unit.name], f"{unit.name} {unit.by}", ""
     distances = np.linalg.norm(side.translation, axis=1)
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
@@ -304,8 +298,8 @@ def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, s
             f"{path}: {name}: lengths up to {farthest:.3g}, {METRES_UP_TO:g} or less for metres and "
             f"{MILLIMETRES_FROM:g} or more for mm needed to tell the unit; give --length-unit mm, cm or m",
         )
-    unit = "m" if farthest <= METRES_UP_TO else "mm"
-    return LENGTHS[unit], f"{unit} by their size, up to {farthest:.4g}", unit
+    guess = "m" if farthest <= METRES_UP_TO else "mm"
+    return LENGTHS[guess], f"{guess} by their size, up to {farthest:.4g}", guess
 
 
 def _pairs(

@@ -117,17 +117,10 @@ class HandEyePoses(Brief):
     def __getitem__(self, index) -> "HandEyePoses":
         """Returns the pairs selected by a mask, slice or list."""
         rows = np.arange(len(self))[index]
-        of_flange, of_board = self.base_from_flange_covariance, self.camera_from_board_covariance
-        common = self.camera_from_board_common
-        return HandEyePoses(
-            self.base_from_flange[rows],
-            self.camera_from_board[rows],
-            None if of_flange is None else of_flange[rows],
-            None if of_board is None else of_board[rows],
-            tuple(self.names[i] for i in rows),
-            self.where,
-            None if common is None else common[rows],
-        )
+        known = (self.base_from_flange_covariance, self.camera_from_board_covariance, self.camera_from_board_common)
+        of_flange, of_board, common = (None if values is None else values[rows] for values in known)
+        flange, board, names = self.base_from_flange[rows], self.camera_from_board[rows], [self.names[i] for i in rows]
+        return HandEyePoses(flange, board, of_flange, of_board, tuple(names), self.where, common)
 
     def _check_copies(self):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
@@ -194,6 +187,12 @@ def apart(poses: Poses, rows: np.ndarray) -> np.ndarray:
     return np.column_stack([turns, np.linalg.norm(poses.translation[first] - poses.translation[second], axis=1)])
 
 
+def rms_of(differences: np.ndarray) -> tuple[float, float]:
+    """Returns the RMS lengths of differences of poses, (m, 6): rad, mm."""
+    turn, shift = np.sqrt((differences.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+    return float(turn), float(shift)
+
+
 def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEyePoses:
     """Read a CSV file of pose pairs.
 
@@ -237,8 +236,13 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
         )
     poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
     common = table.common_errors(covariance, names[0] + "_")
-    if names[0] == wanted:
-        return poses, covariance, common
+    return (poses, covariance, common) if names[0] == wanted else inverted(poses, covariance, common)
+
+
+def inverted(
+    poses: Poses, covariance: np.ndarray | None, common: np.ndarray | None
+) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
+    """Returns the inverses of poses, with their covariances (m, 6, 6) and common errors (m, 6, k), where known."""
     carried = inverse_jacobian(poses)
     return (
         poses.inverse(),
@@ -254,12 +258,6 @@ def inverse_jacobian(poses: Poses) -> np.ndarray:
     derivative[:, :3, :3] = derivative[:, 3:, 3:] = -transposed
     derivative[:, 3:, :3] = -transposed @ skew(poses.translation)
     return derivative
-
-
-def inverse_covariance(poses: Poses, covariance: np.ndarray) -> np.ndarray:
-    """Returns the covariances (m, 6, 6) of the inverses of poses with these covariances (m, 6, 6)."""
-    jacobian = inverse_jacobian(poses)
-    return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
 
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]

@@ -9,6 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
+from stcal.handeye.data.pairs import Setup
 from stcal.io.poses.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
@@ -90,7 +91,7 @@ class Content:
 
     form: str
     sides: tuple[Side, ...]
-    setup: str | None = None
+    setup: Setup | None = None
     passed_over: tuple[str, ...] = ()
 
     def of(self, role: Role) -> Side | None:
@@ -115,12 +116,12 @@ class Said:
     rotation: str | None = None
     length_unit: str | None = None
     frames: tuple[str, ...] = ()
-    setup: str | None = None
+    setup: Setup | None = None
     own: tuple[tuple[Role, str, str], ...] = ()
 
     @classmethod
     def of_options(
-        cls, rotation: Sequence[str], length_unit: Sequence[str], frames: Sequence[str], setup: str | None = None
+        cls, rotation: Sequence[str], length_unit: Sequence[str], frames: Sequence[str], setup: Setup | None = None
     ) -> "Said":
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
         ``robot=`` and ``camera=``, and of ``--poses-are``.

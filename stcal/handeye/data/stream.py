@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
+from stcal.handeye.data.pairs import rms_of
 
 LONGEST_S = 0.25
 """Largest distance in time of two samples between which a pose is interpolated."""
@@ -91,26 +92,20 @@ class Stream:
     def rest(self) -> tuple[float, float]:
         """Returns σ of one sample (rad, mm), by samples' deviations from the cubic through their four neighbours; NaN
         if fewer than five. It holds where these are noise."""
-        n = len(self)
-        if n < WINDOW + 1:
-            return float("nan"), float("nan")
-        samples = np.arange(2, n - 2)
+        samples = np.arange(2, len(self) - 2)
         nodes = samples[:, None] + np.array([-2, -1, 1, 2])
         close = self.seconds[nodes[:, -1]] - self.seconds[nodes[:, 0]] <= WINDOW * LONGEST_S
         samples, nodes = samples[close], nodes[close]
         if not len(samples):
             return float("nan"), float("nan")
         interpolated = self._weighted(samples - 1, nodes, _lagrange(self.seconds[nodes], self.seconds[samples]))
-        deviation = self.base_from_flange[samples].difference(interpolated).reshape(-1, 2, 3)
-        turn, shift = np.sqrt((deviation**2).sum(2).mean(0)) / LOO_NOISE
-        return float(turn), float(shift)
+        turn, shift = rms_of(self.base_from_flange[samples].difference(interpolated))
+        return turn / LOO_NOISE, shift / LOO_NOISE
 
     def travel(self, seconds: np.ndarray, window_s: float) -> tuple[float, float]:
         """Returns the RMS rotation (rad) and travel (mm) of the flange within a window about each time."""
         low, high = (np.clip(seconds + s * window_s / 2, 0, self.seconds[-1]) for s in (-1, 1))
-        motion = self.at(high).difference(self.at(low)).reshape(-1, 2, 3)
-        turn, way = np.sqrt((motion**2).sum(2).mean(0))
-        return float(turn), float(way)
+        return rms_of(self.at(high).difference(self.at(low)))
 
     def _weighted(self, reference: np.ndarray, nodes: np.ndarray, weight: np.ndarray) -> Poses:
         rotation = np.asarray(self.base_from_flange.rotation)

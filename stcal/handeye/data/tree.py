@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.record import (
     FRAMES,
     MATRICES,
@@ -34,6 +35,8 @@ HOLDERS = ("poses", "data", "samples", "pairs", "frames", "transforms", "measure
 LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timestamps", "stamps")
 """Keys of lists that name the poses of a stack in the same object."""
 MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
+SETUPS: dict[str, Setup] = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
+"""Setups by easy_handeye's names of them."""
 ROS = Unit("m", "as in ROS")
 
 
@@ -171,10 +174,9 @@ def _easy_handeye(value: Mapping, statements: Said, where: str) -> Content | Non
         lists = [[entry["robot"] for entry in samples], [entry[camera_key] for entry in samples]]
     else:
         return None
-    setup = None
+    setup: Setup | None = None
     if isinstance(parameters, Mapping):
-        by_type = {"eye_in_hand": "eye-in-hand", "eye_on_base": "eye-to-hand", "eye_to_hand": "eye-to-hand"}
-        setup = by_type.get(str(parameters.get("calibration_type", "")))
+        setup = SETUPS.get(str(parameters.get("calibration_type", "")))
         if isinstance(parameters.get("eye_on_hand"), bool):
             setup = "eye-in-hand" if parameters["eye_on_hand"] else "eye-to-hand"
     fixed = (setup or statements.setup) == "eye-to-hand"

@@ -103,11 +103,10 @@ class Views(Brief):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resection:
-    """``covariance`` : (m, 6, 6) of the poses; ``sigma_px`` : σ of the corners, or factor on their stated one."""
+    """``covariance`` : (m, 6, 6) of the poses."""
 
     camera_from_board: Poses
     covariance: np.ndarray
-    sigma_px: float
 
 
 def resect(views: Views, names: tuple[str, ...]) -> Resection:
@@ -121,8 +120,7 @@ def resect(views: Views, names: tuple[str, ...]) -> Resection:
         cost += minimum.linear.cost
     redundancy = 2 * views.corners() - 6 * len(views)
     variance = cost / redundancy if redundancy else 1.0
-    covariance = variance * np.linalg.inv(np.array(normals))
-    return Resection(Poses.of(poses), covariance, float(np.sqrt(variance)))
+    return Resection(Poses.of(poses), variance * np.linalg.inv(np.array(normals)))
 
 
 @require_arguments

@@ -23,7 +23,7 @@ from stcal.handeye.judge.remarks import HALL_MM, Aside, Grave, of_still, spoken
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.closed_form import mean_pose
 from stcal.io.poses.rotations import INVERTED as CONJUGATED
-from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR, Reading
+from stcal.io.poses.rotations import LAST, ORDERS, ROTATION_VECTOR
 
 FAR_BETTER, BETTER = 30.0, 3.0
 """Factors by which a variant must reduce the product of the median residuals in rotation and translation, and the
@@ -189,46 +189,44 @@ def _other_angles(loop: Loop, by_images: bool) -> dict[str, Loop]:
     """Returns the loop with angles that were read in one sequence, and meant in another."""
     variants = {}
     for side, role in (("robot", "robot"),) if by_images else (("robot", "robot"), ("board", "camera")):
-        poses = _of_side(loop, side)
-        inverted = side == "robot" and loop.inverted
-        read = poses.inverse() if inverted else poses
         for one, other in permutations(ANGLES, 2):
-            meant = Poses(_of_angles(_angles_of(read.rotation, one), other), read.translation)
             key = f"with the {side}'s{OTHER_ANGLES}--rotation {role}={other}-deg (or -rad) if they were read as {one}"
-            variants[key] = _with_side(loop, side, meant.inverse() if inverted else meant)
+            variants[key] = _with_stated(loop, side, _with_angles(_stated(loop, side), one, other))
     return variants
 
 
-def _angles_of(rotation: np.ndarray, order: str) -> np.ndarray:
-    """Returns the three angles (m, 3), rad, of rotations (m, 3, 3) in an order of axes, or their rotation vectors."""
+def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
+    """Returns poses whose angles were read in one sequence, or as rotation vectors, and meant in another."""
+    rotation = Rotation.from_matrix(poses.rotation)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of the gimbal lock: its angles give the same rotation
-        turns = Rotation.from_matrix(rotation)
-        return turns.as_rotvec() if order == ROTATION_VECTOR else turns.as_euler(order)
-
-
-def _of_angles(angles: np.ndarray, order: str) -> np.ndarray:
-    """Returns the rotations (m, 3, 3) of three angles (m, 3), rad, in an order of axes, or of rotation vectors."""
-    turns = Rotation.from_rotvec(angles) if order == ROTATION_VECTOR else Rotation.from_euler(order, angles)
-    return turns.as_matrix()
+        angles = rotation.as_rotvec() if read == ROTATION_VECTOR else rotation.as_euler(read)
+    turns = Rotation.from_rotvec(angles) if meant == ROTATION_VECTOR else Rotation.from_euler(meant, angles)
+    return Poses(turns.as_matrix(), poses.translation)
 
 
 def _other_places(loop: Loop, by_images: bool) -> dict[str, Loop]:
     """Returns the loop with other signs and another order of the coordinates of places, on either side."""
     variants = {}
     for side in ("robot",) if by_images else ("robot", "board"):
-        poses = _of_side(loop, side)
-        inverted = side == "robot" and loop.inverted
-        read = poses.inverse() if inverted else poses
+        read = _stated(loop, side)
         for names, places in other_axes(read.translation):
-            meant = Poses(read.rotation, places)
             key = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
-            variants[key] = _with_side(loop, side, meant.inverse() if inverted else meant)
+            variants[key] = _with_stated(loop, side, Poses(read.rotation, places))
     return variants
 
 
-def _with_side(loop: Loop, side: str, poses: Poses) -> Loop:
-    return replace(loop, stand_from_mount=poses) if side == "robot" else replace(loop, camera_from_board=poses)
+def _stated(loop: Loop, side: str) -> Poses:
+    """Returns the poses of a side as their file states them."""
+    poses = _of_side(loop, side)
+    return poses.inverse() if side == "robot" and loop.inverted else poses
+
+
+def _with_stated(loop: Loop, side: str, poses: Poses) -> Loop:
+    """Returns the loop with other poses of a side, as a file would state them."""
+    if side == "board":
+        return replace(loop, camera_from_board=poses)
+    return replace(loop, stand_from_mount=poses.inverse() if loop.inverted else poses)
 
 
 def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
@@ -259,7 +257,8 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
             "row, or the names of their images"
         ] = Loop(hand[robot_rows], eye[board_rows], loop.inverted)
     for reading in (*ORDERS, CONJUGATED):
-        robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)
+        robot, board = (reading.poses(_stated(loop, side)) for side in ("robot", "board"))
+        by_robot = _with_stated(loop, "robot", robot)
         kind = "conjugated" if reading.conjugated else "in another order"
         order = "xyzw" if reading is LAST else "wxyz"
         robot_side, camera_side = (
@@ -268,10 +267,10 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
             for side in ("robot", "camera")
         )
         both_sides = f"quaternions {kind}: if {reading.held}, {reading.remedy}"
-        variants[f"with the robot's {both_sides if by_images else robot_side}"] = replace(loop, stand_from_mount=robot)
+        variants[f"with the robot's {both_sides if by_images else robot_side}"] = by_robot
         if not by_images:
             variants[f"with the board's {camera_side}"] = replace(loop, camera_from_board=board)
-            variants[f"with all {both_sides}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
+            variants[f"with all {both_sides}"] = replace(by_robot, camera_from_board=board)
     return variants
 
 
@@ -325,12 +324,6 @@ def _as_of_radians(loop: Loop, by_images: bool) -> str:
 
 def _of_side(loop: Loop, side: str) -> Poses:
     return loop.stand_from_mount if side == "robot" else loop.camera_from_board
-
-
-def _read_as(reading: Reading, poses: Poses, inverted: bool = False) -> Poses:
-    """Returns the poses read with quaternions in another convention; ``inverted`` : their inverses were read."""
-    right = reading.poses(poses.inverse() if inverted else poses)
-    return right.inverse() if inverted else right
 
 
 def _differ(loop: Loop) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.handeye.data.pairs import FRAMES, Loop, Setup
 from stcal.io.table import LENGTHS, UNIT_WORDS
 
@@ -51,7 +51,7 @@ class Observability:
 
     def __post_init__(self):
         for name, shape in (("turns_rad", (3,)), ("axes", (3, 3)), ("mount_axis", (3,))):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+            freeze(self, name, shape, name)
 
     @classmethod
     def of(cls, loop: Loop) -> "Observability":
@@ -98,18 +98,15 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
         )
     observability = Observability.of(loop)
     if four_dof:
-        turns = _list(np.degrees(observability.turns_rad))
+        fault = ""
         if observability.turns_rad[0] < LEAST_TURN:
+            fault = f"; rotate it about {in_words(observability.axes[0])} by {WANTED_DEG}° or more"
+        elif not observability.one_axis:
+            fault = ", but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out"
+        if fault:
+            turns = f"{_list(np.degrees(observability.turns_rad))}° (RMS)"
             raise DegenerateError(
-                "E-HANDEYE-AXES",
-                f"{where}: the flange turns by {turns}° (RMS) about its principal axes; "
-                f"rotate it about {in_words(observability.axes[0])} by {WANTED_DEG}° or more",
-            )
-        if not observability.one_axis:
-            raise DegenerateError(
-                "E-HANDEYE-AXES",
-                f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "but a robot with four axes turns about one axis only; leave --four-dof (in Python four_dof) out",
+                "E-HANDEYE-AXES", f"{where}: the flange turns by {turns} about its principal axes{fault}"
             )
     elif observability.useless:
         slides = (

@@ -1,6 +1,5 @@
 """Export of a hand-eye transform to files of other programs; each file is read back and compared."""
 
-import json
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +18,9 @@ from stcal.handeye.result import HandEye
 from stcal.io.poses.programs import (
     Static,
     fixed_joint,
-    messages,
     metres,
     plain_numbers,
     pose_of_metres,
-    read_messages,
     read_ros1_launch,
     read_ros2_commands,
     read_ros2_launch,
@@ -54,7 +51,6 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
     Raises InputError: a name is invalid, or the names are not all different.
     """
     mount, *names = frame_names(result.setup, parent, child, camera_frame)
-    require_frame_names(mount, *names)
     if camera_frame == "optical":
         return [Static(mount, names[0], result.mount_from_camera)]
     link, optical = names
@@ -63,22 +59,22 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
 
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
-    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame."""
-    mount = parent or FRAMES[setup].mount
+    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame.
+
+    Raises InputError: a name has a control character, or occurs twice.
+    """
+    names = [parent or FRAMES[setup].mount]
     if camera_frame == "optical":
-        return mount, child or CAMERA_FRAME
-    link = child or CAMERA_LINK
-    return mount, link, f"{link.removesuffix('_link')}_optical_frame"
-
-
-def require_frame_names(*names: str) -> None:
-    """Raises InputError if a frame's name has a control character, or occurs twice; empty ones are defaults."""
-    given = [name for name in names if name]
-    for name in given:
+        names.append(child or CAMERA_FRAME)
+    else:
+        link = child or CAMERA_LINK
+        names += [link, f"{link.removesuffix('_link')}_optical_frame"]
+    for name in names:
         if not name.isprintable():
             raise InputError("E-FRAME-NAME", f"frames: {name!r} has control characters; give a name in letters")
-        if given.count(name) > 1:
+        if names.count(name) > 1:
             raise InputError("E-FRAME-NAME", f"frames: parent and child are both {name!r}; two names needed")
+    return tuple(names)
 
 
 def said_of(result: HandEye) -> list[str]:
@@ -105,18 +101,30 @@ def opencv_yaml(result: HandEye) -> str:
     return "\n".join(lines) + "\n"
 
 
+def named(result: HandEye) -> list[Static]:
+    """Returns both transforms of a result."""
+    return [_static(name, pose) for name, pose in result.transforms.items()]
+
+
+def _static(name: str, pose: Rigid) -> Static:
+    parent, _, child = name.partition("_from_")
+    return Static(parent, child, pose)
+
+
+def read_opencv(text: str) -> list[Static]:
+    """Returns the transforms in a text of :func:`opencv_yaml`."""
+    content = load_yaml(text)
+    frames = FRAMES[content["setup"]]
+    matrices = {name: np.reshape(content[name]["data"], (4, 4)) for name in (frames.camera, frames.board)}
+    return [_static(name, Rigid.from_matrix(matrix)) for name, matrix in matrices.items()]
+
+
 IN_HAND = "eye-in-hand"
 
 
-def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """Returns ``geometry_msgs/TransformStamped`` as YAML, in metres: a document for each transform of :func:`tree`."""
-    return messages(tree(result, parent, child, camera_frame))
-
-
-def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); for ``link`` two, in a ``robot`` for
+def urdf_joint(transforms: list[Static]) -> str:
+    """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); of several ones, in a ``robot`` for
     xacro."""
-    transforms = tree(result, parent, child, camera_frame)
     joints = [fixed_joint(each) for each in transforms]
     if len(joints) == 1:
         return joints[0]
@@ -232,18 +240,11 @@ FORMS = {
 """All formats, by the word of ``--export``."""
 
 
-def exported(
-    result: HandEye,
-    form: str,
-    name: str = "handeye",
-    parent: str = "",
-    child: str = "",
-    camera_frame: CameraFrame = "optical",
-) -> str:
-    """Returns the text in one of :data:`FORMS`, read back and compared; ``name`` : the file's stem, which easy_handeye
-    holds. Raises InputError: the format is unknown, or cannot hold the name of a frame."""
+def exported(result: HandEye, transforms: list[Static], form: str, name: str = "handeye") -> str:
+    """Returns the text of ``transforms``, of :func:`tree`, in one of :data:`FORMS`, read back and compared; ``name`` :
+    the file's stem, which easy_handeye holds. Raises InputError: the format is unknown, or cannot hold the name of a
+    frame."""
     require_form(form, FORMS)
-    transforms = tree(result, parent, child, camera_frame)
     text = FORMS[form].write(result, transforms, name)
     for static, wanted in zip(FORMS[form].read(text), transforms, strict=False):
         difference = static.pose.inverse() @ wanted.pose
@@ -255,24 +256,10 @@ def exported(
     return text
 
 
-def require_export_written(
-    path: Path,
-    kind: str,
-    result: HandEye,
-    parent: str = "",
-    child: str = "",
-    camera_frame: CameraFrame = "optical",
-) -> None:
-    """Read a written file again, and require the transforms of ``result``; ``kind`` : ``json``, ``opencv``, ``ros`` or
-    ``urdf``."""
+def require_export_written(path: Path, read: Callable[[str], list[Static]], transforms: list[Static]) -> None:
+    """Reads a written file again, and requires the poses of ``transforms``."""
 
     def again() -> Poses:
-        text = path.read_text(encoding="utf-8")
-        if kind in ("ros", "urdf"):
-            return Poses.of(static.pose for static in (read_messages if kind == "ros" else read_urdf)(text))
-        content = json.loads(text) if kind == "json" else load_yaml(text)
-        matrices = [content[name] if kind == "json" else content[name]["data"] for name in result.transforms]
-        return Poses.of(Rigid.from_matrix(np.reshape(matrix, (4, 4))) for matrix in matrices)
+        return Poses.of(each.pose for each in read(path.read_text(encoding="utf-8")))
 
-    statics = tree(result, parent, child, camera_frame) if kind in ("ros", "urdf") else ()
-    require_poses_written(path, again, Poses.of([each.pose for each in statics] or result.transforms.values()))
+    require_poses_written(path, again, Poses.of(each.pose for each in transforms))

@@ -2,19 +2,19 @@
 
 import base64
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import freeze
 from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.reprojection import Reprojection
-from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.result import HandEye
+from stcal.handeye.validate import as_adjusted, poses_by_robot
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode, grey_8bit, thumbnail
 from stcal.report.svg import (
@@ -41,19 +41,9 @@ LEAST_TURN = np.radians(2)
 """Smallest turn whose axis is drawn, in rad; the axes of smaller turns are noise."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageCoverage:
-    """``counts`` : (rows, columns) photographs whose board covers a cell; ``share`` : of the cells that any covers."""
-
-    counts: np.ndarray
-    share: float
-
-    def __post_init__(self):
-        freeze(self, "counts", (None, None), "counts", int)
-
-
-def image_coverage(views: Views) -> ImageCoverage:
-    """Returns the coverage of the image by the convex hulls of each view's corners."""
+def image_coverage(views: Views) -> np.ndarray:
+    """Returns the number (rows, columns) of photographs whose board, the convex hull of its corners, covers each cell
+    of the image."""
     width, height = views.camera.width, views.camera.height
     cell = max(width, height) / CELLS
     columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
@@ -68,7 +58,7 @@ def image_coverage(views: Views) -> ImageCoverage:
         except QhullError:  # all corners on a line
             continue
         counts += (middle @ sides[:, :2].T + sides[:, 2] <= 0).all(1)
-    return ImageCoverage(counts.reshape(rows, columns), float((counts > 0).mean()))
+    return counts.reshape(rows, columns)
 
 
 def turns_between(pairs: HandEyePoses) -> np.ndarray:
@@ -89,17 +79,9 @@ def equal_area(directions: np.ndarray) -> np.ndarray:
 
 def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
     """Returns the corners (k, 2) px of each view by the robot's reported pose, NaN behind the camera."""
-    loop, board = Loop.of(pairs, result.setup), result.reprojection
-    camera = views.camera if board is None else board.camera
-    predicted = []
-    poses = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
-    for view, pose in zip(views.views, poses, strict=True):
-        xyz = pose @ (result.scale * view.xyz_board if board is None else board.board(view.xyz_board))
-        in_front = xyz[:, 2] > 0
-        px = np.full((len(xyz), 2), np.nan)
-        px[in_front] = camera.project(xyz[in_front])
-        predicted.append(px)
-    return predicted
+    camera, adjusted = as_adjusted(result, views)
+    poses = poses_by_robot(result, Loop.of(pairs, result.setup))
+    return [camera.project(pose @ view.xyz_board) for view, pose in zip(adjusted, poses, strict=True)]
 
 
 def rms_px(predicted: np.ndarray, seen: np.ndarray) -> float:
@@ -196,13 +178,13 @@ def _circle(radius: float) -> np.ndarray:
     return radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
 
-def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray, off: np.ndarray) -> Drawing:
+def image_figure(size: tuple[int, int], counts: np.ndarray, seen: np.ndarray, off: np.ndarray) -> Drawing:
     """Draws how often the board covered the image, and enlarged residuals ``off`` (n, 2) of corners ``seen`` (n, 2)."""
     width, height = size
     drawing = Drawing(6.0, 5.25 * height / width + 0.6)
     axes = Axes(drawing, drawing.panels()[0], (-0.5, width - 0.5), (height - 0.5, -0.5))
-    shown = np.where(covered.counts > 0, covered.counts, np.nan)
-    most = max(int(covered.counts.max()), 1)
+    shown = np.where(counts > 0, counts, np.nan)
+    most = max(int(counts.max()), 1)
     axes.shade(shown, (-0.5, -0.5, width - 0.5, height - 0.5), -most / 3, 2.5 * most, BLUES, smooth=False)
     sample = _some(len(seen))
     seen, off = seen[sample], enlargement(off, width) * off[sample]
@@ -278,12 +260,8 @@ class Overlay:
     corners: list[tuple[float, float, float, float, str]]
 
 
-def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
-    """Returns the overlays of the worst, median and best image, and a message for each unreadable one; none without
-    images."""
-    result, pairs, views = outcome.result, outcome.pairs, outcome.views
-    if pairs is None or views is None or outcome.folder is None:
-        return [], []
+def overlays(result: HandEye, pairs: HandEyePoses, views: Views, folder: Path) -> tuple[list[Overlay], list[str]]:
+    """Returns the overlays of the worst, median and best image, and a message for each unreadable one."""
     predicted = by_robot(result, pairs, views)
     rms = np.array([rms_px(p, view.xy_px) for p, view in zip(predicted, views.views, strict=True)])
     order = np.argsort(rms, kind="stable")[::-1]
@@ -294,7 +272,7 @@ def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
     for i, word in chosen.items():
         name = pairs.names[i]
         try:
-            grey = grey_8bit(decode(read_bytes(outcome.folder / name, IMAGE_BYTES), name))
+            grey = grey_8bit(decode(read_bytes(folder / name, IMAGE_BYTES), name))
         except (OSError, InputError) as error:
             reason = error.strerror or error if isinstance(error, OSError) else error
             missing.append(f"{name} cannot be shown: {reason}")

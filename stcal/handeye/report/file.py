@@ -9,8 +9,7 @@ import stcal
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
-from stcal.handeye.judge.observability import Observability
-from stcal.handeye.judge.remarks import Verdict, Word
+from stcal.handeye.judge.remarks import Word
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
@@ -237,14 +236,14 @@ class HandEyeFile(ResultFile):
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
+        found, seen = judged(outcome), outcome.result.observability
         result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
         poses = {name: pose.matrix() for name, pose in result.transforms.items()}
         compared = [_method(each, names) for each in outcome.compared]
         optional: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
         optional |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
         optional |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
-        if (offset := outcome.time_offset) is not None:
-            optional["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
+        optional |= {} if outcome.time_offset is None else {"time_offset": outcome.time_offset}
         optional |= {"understood": outcome.understood} if outcome.understood else {}
         optional |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
@@ -252,7 +251,7 @@ class HandEyeFile(ResultFile):
                 "format": "stcal handeye 1",
                 "version": stcal.__version__,
                 "where": outcome.where,
-                "verdict": verdict_part(judged(outcome)),
+                "verdict": {"word": found.word, "sentence": found.sentence(), "findings": found.findings},
                 "setup": result.setup,
                 "method": result.method,
                 **poses,
@@ -268,16 +267,17 @@ class HandEyeFile(ResultFile):
                 "outliers": outcome.outliers(),
                 "left_out": [NamedReason(name=name, reason=reason) for name, reason in outcome.left_out],
                 "held_out": _held_out(outcome.held_out, result.outliers),
-                "observability": _observability(result.observability),
+                "observability": seen
+                and {
+                    "turns_rad": seen.turns_rad,
+                    "axes_flange": seen.axes,
+                    "sigma_rad": seen.sigma_rad,
+                    "sigma_mm": seen.sigma_mm,
+                },
                 "notes": outcome.all_notes(),
                 **optional,
             }
         )
-
-
-def verdict_part(found: Verdict) -> VerdictPart:
-    rows = [FindingRow(**{name: getattr(each, name) for name in FindingRow.model_fields}) for each in found.findings]
-    return VerdictPart(word=found.word, sentence=found.sentence(), findings=rows)
 
 
 def board_part(outcome: Outcome) -> BoardSize:
@@ -369,13 +369,4 @@ def _method(each: Compared, names: tuple[str, ...]) -> MethodRow:
         held_out=_held_out(each.held_out, bad),
         **{name: pose.matrix() for name, pose in transforms.items()},
         splits=_splits(each.held_out, names),
-    )
-
-
-def _observability(observability: Observability | None) -> SeenTurns | None:
-    return observability and SeenTurns(
-        turns_rad=observability.turns_rad,
-        axes_flange=observability.axes,
-        sigma_rad=observability.sigma_rad,
-        sigma_mm=observability.sigma_mm,
     )

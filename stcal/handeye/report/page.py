@@ -4,11 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
-from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import Aside, Verdict, spoken
 from stcal.handeye.report.figures import (
     BAD,
@@ -23,6 +21,7 @@ from stcal.handeye.report.figures import (
     turns_between,
     turns_figure,
 )
+from stcal.handeye.report.file import camera_part
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
@@ -91,22 +90,10 @@ def _headline(outcome: Outcome) -> str:
     return f"{result.setup}, {result.method}: {len(result.names) - len(bad)} poses{without}"
 
 
-def _transforms(result: HandEye) -> list[tuple[str, Rigid, np.ndarray | None]]:
-    covariances = (result.covariance, result.stand_covariance)
-    return [(*item, covariance) for item, covariance in zip(result.transforms.items(), covariances, strict=True)]
-
-
 def _splits_text(outcome: Outcome) -> str:
     every = (outcome.held_out, *(each.held_out for each in outcome.compared))
     known = [found.rows.shape for found in every if found is not None]
     return f"{known[0][0]} × {known[0][1]} of {len(outcome.result.names)} poses" if known else "no poses"
-
-
-def _agreeing_text(outcome: Outcome) -> list[str]:
-    """Returns the errors without outliers in words, or nothing if there are no outliers."""
-    bad = outcome.result.outliers
-    means = outcome.held_out.means(~bad) if bad.any() and outcome.held_out is not None else {}
-    return [f"without the {bad.sum()} left out above: {means_text(means)}"] if means else []
 
 
 def means_text(means: dict[str, float]) -> str:
@@ -130,11 +117,6 @@ def sigma_rows(outcome: Outcome) -> list[list[str]]:
     return rows
 
 
-def turns_text(observability: Observability) -> str:
-    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(observability.turns_rad))
-    return f"the flange turns between poses by {turns} (RMS) about its principal axes"
-
-
 def _off(each: Compared, result: HandEye) -> list[str]:
     if each.result is None:
         return [NONE, NONE]
@@ -146,13 +128,20 @@ def outcome_report(outcome: Outcome) -> Document:
     """Returns the report of ``handeye``."""
     result, frames = outcome.result, FRAMES[outcome.result.setup]
     turn, shift = result.rms()
+    covariances, bad, seen = (result.covariance, result.stand_covariance), result.outliers, result.observability
     held_out = []
     if outcome.held_out is not None:
         held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
-        held_out += [f"held out, mean {text}" for text in _agreeing_text(outcome)]
+        if bad.any() and (agreeing := outcome.held_out.means(~bad)):
+            held_out.append(f"held out, mean without the {bad.sum()} left out above: {means_text(agreeing)}")
+    turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
     answer: list[Block] = [
         tiles(_tiles(outcome)),
-        *(block for item in _transforms(result) for block in transform_blocks(*item)),
+        *(
+            block
+            for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True)
+            for block in transform_blocks(name, pose, covariance)
+        ),
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
@@ -160,7 +149,7 @@ def outcome_report(outcome: Outcome) -> Document:
         outcome.sentence(),
         Table(["<what errs, and by how much", "σ", "<"], sigma_rows(outcome)),
         "" if result.sigma_scale is None else scale_text(outcome, result.sigma_scale),
-        "" if result.observability is None else turns_text(result.observability),
+        f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
         fold(
             "Camera, as adjusted (first pixel's centre at 0, 0)",
             Table(["<", "value", "± σ", "<unit"], adjusted(outcome)),
@@ -333,14 +322,14 @@ def coverage_blocks(outcome: Outcome) -> list[Block]:
         measured, residuals = np.concatenate(used), board.residuals_px
     finite = np.isfinite(residuals).all(1)
     size, residuals = (views.camera.width, views.camera.height), residuals[finite]
-    covered, factor = image_coverage(views), enlargement(residuals, views.camera.width)
+    counts, factor = image_coverage(views), enlargement(residuals, views.camera.width)
     by = "the adjustment" if board is not None else "robot and transforms"
     return [
-        f"The board lay over {covered.share:.0%} of the image in one photograph or another. Where it never was, "
+        f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
         "nothing checks the distortion of the lens",
         plots(
             plot(
-                lambda: image_figure(size, covered, measured[finite], residuals),
+                lambda: image_figure(size, counts, measured[finite], residuals),
                 "coverage of the image",
                 f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
                 "",
@@ -381,11 +370,12 @@ def _turns(outcome: Outcome) -> list[Block]:
 
 def photograph_blocks(outcome: Outcome) -> list[Block]:
     """Returns some photographs with their corners; read when the page is written."""
-    if outcome.pairs is None or outcome.views is None or outcome.folder is None:
+    pairs, views, folder = outcome.pairs, outcome.views, outcome.folder
+    if pairs is None or views is None or folder is None:
         return []
 
     def photographs():
-        shown, missing = overlays(outcome)
+        shown, missing = overlays(outcome.result, pairs, views, folder)
         explained = (
             "Circles: corners as measured. Lines lead to where they would be by the robot's pose as it was reported "
             "and the transforms above, enlarged: the combined error of robot, transforms, camera and board"
@@ -423,18 +413,14 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
 
 def adjusted(outcome: Outcome) -> list[list[str]]:
     """Returns rows of the camera's parameters; none if they were not adjusted."""
-    adjustment = outcome.result.reprojection
-    if adjustment is None or adjustment.camera_covariance is None:
+    camera, rows = camera_part(outcome), []
+    if camera is None:
         return []
-    sigma = dict(
-        zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(adjustment.camera_covariance)), strict=True)
-    )
-    rows = []
-    for name, value in zip(PARAMETER_NAMES, adjustment.camera.parameters(), strict=True):
-        sigma_of_parameter = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
-        if value or sigma_of_parameter:
+    for name, value in camera.parameters.items():
+        sigma = camera.sigma.get(name, camera.sigma.get("f") if name in ("fx", "fy") else None)
+        if value or sigma:
             digits, unit = (3, "px") if name[0] in "fc" else (6, "")
-            rows.append([name, number(value, digits), number(sigma_of_parameter, digits), unit])
+            rows.append([name, number(value, digits), number(sigma, digits), unit])
     return rows
 
 

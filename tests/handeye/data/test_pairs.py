@@ -5,7 +5,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, read_poses
-from stcal.handeye.data.pairs import inverse_covariance
+from stcal.handeye.data.pairs import inverted
 from stcal.io.table import COVARIANCE
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated
@@ -107,7 +107,7 @@ def test_covariances_are_read_and_turned_over(tmp_path, truth):
     covariance = root @ np.swapaxes(root, 1, 2)
     board = truth.pairs.camera_from_board
     i, j = np.triu_indices(6)
-    inverse = inverse_covariance(board, covariance)
+    _, inverse, _ = inverted(board, covariance, None)
     extra = {f"board_from_camera_{name}": inverse[:, i[k], j[k]] for k, name in enumerate(COVARIANCE)}
     sides = {"base_from_flange": truth.pairs.base_from_flange, "board_from_camera": board.inverse()}
     pairs = read_poses(write(tmp_path / "poses.csv", sides, extra=extra))
@@ -127,6 +127,6 @@ def test_the_inverse_covariance_is_that_of_scattered_poses():
     turn = np.array([Rigid.exp(s).rotation for s in steps])
     drawn = Poses(turn @ many.rotation, many.translation + steps[:, 3:])
     scatter = drawn.inverse().difference(many.inverse())
-    expected = inverse_covariance(many[:1], np.diag(sigma**2)[None])[0]
+    _, (expected,), _ = inverted(many[:1], np.diag(sigma**2)[None], None)
     scale = np.sqrt(np.diag(expected))
     assert np.cov(scatter.T) / np.outer(scale, scale) == pytest.approx(expected / np.outer(scale, scale), abs=0.04)

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.report.export import FORMS, exported, opencv_yaml, read_urdf, ros_yaml, urdf_joint
-from stcal.io.poses.programs import read_messages
+from stcal.handeye.report.export import FORMS, exported, opencv_yaml, read_urdf, tree, urdf_joint
+from stcal.io.poses.programs import messages, read_messages
 from tests.outcome import fails_with
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
@@ -22,6 +22,11 @@ angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
 def result_of(pose: Rigid, setup: str = "eye-in-hand", covariance: np.ndarray | None = None) -> HandEye:
     other = Rigid.exp([0.1, 0.2, -0.3, 900, -20, 30])
     return HandEye("pose", setup, pose, other, np.zeros((1, 6)), ("a",), np.zeros(1, bool), covariance)
+
+
+def text_of(result: HandEye, form: str, name: str = "handeye", **frames: str) -> str:
+    """The file with frames of these names."""
+    return exported(result, tree(result, **frames), form, name)
 
 
 def assert_same(rotation: np.ndarray, metres, pose: Rigid) -> None:
@@ -35,7 +40,7 @@ def assert_same(rotation: np.ndarray, metres, pose: Rigid) -> None:
 @example((0, np.pi / 2, 0, 1, 2, 3))
 def test_ros(twist):
     pose = Rigid.exp(twist)
-    message = yaml.safe_load(ros_yaml(result_of(pose)))
+    message = yaml.safe_load(messages(tree(result_of(pose))))
     assert (message["header"]["frame_id"], message["child_frame_id"]) == ("flange", "camera_optical_frame")
     transform = message["transform"]
     rotation = Rotation.from_quat([transform["rotation"][c] for c in "xyzw"]).as_matrix()
@@ -49,7 +54,7 @@ def test_ros(twist):
 def test_urdf(twist):
     """URDF's rule: R = R_z(yaw) R_y(pitch) R_x(roll)."""
     pose = Rigid.exp(twist)
-    joint = ElementTree.fromstring(urdf_joint(result_of(pose, "eye-to-hand"), child='eye "left" & <front>'))
+    joint = ElementTree.fromstring(urdf_joint(tree(result_of(pose, "eye-to-hand"), child='eye "left" & <front>')))
     assert joint.get("type") == "fixed"
     assert (joint.find("parent").get("link"), joint.find("child").get("link")) == ("base", 'eye "left" & <front>')
     origin = joint.find("origin")
@@ -77,7 +82,7 @@ def test_opencv(setup, tmp_path):
 
 def test_frames_of_the_same_name_are_refused():
     with fails_with("E-FRAME-NAME … 'tool0'"):
-        ros_yaml(result_of(Rigid()), "tool0", "tool0")
+        tree(result_of(Rigid()), "tool0", "tool0")
 
 
 COVARIANCE = np.diag([1e-8, 4e-8, 9e-8, 0.01, 0.04, 0.09])
@@ -98,7 +103,7 @@ LINK = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 def test_every_form_gives_the_transform_back(form, setup, twist):
     pose = Rigid.exp(twist)
     (own,) = FORMS[form].read(
-        exported(result_of(pose, setup, COVARIANCE), form, parent="tool 0" if form == "ros2" else "")
+        text_of(result_of(pose, setup, COVARIANCE), form, parent="tool 0" if form == "ros2" else "")
     )
     mount = "tool 0" if form == "ros2" else {"eye-in-hand": "flange", "eye-to-hand": "base"}[setup]
     assert (own.parent, own.child) == (mount, "camera_optical_frame")
@@ -111,7 +116,7 @@ def test_every_form_gives_the_transform_back(form, setup, twist):
 def test_the_link_has_the_optical_frame_in_it(form):
     """One parent for each frame, and the way to the optical frame is the same."""
     pose = Rigid.exp([0.3, -2, 1, 12.5, -900, 3])
-    found = FORMS[form].read(exported(result_of(pose), form, child="left_link", camera_frame="link"))
+    found = FORMS[form].read(text_of(result_of(pose), form, child="left_link", camera_frame="link"))
     assert (found[0].parent, found[0].child) == ("flange", "left_link")
     assert np.abs((found[0].pose @ LINK).matrix() - pose.matrix()).max() < 1e-8
     for fixed in found[1:]:
@@ -120,10 +125,10 @@ def test_the_link_has_the_optical_frame_in_it(form):
     assert len(found) == (1 if form.startswith("easy") else 2)
 
 
-@pytest.mark.parametrize(("write", "read"), [(ros_yaml, read_messages), (urdf_joint, read_urdf)])
+@pytest.mark.parametrize(("write", "read"), [(messages, read_messages), (urdf_joint, read_urdf)])
 def test_the_link_in_ros_and_urdf(write, read):
     pose = Rigid.exp([0.3, -2, 1, 12.5, -900, 3])
-    first, fixed = read(write(result_of(pose), camera_frame="link"))
+    first, fixed = read(write(tree(result_of(pose), camera_frame="link")))
     assert [first.parent, first.child, fixed.parent, fixed.child] == [
         "flange",
         "camera_link",
@@ -131,7 +136,7 @@ def test_the_link_in_ros_and_urdf(write, read):
         "camera_optical_frame",
     ]
     assert np.abs((first.pose @ fixed.pose).matrix() - pose.matrix()).max() < 1e-9
-    (only,) = read(write(result_of(pose)))
+    (only,) = read(write(tree(result_of(pose))))
     assert only.child == "camera_optical_frame"
     assert np.abs(only.pose.matrix() - pose.matrix()).max() < 1e-9
 
@@ -141,37 +146,37 @@ POSE = Rigid(Rotation.from_euler("ZYX", [30, -20, 10], degrees=True).as_matrix()
 
 def test_moveit_is_an_argument_list_of_roslaunch():
     """x y z qx qy qz qw parent child."""
-    text = exported(result_of(Rigid.exp([0, 0, np.pi / 3, 100, 200, -300])), "moveit")
+    text = text_of(result_of(Rigid.exp([0, 0, np.pi / 3, 100, 200, -300])), "moveit")
     node = ElementTree.fromstring(text).find("node")
     assert (node.get("pkg"), node.get("type")) == ("tf2_ros", "static_transform_publisher")
     words = node.get("args").split()
     assert [float(word) for word in words[:7]] == pytest.approx([0.1, 0.2, -0.3, 0, 0, 0.5, 0.75**0.5], abs=1e-12)
     assert words[7:] == ["flange", "camera_optical_frame"]
     with fails_with("E-FRAME-NAME … 'tool 0'"):
-        exported(result_of(Rigid()), "moveit", parent="tool 0")
+        text_of(result_of(Rigid()), "moveit", parent="tool 0")
 
 
 @pytest.mark.parametrize(("setup", "kind"), [("eye-in-hand", "eye_in_hand"), ("eye-to-hand", "eye_on_base")])
 def test_easy_handeye_names_its_frames(setup, kind):
-    text = exported(result_of(Rigid(), setup), "easy-handeye2", "mine", parent="tool0", child="cam")
+    text = text_of(result_of(Rigid(), setup), "easy-handeye2", "mine", parent="tool0", child="cam")
     frames = yaml.safe_load(text)["parameters"]
     assert (frames["name"], frames["calibration_type"], frames["tracking_base_frame"]) == ("mine", kind, "cam")
     own, other = ("robot_effector_frame", "robot_base_frame")[:: 1 if setup == "eye-in-hand" else -1]
     assert (frames[own], frames[other]) == ("tool0", "base" if setup == "eye-in-hand" else "flange")
-    assert yaml.safe_load(exported(result_of(Rigid(), setup), "easy-handeye"))["parameters"]["eye_on_hand"] == (
+    assert yaml.safe_load(text_of(result_of(Rigid(), setup), "easy-handeye"))["parameters"]["eye_on_hand"] == (
         setup == "eye-in-hand"
     )
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_covariance_is_stated(form):
-    text = exported(result_of(POSE, covariance=COVARIANCE), form)
+    text = text_of(result_of(POSE, covariance=COVARIANCE), form)
     assert "sigma along x y z of the flange: 0.1 0.2 0.3 mm; about them: 0.00573 0.01146 0.01719 deg" in text
     assert "9.000000e-02" in text
-    assert "no covariance" in exported(result_of(POSE), form)
+    assert "no covariance" in text_of(result_of(POSE), form)
     assert text[: text.index("axes of the flange:")].isascii()
 
 
 def test_a_form_that_is_none_is_refused():
     with fails_with("E-OPTION-FORM … --export … staubli … ros2"):
-        exported(result_of(POSE), "staubli")
+        text_of(result_of(POSE), "staubli")
