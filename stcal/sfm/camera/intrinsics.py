@@ -174,8 +174,8 @@ SETTLED_SHIFT_PX = 1e-5
 LEAST_ROBUST = 1e-6
 """Smallest robust σ of normalised residuals, for exact data."""
 LOUD = 1.5
-"""Ratio of a photograph's residuals to those of most from which its σ grow with them: one that was moved or out of focus
-does not decide. Of 20 centres, chance exceeds it in one photograph of 600."""
+"""Ratio of a photograph's residuals to those of most from which its σ grow with them: one that was moved or out of
+focus does not decide. Of 20 centres, chance exceeds it in one photograph of 600."""
 LEAST_DOTS = 0.1
 """Smallest factor of the dots' σ: dots may be more accurate than the board file states, but never exact."""
 MIN_BOARD_REDUNDANCY = 20.0
