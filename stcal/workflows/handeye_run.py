@@ -110,9 +110,9 @@ def calibrate_handeye(
         As of :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     setup, options, offset = given.setup or "eye-in-hand", options or HandEyeOptions(), None
-    camera = given.prior if refine_camera else options.camera
-    options = replace(options, camera=camera, symmetries=given.symmetries)
-    if method is None and not (refine_camera or camera is not None or options.with_scale or options.four_dof):
+    intrinsics = given.prior if refine_camera else options.intrinsics
+    options = replace(options, intrinsics=intrinsics, symmetries=given.symmetries)
+    if method is None and not (options.names_unknowns or options.camera is not None):
         method = AUTO
     if time_offset:
         given, options, offset = at_offset(given, setup, options)

@@ -7,13 +7,16 @@ import pytest
 
 import stcal
 from stcal import workflows
+from stcal.geometry.camera import Camera
 from stcal.handeye.plan import planned_file
 from stcal.handeye.report.file import HandEyeFile
+from stcal.io.cameras.model import camera_prior
 from stcal.io.files import json_text
 from stcal.io.table import POSE, pose_cells
+from stcal.workflows.handeye_inputs import HandEyeInput
 from tests.handeye.test_plan_cli import NOISE, poses_file
 from tests.outcome import refuses
-from tests.support.handeye import simulated
+from tests.support.handeye import simulated, simulated_views
 
 
 @pytest.fixture
@@ -60,3 +63,12 @@ def test_without_flips(poses):
     given, said = workflows.without_flips(workflows.read_handeye(poses))
     assert given.pairs.camera_from_board == workflows.read_handeye(poses).pairs.camera_from_board
     assert said.endswith("0 of 8 poses: none")
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_intrinsics_are_adjusted_where_that_is_asked(refine):
+    truth = simulated_views(np.random.default_rng(3), 8, robot=(2e-4, 0.05), corner_px=0.1)
+    prior = camera_prior(Camera.of(truth.views.camera, "OPENCV"))
+    given = HandEyeInput("", truth.pairs, truth.views, prior=prior)
+    found = workflows.calibrate_handeye(given, "reprojection", refine_camera=refine, repeats=0)
+    assert (found.result.reprojection.camera_covariance is not None) == refine
