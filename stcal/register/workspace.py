@@ -347,12 +347,7 @@ def _errors(problem: Problem, inside: np.ndarray, folds: int, seed: int) -> np.n
     """Returns the errors (n,) of all points, mm, for the fit to the points ``inside``. These are held out in turn."""
     cube = problem[inside]
     error = np.linalg.norm(problem.residuals(cube.fit()), axis=1)
-
-    def fitted(rows: np.ndarray) -> Transform:
-        return cube[rows].fit()
-
-    every, least = np.ones(len(cube), bool), problem.model.sample + 1
-    held = held_out(fitted, cube.xyz_a, cube.xyz_b, every, folds, least, seed)
+    held = held_out(cube, lambda rows: cube[rows].fit(), np.ones(len(cube), bool), folds, seed)
     if held is not None:
         error[np.flatnonzero(inside)[held.rows]] = held.error_mm
     return error
