@@ -14,7 +14,8 @@ from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register.models import MODELS, Model, Transform, jacobian, parts, unit_covariance, whitened
 from stcal.register.pairs import Problem
-from stcal.register.robust import BY_CHANCE, FALSE_ALARMS, Fitted, by_share, chernoff, search
+from stcal.register.result import Registration
+from stcal.register.robust import BY_CHANCE, FALSE_ALARMS, by_share, chernoff, search
 from stcal.row_order import Change, change_along
 
 UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
@@ -98,12 +99,12 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
     )
 
 
-def outlier_notes(problem: Problem, fitted: Fitted, name: Callable[[int], str]) -> list[str]:
+def outlier_notes(result: Registration, problem: Problem, name: Callable[[int], str]) -> list[str]:
     """Returns notes on outliers that a slip explains: exchanged rows, or another unit."""
-    rows = np.flatnonzero(~fitted.inliers)[:LOOKED_AT]
-    if not len(rows):
+    rows, reach = np.flatnonzero(~result.inliers)[:LOOKED_AT], result.threshold_mm
+    if not len(rows) or reach is None:
         return []
-    xyz_a, xyz_b, transform, reach = problem.xyz_a, problem.xyz_b, fitted.transform, fitted.threshold
+    xyz_a, xyz_b, transform = problem.xyz_a, problem.xyz_b, result.b_from_a
     notes = []
     mapped = transform @ xyz_a[rows]
     distance, nearest = (np.asarray(each) for each in KDTree(mapped).query(xyz_b[rows]))

@@ -1,7 +1,6 @@
 """Checks whether the points determine the transform, and notes on what a user should check, one line each."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -26,8 +25,8 @@ from stcal.register.mistakes import (
 )
 from stcal.register.models import Model, squares
 from stcal.register.pairs import Problem
-from stcal.register.result import Alternative
-from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Covariance, Fitted
+from stcal.register.result import Registration
+from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO
 
 WIDER_THAN = 10.0
 """Least spread √Σd² of points off a line (affine: off a plane), in σ. The turn about it then has σ ≤ 0.1 rad."""
@@ -179,88 +178,63 @@ TIGHT = 2.5
 """Threshold in σ below which the covariance of few points is too small. 2.5 σ cuts off a tenth of the good points."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Subject:
-    """A registration to judge.
+def notes_of(
+    result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None, name: Callable[[int], str]
+) -> list[str]:
+    """Returns all notes on a registration.
 
-    Parameters
-    ----------
-    problem : problem
-    method : str
-    fitted : fitted
-    alternative : alternative or None
-    ambiguous : whether the alternative is about as good
-    other : a wider model that explains the points
-    shifted : inliers that are shifted together
-    covariance : covariance
-    factor : ratio of the residuals to the given σ; None if none was given
-    lines : lines of the file that name the points
+    ``other`` : a wider model that explains the points; ``shifted`` : inliers that are shifted together; ``name`` : of
+    a row, for messages.
     """
-
-    problem: Problem
-    method: str
-    fitted: Fitted
-    alternative: Alternative | None
-    ambiguous: bool
-    other: Wider | None
-    shifted: Shifted | None
-    covariance: Covariance
-    factor: float | None
-    lines: Sequence[int] | None
-
-    def name(self, row: int) -> str:
-        """Returns a point's name for messages."""
-        return row_name(row, self.lines)
+    sigma = result.sigma_mm if other is None else other.sigma_mm
+    return [
+        *_agreement(result, problem, name),
+        *_noise(result, problem, other, shifted, name),
+        *_layout(result, problem, sigma, name),
+        *outlier_notes(result, problem, name),
+    ]
 
 
-def notes_of(subject: Subject) -> list[str]:
-    """Returns all notes."""
-    other = subject.other
-    sigma = subject.fitted.sigma if other is None else other.sigma_mm
-    notes = [*_agreement(subject), *_noise(subject, other), *_layout(subject, sigma)]
-    return notes + outlier_notes(subject.problem, subject.fitted, subject.name)
-
-
-def _agreement(subject: Subject) -> list[str]:
-    fitted, other = subject.fitted, subject.alternative
-    agree, count = int(fitted.inliers.sum()), len(fitted.inliers)
+def _agreement(result: Registration, problem: Problem, name: Callable[[int], str]) -> list[str]:
+    other = result.alternative
+    agree, count = int(result.inliers.sum()), len(result)
     notes = []
     if agree < MAJORITY * count:
         notes.append(f"only {agree} of {count} point pairs agree; check the others before you trust the transform")
     if other is not None:
-        shown = ", ".join(subject.name(i) for i in other.rows[:SHOWN])
-        more = ", …" if len(other.rows) > SHOWN else ""
-        start = "AMBIGUOUS: " if subject.ambiguous else ""
+        shown = _shown(other.rows, name)
+        start = "AMBIGUOUS: " if result.ambiguous else ""
         notes.append(
             f"{start}{len(other.rows)} of the other points agree on another transform, {other.apart_mm:.4g} mm and "
-            f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}{more}); did an instrument move between them?"
+            f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}); did an instrument move between them?"
         )
-    if subject.method == "liu2017":
+    if result.method == "liu2017":
         notes.append(ASSUMED)
-    if subject.method == "least-squares":
-        notes += _far_rows(subject)
+    if result.method == "least-squares":
+        notes += _far_rows(result, problem, name)
     return notes
 
 
-def _far_rows(subject: Subject) -> list[str]:
+def _far_rows(result: Registration, problem: Problem, name: Callable[[int], str]) -> list[str]:
     """Returns notes on rows that the robust method would examine."""
-    problem = subject.problem
     redundancy = problem.redundancy
-    square = squares(problem.residuals(subject.fitted.transform))
+    square = squares(result.residuals)
     bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
     far = np.flatnonzero(square > bound)
     if not len(far):
         return []
     worst = int(far[square[far].argmax()])
     return [
-        f"{len(far)} points lie farther off than noise would put them, the farthest {subject.name(worst)} at "
+        f"{len(far)} points lie farther off than noise would put them, the farthest {name(worst)} at "
         f"{np.sqrt(square[worst]):.4g} mm; use the robust method"
     ]
 
 
-def _noise(subject: Subject, other: Wider | None) -> list[str]:
-    fitted, notes = subject.fitted, []
-    inside, transform = subject.problem[fitted.inliers], fitted.transform
+def _noise(
+    result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None, name: Callable[[int], str]
+) -> list[str]:
+    notes = []
+    inside, transform = problem[result.inliers], result.b_from_a
     if other is not None:
         notes.append(other.note)
         inside, transform = other.problem, other.transform
@@ -270,54 +244,56 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
             "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
             "other, and a transform is valid only where its points are; see the residual field"
         )
-    if other is None and subject.method != "liu2017":
-        change = moved_meanwhile(subject.problem, transform)
-        notes += [] if change is None else [order_note(change, subject.name)]
-    if subject.shifted is not None:
-        notes.append(_two_groups(subject, subject.shifted))
-    if subject.factor is not None and subject.covariance.scaled:
+    if other is None and result.method != "liu2017":
+        change = moved_meanwhile(problem, transform)
+        notes += [] if change is None else [order_note(change, name)]
+    if shifted is not None:
+        notes.append(_two_groups(result, shifted, name))
+    if result.sigma_factor is not None and result.scaled:
         notes.append(
-            f"residuals exceed the σ given {subject.factor:.3g} times, which is beyond chance; the covariance is "
+            f"residuals exceed the σ given {result.sigma_factor:.3g} times, which is beyond chance; the covariance is "
             f"scaled by this factor"
         )
     enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
-    if len(inside) <= enough and subject.covariance.scaled:
+    if len(inside) <= enough and result.scaled:
         more = enough + 2 - len(inside)
         notes.append(f"of {len(inside)} points a wrong one cannot be identified: measure {more} more")
-    redundancy = subject.covariance.redundancy
-    if redundancy < LOW_REDUNDANCY:
-        notes.append(f"σ rests on {redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
-    if fitted.threshold < TIGHT * fitted.sigma and subject.method == "robust":
+    if result.redundancy < LOW_REDUNDANCY:
+        notes.append(f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
+    threshold, sigma = result.threshold_mm, result.sigma_mm
+    if threshold is not None and threshold < TIGHT * sigma and result.method == "robust":
         notes.append(
-            f"the threshold of {fitted.threshold:.4g} mm is only {fitted.threshold / fitted.sigma:.2g} σ and cuts off "
-            "good points; leave it out to have it estimated"
+            f"the threshold of {threshold:.4g} mm is only {threshold / sigma:.2g} σ and cuts off good points; leave "
+            "it out to have it estimated"
         )
     return notes
 
 
-def _two_groups(subject: Subject, shifted: Shifted) -> str:
-    inliers = np.flatnonzero(subject.fitted.inliers)
-    shown = ", ".join(subject.name(int(inliers[i])) for i in shifted.rows[:SHOWN])
-    more = ", …" if len(shifted.rows) > SHOWN else ""
+def _shown(rows: np.ndarray, name: Callable[[int], str]) -> str:
+    return ", ".join(name(row) for row in rows[:SHOWN].tolist()) + (", …" if len(rows) > SHOWN else "")
+
+
+def _two_groups(result: Registration, shifted: Shifted, name: Callable[[int], str]) -> str:
+    shown = _shown(np.flatnonzero(result.inliers)[shifted.rows], name)
     by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
     where = ", and lie together" if shifted.together else ""
     return (
         f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
-        f"{shifted.count - len(shifted.rows)}{where} ({shown}{more}): two groups, and the data do not show which is "
+        f"{shifted.count - len(shifted.rows)}{where} ({shown}): two groups, and the data do not show which is "
         f"right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
     )
 
 
-def _layout(subject: Subject, sigma: float) -> list[str]:
+def _layout(result: Registration, problem: Problem, sigma: float, name: Callable[[int], str]) -> list[str]:
     """Returns notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
-    model, fitted, notes = subject.problem.model, subject.fitted, []
-    rows = np.flatnonzero(fitted.inliers)
-    inside, transform = subject.problem.xyz_a[rows], fitted.transform
-    if len(rows) <= LEVERAGE_UP_TO and subject.method != "liu2017":
+    model, transform, notes = problem.model, result.b_from_a, []
+    rows = np.flatnonzero(result.inliers)
+    inside = problem.xyz_a[rows]
+    if len(rows) <= LEVERAGE_UP_TO and result.method != "liu2017":
         alone = single_supports(model, inside, sigma)
         kind = "plane" if model.name == "affine" else "line"
         notes += [
-            f"only {subject.name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
+            f"only {name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
             for row in rows[alone[:SHOWN]].tolist()
         ]
     if model.name != "affine" and spreads(inside)[2] < WIDER_THAN * sigma:
@@ -326,11 +302,11 @@ def _layout(subject: Subject, sigma: float) -> list[str]:
         notes.append("the transform is a reflection: one of the frames is left-handed")
     if isinstance(transform, Similarity):
         scale = transform.scale
-        for factor, (name, _) in UNITS.items():
+        for factor, (unit, _) in UNITS.items():
             if abs(max(scale, 1 / scale) / factor - 1) < UNIT_WITHIN:
-                notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {name}?")
-    extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (subject.problem.xyz_a, subject.problem.xyz_b))
+                notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {unit}?")
+    extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (problem.xyz_a, problem.xyz_b))
     if 0 < extent < SMALL_MM:
         notes.append(f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m")
-    found = symmetry(inside, fitted.threshold if np.isfinite(fitted.threshold) else 4 * sigma)
-    return notes if found is None else [*notes, symmetry_note(found, rows, subject.name)]
+    found = symmetry(inside, 4 * sigma if result.threshold_mm is None else result.threshold_mm)
+    return notes if found is None else [*notes, symmetry_note(found, rows, name)]

@@ -26,7 +26,7 @@ from stcal.register.mistakes import (
     wider,
 )
 from stcal.register.models import MODELS, parts, squares
-from stcal.register.notes import Subject, by_chance, check_extent, check_supports, notes_of, row_name
+from stcal.register.notes import by_chance, check_extent, check_supports, notes_of, row_name
 from stcal.register.pairs import Problem, noise_of
 from stcal.register.result import Alternative, Registration, held_out
 from stcal.register.robust import (
@@ -131,12 +131,13 @@ def register(
         published = partial(_liu2017, options=_liu2017_options(liu2017_options, threshold_mm), seed=seed)
         again = _least_squares if method == "least-squares" else published
         fitted, second = again(problem), None
-    _check_geometry(problem, method, fitted, lines)
+    name = partial(row_name, lines=lines)
+    _check_geometry(problem, method, fitted, name)
     alternative = None if second is None else _alternative(fitted, second, problem.xyz_a)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
         change = moved_meanwhile(problem, fitted.transform)
-        moved = "" if change is None else f"; {order_note(change, lambda row: row_name(row, lines))}"
+        moved = "" if change is None else f"; {order_note(change, name)}"
         raise DegenerateError(
             "E-REGISTER-TWO-TRANSFORMS",
             f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
@@ -149,19 +150,7 @@ def register(
     if shifted is not None:
         covariance = shifted_too(covariance, shifted.off_mm())
     given = problem.noise.sigma_mm
-    subject = Subject(
-        problem=problem,
-        method=method,
-        fitted=fitted,
-        alternative=alternative,
-        ambiguous=ambiguous,
-        other=other,
-        shifted=shifted,
-        covariance=covariance,
-        factor=None if given is None else fitted.sigma / given,
-        lines=lines,
-    )
-    return Registration(
+    result = Registration(
         model=problem.model.name,
         method=method,
         b_from_a=fitted.transform,
@@ -171,15 +160,15 @@ def register(
         sigma_mm=fitted.sigma,
         redundancy=covariance.redundancy,
         threshold_mm=fitted.threshold if np.isfinite(fitted.threshold) else None,
-        sigma_factor=subject.factor,
+        sigma_factor=None if given is None else fitted.sigma / given,
         scaled=covariance.scaled,
-        held_out=_held_out(problem, again, fitted.inliers, folds, seed),
+        held_out=held_out(problem, lambda rows: again(problem[rows]).transform, fitted.inliers, folds, seed),
         ambiguous=ambiguous,
         alternative=alternative,
-        notes=tuple(notes_of(subject)),
         seed=seed,
         samples=fitted.samples,
     )
+    return replace(result, notes=tuple(notes_of(result, problem, other, shifted, name)))
 
 
 def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances) -> Problem:
@@ -213,19 +202,7 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
     return Problem(chosen, a, b, noise_of(len(a), weights, covariances))
 
 
-def _held_out(problem: Problem, again: Callable[[Problem], Fitted], inliers: np.ndarray, folds: int, seed: int):
-    return held_out(
-        lambda rows: again(problem[rows]).transform,
-        problem.xyz_a,
-        problem.xyz_b,
-        inliers,
-        folds,
-        problem.model.sample + 1,
-        seed,
-    )
-
-
-def _check_geometry(problem: Problem, method: str, fitted: Fitted, lines: Sequence[int] | None) -> None:
+def _check_geometry(problem: Problem, method: str, fitted: Fitted, name: Callable[[int], str]) -> None:
     """Refuses mirrored frames, and points that do not determine the model. The baseline runs as published."""
     if method == "liu2017":
         return
@@ -233,7 +210,7 @@ def _check_geometry(problem: Problem, method: str, fitted: Fitted, lines: Sequen
     check_mirrored(problem.model, inside.xyz_a, inside.xyz_b)
     check_extent(problem.model, inside.xyz_a, fitted.sigma)
     if method == "robust" and not fitted.inliers.all():
-        check_supports(problem.model, problem.xyz_a, fitted.inliers, fitted.sigma, lambda row: row_name(row, lines))
+        check_supports(problem.model, problem.xyz_a, fitted.inliers, fitted.sigma, name)
 
 
 def _beside(inside: Problem, fitted: Fitted) -> tuple[Wider | None, Shifted | None]:

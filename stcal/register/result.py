@@ -8,6 +8,7 @@ import numpy as np
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.geometry.arrays import Array, Brief, freeze
 from stcal.register.models import Transform
+from stcal.register.pairs import Problem
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,27 +161,21 @@ TRIED = 20_000
 
 
 def held_out(
-    fit_rows: Callable[[np.ndarray], Transform],
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    inliers: np.ndarray,
-    folds: int,
-    least: int,
-    seed: int,
+    problem: Problem, fit_rows: Callable[[np.ndarray], Transform], inliers: np.ndarray, folds: int, seed: int
 ) -> HeldOutPoints | None:
     """Returns the errors of points left out of the fit in turn; None if too few are left, or every fold fails.
 
     ``fit_rows`` : fit to given rows; ``inliers`` : (n,) of the fit to all; ``folds`` : number of parts to leave out;
-    ``least`` : number of points of a fit; ``seed`` : of the division.
+    ``seed`` : of the division.
     """
     rng = np.random.default_rng([seed, 2])
-    sample = np.sort(rng.permutation(len(xyz_a))[:TRIED])
+    sample = np.sort(rng.permutation(len(problem))[:TRIED])
     parts = [sample[part] for part in dealt(len(sample), folds, rng)]
 
     def errors(rest: np.ndarray, own: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(xyz_b[own] - fit_rows(rest) @ xyz_a[own], axis=1)
+        return np.linalg.norm(problem[own].residuals(fit_rows(rest)), axis=1)
 
-    if not parts or len(sample) - len(parts[0]) < least:
+    if not parts or len(sample) - len(parts[0]) <= problem.model.sample:
         return None
     done, rows, (error,) = held_out_errors([errors], parts)
     if not done:

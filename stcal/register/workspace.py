@@ -1,6 +1,6 @@
 """Range of validity of a registration: systematic residuals over the workspace, and errors around cubes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,15 +42,15 @@ class Field:
     """
 
     length_mm: float
-    size_mm: float
-    noise_mm: float
     p_value: float
     rows: Array
     taken_back: Array
     plain_mm: Array
     corrected_mm: Array
     sigma_ratio: float
-    _solved: "_Solved"
+    _model: "_Likelihood"
+    _ratio: float
+    _kriged: "_Kriged"
 
     def __post_init__(self):
         for name, kind in (("rows", int), ("taken_back", int), ("plain_mm", float), ("corrected_mm", float)):
@@ -61,31 +61,24 @@ class Field:
         """Whether residuals are more than noise."""
         return self.p_value < SEEN_AT
 
+    @property
+    def noise_mm(self) -> float:
+        return float(np.sqrt(self._kriged.variance))
+
+    @property
+    def size_mm(self) -> float:
+        return float(np.sqrt((self.at(self._model.xyz_a)[0] ** 2).sum(1).mean()))
+
     def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the expected systematic error (g, 3) of the transform at places (g, 3), and its covariance, mm."""
-        return self._solved.at(np.asarray(xyz_a, float))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """Data of predictions: places (m, 3), C⁻¹ (m, m) of unit noise, and quantities derived from it."""
-
-    model: Model
-    transform: Transform
-    xyz_a: np.ndarray
-    length: float
-    ratio: float
-    inverse: np.ndarray
-    kriged: "_Kriged"
-
-    def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        near = self.ratio * _matern(cdist(xyz_a, self.xyz_a) / self.length)
-        motions = _motions(self.model, self.transform, xyz_a, self.xyz_a)
-        left = motions - np.einsum("gm,mcp->gcp", near, self.kriged.of_motions)
-        value = near @ self.kriged.of_y + left @ self.kriged.beta
-        own = self.ratio - np.einsum("gm,mk,gk->g", near, self.inverse, near, optimize=True)
-        covariance = np.maximum(own, 0)[:, None, None] * np.eye(3) + left @ self.kriged.spread @ np.swapaxes(left, 1, 2)
-        return value, self.kriged.variance * covariance
+        known, kriged, places = self._model, self._kriged, np.asarray(xyz_a, float)
+        near = self._ratio * _matern(cdist(places, known.xyz_a) / self.length_mm)
+        motions = _motions(known.model, known.transform, places, known.xyz_a)
+        left = motions - np.einsum("gm,mcp->gcp", near, kriged.of_motions)
+        value = near @ kriged.of_y + left @ kriged.beta
+        own = self._ratio - np.einsum("gm,mk,gk->g", near, kriged.inverse, near, optimize=True)
+        covariance = np.maximum(own, 0)[:, None, None] * np.eye(3) + left @ kriged.spread @ np.swapaxes(left, 1, 2)
+        return value, kriged.variance * covariance
 
 
 def residual_field(
@@ -194,19 +187,11 @@ class _Likelihood:
         """Returns the best length and ratio, −2 log L there, and −2 log L without f."""
         nearest = KDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
         low, high = max(np.median(nearest), 1e-6 * self.distance.max()), 2 * self.distance.max()
-        lengths = np.geomspace(low, high, LENGTHS)
-        values = [self._at_length(length)[0] for length in lengths]
-        i = int(np.argmin(values))
-        around = np.log(lengths[[max(i - 1, 0), min(i + 1, LENGTHS - 1)]])
-        refined = minimize_scalar(
-            lambda x: self._at_length(np.exp(x))[0], bounds=around, method="bounded", options={"xatol": 0.02}
-        )
-        length = float(np.exp(refined.x)) if refined.fun < values[i] else float(lengths[i])
-        value, ratio, without = self._at_length(length)
-        return length, ratio, value, without
+        length, _ = _least(lambda length: self._at_length(length)[1], np.geomspace(low, high, LENGTHS), 0.02)
+        return length, *self._at_length(length)
 
     def _at_length(self, length: float) -> tuple[float, float, float]:
-        """Returns −2 log L at the best ratio, that ratio, and −2 log L without f."""
+        """Returns the best ratio, −2 log L there, and −2 log L without f."""
         root = np.sqrt(self.variance)
         m, _, p = self.motions.shape
         columns = np.concatenate([self.motions, self.y[:, :, None]], axis=2).reshape(m, -1)
@@ -221,19 +206,27 @@ class _Likelihood:
             rest = both[p, p] - g @ np.linalg.solve(a, g)
             return (3 * m - p) * np.log(max(rest, 1e-300)) + 3 * np.log(spread).sum() + np.linalg.slogdet(a)[1]
 
-        tried = [twice(r) for r in RATIOS]
-        i = int(np.argmin(tried))
-        around = np.log(RATIOS[[max(i - 1, 0), min(i + 1, len(RATIOS) - 1)]])
-        refined = minimize_scalar(lambda x: twice(np.exp(x)), bounds=around, method="bounded", options={"xatol": 0.01})
-        best = float(np.exp(refined.x)) if refined.fun < tried[i] else float(RATIOS[i])
-        return min(float(refined.fun), tried[i]), best, twice(0.0)
+        return *_least(twice, RATIOS, 0.01), twice(0.0)
+
+
+def _least(function: Callable[[float], float], places: np.ndarray, within: float) -> tuple[float, float]:
+    """Returns the place of the least of the values at ascending places, refined by its logarithm, and the value."""
+    values = [function(place) for place in places]
+    i = int(np.argmin(values))
+    around = np.log(places[[max(i - 1, 0), min(i + 1, len(places) - 1)]])
+    refined = minimize_scalar(
+        lambda log: function(np.exp(log)), bounds=around, method="bounded", options={"xatol": within}
+    )
+    if refined.fun < values[i]:
+        return float(np.exp(refined.x)), float(refined.fun)
+    return float(places[i]), float(values[i])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Kriged:
-    """Generalised least squares by unit C: C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β), and the variance factor."""
+    """Generalised least squares by unit C: C⁻¹, C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β), and the variance factor."""
 
-    own: np.ndarray
+    inverse: np.ndarray
     of_y: np.ndarray
     of_motions: np.ndarray
     spread: np.ndarray
@@ -250,12 +243,12 @@ class _Kriged:
         beta = spread @ np.einsum("mcp,mc->p", motions, of_y)
         left = of_y - of_motions @ beta
         variance = float((y * left).sum() / (3 * m - p))
-        return cls(np.diag(inverse), of_y, of_motions, spread, beta, left, variance)
+        return cls(inverse, of_y, of_motions, spread, beta, left, variance)
 
     def left_out(self) -> tuple[np.ndarray, float]:
         """Returns each point's error (m,) by the model of the others, and the RMS ratio to σ (Dubrule 1983, in blocks
         of 3)."""
-        block = self.own[:, None, None] * np.eye(3)
+        block = np.diag(self.inverse)[:, None, None] * np.eye(3)
         block = block - self.of_motions @ self.spread @ np.swapaxes(self.of_motions, 1, 2)
         error = np.linalg.solve(block, self.left[:, :, None])[:, :, 0]
         ratio = np.sqrt((error * self.left).sum() / (3 * len(error) * self.variance))
@@ -270,11 +263,8 @@ def _field(found: _Likelihood, rows: np.ndarray, taken: np.ndarray) -> Field:
     kriged = _Kriged.of(inverse, y, motions)
     corrected, sigma_ratio = kriged.left_out()
     plain, _ = _Kriged.of(np.diag(1 / found.variance), y, motions).left_out()
-    noise = float(np.sqrt(kriged.variance))
     p_value = float(chdtrc(2, max(without - value, 0.0)))
-    solved = _Solved(found.model, found.transform, found.xyz_a, length, ratio, inverse, kriged)
-    size = float(np.sqrt((solved.at(found.xyz_a)[0] ** 2).sum(1).mean()))
-    return Field(length, size, noise, p_value, rows, taken, plain, corrected, sigma_ratio, solved)
+    return Field(length, p_value, rows, taken, plain, corrected, sigma_ratio, found, ratio, kriged)
 
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
@@ -312,7 +302,8 @@ def cubes(
     """Fits the registration's model in cubes about the middle of its inliers and ``taken_back``, (m,) outliers; None
     for too few points. Other arguments as in :func:`stcal.register.register`."""
     used = registration.inliers.copy()
-    used[np.zeros(0, int) if taken_back is None else taken_back] = True
+    if taken_back is not None:
+        used[taken_back] = True
     every = Problem(
         MODELS[registration.model],
         np.asarray(xyz_a, float),
@@ -347,12 +338,7 @@ def _errors(problem: Problem, inside: np.ndarray, folds: int, seed: int) -> np.n
     """Returns the errors (n,) of all points, mm, for the fit to the points ``inside``. These are held out in turn."""
     cube = problem[inside]
     error = np.linalg.norm(problem.residuals(cube.fit()), axis=1)
-
-    def fitted(rows: np.ndarray) -> Transform:
-        return cube[rows].fit()
-
-    every, least = np.ones(len(cube), bool), problem.model.sample + 1
-    held = held_out(fitted, cube.xyz_a, cube.xyz_b, every, folds, least, seed)
+    held = held_out(cube, lambda rows: cube[rows].fit(), np.ones(len(cube), bool), folds, seed)
     if held is not None:
         error[np.flatnonzero(inside)[held.rows]] = held.error_mm
     return error

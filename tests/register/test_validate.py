@@ -6,13 +6,16 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
+from stcal.register.models import MODELS
+from stcal.register.pairs import PointNoise, Problem
 from stcal.register.result import held_out
 from tests.support.point_pairs import SIGMA_MM, scene
 
 
 def test_leave_one_out_is_what_it_says():
     s = scene(0, 7)
-    found = held_out(lambda rows: align_rigid(s.xyz_b[rows], s.xyz_a[rows]), s.xyz_a, s.xyz_b, s.clean, 7, 4, 0)
+    problem = Problem(MODELS["rigid"], s.xyz_a, s.xyz_b, PointNoise())
+    found = held_out(problem, lambda rows: problem[rows].fit(), s.clean, 7, 0)
     for i, error in zip(found.rows, found.error_mm, strict=True):
         rest = np.arange(7) != i
         expected = np.linalg.norm(s.xyz_b[i] - align_rigid(s.xyz_b[rest], s.xyz_a[rest]) @ s.xyz_a[i])
@@ -40,13 +43,14 @@ def test_no_folds_and_too_few_points():
 
 def test_a_fold_that_cannot_be_fitted_is_left_out():
     s = scene(3, 12)
+    problem = Problem(MODELS["rigid"], s.xyz_a, s.xyz_b, PointNoise())
 
     def sometimes(rows):
         if 0 not in rows:
             raise DegenerateError("E-TEST", "without the first")
-        return align_rigid(s.xyz_b[rows], s.xyz_a[rows])
+        return problem[rows].fit()
 
-    found = held_out(sometimes, s.xyz_a, s.xyz_b, s.clean, 4, 4, 0)
+    found = held_out(problem, sometimes, s.clean, 4, 0)
     assert found.folds == 3
     assert len(found.rows) == 9
     assert 0 not in found.rows
