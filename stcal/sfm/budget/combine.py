@@ -71,11 +71,11 @@ class Row:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Number of photographs of a group, and the largest angle between two of their axes, rad."""
+    """Number of photographs of a group, and the largest angle between two of their axes."""
 
     group: str
     images: int
-    spread_rad: float
+    spread_deg: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,23 +103,14 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
             "E-BUDGET-NO-COVARIANCE",
             f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint",
         )
-    adjusted = adjusted_run(run)
-    contributions = contributions_of(adjusted.state)
-    derivatives_of_run = derivatives(contributions.joint, adjusted.start, run.target_design, run.faces.frame)
-    stated = statement or statement_of(run.board_design.stated)
-    rim = _rims(run, contributions, derivatives_of_run)
-    camera, refined = run.camera, run.options.refine_camera
+    adjusted, board, options = adjusted_run(run), run.board_design, run.options
+    found = contributions_of(adjusted.state)
+    own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)
+    stated = statement or statement_of(board.stated)
+    reference, rims = run.faces.reference_face, _rims(run, found, own)
+    camera_given = run.report["summary"].get("camera_given", True)
     return budget(
-        contributions,
-        derivatives_of_run,
-        camera,
-        run.board_design,
-        run.options.flatness_mm,
-        refined,
-        stated,
-        run.faces.reference_face,
-        rim,
-        run.report["summary"].get("camera_given", True),
+        found, own, run.camera, board, options.flatness_mm, options.refine_camera, stated, reference, rims, camera_given
     )
 
 
@@ -174,14 +165,13 @@ def _placed(own: Derivatives) -> Source:
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
     """Returns positions and rotations of all faces except the reference face, and the longest distances."""
     other_faces = [face for face in own.target_from_face if face != reference_face]
-    quantities = []
     kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
-    for kind, rows in kinds:
-        quantities += [
-            Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
-            for face in other_faces
-        ]
-    return quantities + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
+    poses = [
+        Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
+        for kind, rows in kinds
+        for face in other_faces
+    ]
+    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
@@ -235,5 +225,5 @@ def _coverage(covariance: np.ndarray, expanded: float, rng: np.random.Generator)
 
 def _view(model: MetricModel) -> View:
     axes = np.array([pose.rotation[2] for pose in model.camera_from_model])
-    spread = float(np.arccos(np.clip((axes @ axes.T).min(), -1, 1)))
-    return View(model.group, len(model.images), spread)
+    spread = np.arccos(np.clip((axes @ axes.T).min(), -1, 1))
+    return View(model.group, len(model.images), float(np.degrees(spread)))

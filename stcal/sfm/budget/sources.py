@@ -264,19 +264,18 @@ def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: S
     """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
     zero = np.zeros((len(effect), len(effect)))
     warmer = warmer_k(stated)
-    for key, title, sigma, factor, unit in (
-        ("temperature", f"{what}'s temperature", stated.temperature_sigma_k, stated.expansion_ppm_per_k, "K"),
-        ("expansion", f"{what}'s expansion", stated.expansion_sigma_ppm_per_k, warmer, "ppm/K"),
+    for key, name, needed, factor, unit in (
+        ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
+        ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer, "ppm/K"),
     ):
-        name = "temperature_sigma_k" if key == "temperature" else "expansion_sigma_ppm_per_k"
-        needed = "expansion_ppm_per_k" if key == "temperature" else "temperature_c"
+        row, sigma = (f"{what}_{key}", f"{what}'s {key}", "B"), getattr(stated, name)
         if factor is None or sigma is None:
             absent = " and ".join([name] * (sigma is None) + [needed] * (factor is None))
-            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {absent}", None, unit, zero)
+            yield Source(*row, "not stated", f"no {absent}", None, unit, zero)
         else:
             words = f"{name} of {statement.origin[what, name]}"
             covariance = (sigma * factor * PPM) ** 2 * np.outer(effect, effect)
-            yield Source(f"{what}_{key}", title, "B", "stated", words, sigma, unit, covariance)
+            yield Source(*row, "stated", words, sigma, unit, covariance)
 
 
 def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> Source:
