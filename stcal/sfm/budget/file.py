@@ -360,13 +360,9 @@ def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
     }
 
 
-def _failed(run: SavedRun) -> list[dict]:
-    return [check for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
-
-
 def is_refused(run: SavedRun) -> bool:
     """Whether a run says that it must not be used, so that no uncertainty of it holds."""
-    return bool(_failed(run)) or (run.report.get("judgement") or {}).get("verdict") == "no"
+    return bool(run.failed_checks()) or (run.report.get("judgement") or {}).get("verdict") == "no"
 
 
 def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[str]:
@@ -375,7 +371,7 @@ def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[
     for run in runs:
         if is_refused(run):
             own = (run.report.get("judgement") or {}).get("use", "").removesuffix(".")
-            failed = "failed: " + "; ".join(check["title"] for check in _failed(run))
+            failed = "failed: " + "; ".join(check["title"] for check in run.failed_checks())
             reasons.append(f"may run {run.folder} be used? {own if own.startswith('No') else failed}")
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
@@ -420,7 +416,7 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
             f"for the stated expansion, lengths in faces.json are still to be changed by {ppm:+.1f} ppm; the tables "
             "here have them changed, and U holds for these"
         )
-    failed = _failed(run)
+    failed = run.failed_checks()
     if failed:
         invalid = join(invalidated(check["key"] for check in failed))
         notes.insert(
