@@ -305,11 +305,9 @@ def _definitions(run: SavedRun) -> list[str]:
 
 
 def _faces(budget: Budget, target_from_face: Mapping[str, Rigid]) -> dict[str, dict]:
-    rotations = {row.measurand.name: row for row in budget.of_kind("rotation")}
-    faces = {}
-    for row in budget.of_kind("position"):
-        rotation, pose = rotations[row.measurand.name], target_from_face[row.measurand.name]
-        known = budget.conditions.size_known
+    faces, known = {}, budget.conditions.size_known
+    for row, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
+        pose = target_from_face[row.measurand.name]
         position = pose.translation * (1 + budget.conditions.correction)
         faces[row.measurand.name] = {
             "position_mm": position.tolist() if known else None,

@@ -86,7 +86,11 @@ IN_OTHERS = 0.05
 def budget_report(file: BudgetFile) -> Document:
     """Returns the report of ``budget``: expanded uncertainties, inputs, contributions, and tests of lengths."""
     kinds = _contributions(file)
-    measurands = [measurand for columns in kinds.values() for measurand in columns.items()]
+    measurands = [
+        (f"{name}, rotation" if title.startswith("rotations") else name, u)
+        for title, columns in kinds.items()
+        for name, u in columns.items()
+    ]
     images, folder = sum(each.images for each in file.views), Path(file.run.folder).name
     groups = f"{len(file.views)} group{'s' * (len(file.views) != 1)}"
     tone = "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
@@ -409,11 +413,6 @@ def _slope(of: Uncertainty, source: SourceRow) -> float:
     return of.sensitivities[source.key] if share > NEGLIGIBLE else 0.0
 
 
-def _measurand_names(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[str]:
-    rotations = [any(u is face.rotation_mdeg for face in file.faces.values()) for _, u in measurands]
-    return [name + ", rotation" * turned for (name, _), turned in zip(measurands, rotations, strict=True)]
-
-
 def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[Block]:
     """Returns a figure with stacked shares of the variances, and its legend."""
     shares = {
@@ -424,7 +423,7 @@ def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list
     colours = {row.key: COLOURS[i % len(COLOURS)] for i, row in enumerate(drawn)}
 
     def draw() -> Drawing:
-        names, place = _measurand_names(file, measurands), np.arange(len(measurands))[::-1]
+        names, place = [name for name, _ in measurands], np.arange(len(measurands))[::-1]
         drawing = Drawing(9.0, 0.6 + 0.24 * len(measurands))
         left = min(20 + LETTER * SMALL * max(map(len, names)), 290)
         axes = Axes(drawing, drawing.panels(left=left, top=4)[0], (0, 100), (-0.6, len(measurands) - 0.4))

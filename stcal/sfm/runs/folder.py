@@ -303,7 +303,7 @@ def _page(
     labelled: Sequence[LabelledImage],
     folder: RunFolder,
 ) -> str:
-    rows, rest = [], max(len(labelled) - FIRST_IMAGES, 0)
+    rows, rest, shown = [], max(len(labelled) - FIRST_IMAGES, 0), _photographs(detection, labelled, folder)
     for each in labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
@@ -311,18 +311,14 @@ def _page(
     left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
-        Section("What was found", [seen, Table(HEADS, rows)]),
+        Section("What was found", [seen, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
-        Section("Overlays", [macro("photographs", _photographs(detection, labelled, folder), rest, WORDS)]),
+        Section("Overlays", [macro("photographs", shown, rest, Words("point", True))]),
     ]
     answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
     about = f"{len(labelled)} images, no calibrated target"
     return Document(name, about, sections, [answer], f"{name}: no calibration").page()
-
-
-HEADS = ["<Image", "<Faces", "Points", "Dots"]
-WORDS = Words("point", True)
 
 
 def _photographs(detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder) -> Photographs:
