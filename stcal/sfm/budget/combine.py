@@ -64,10 +64,6 @@ class Row:
     coverage: float  # simulated, of ``expanded``
     freedom: float  # effective degrees of freedom (Welch–Satterthwaite, JCGM 100 G.4)
 
-    def share(self, key: str) -> float:
-        """Returns the share of one source in the variance."""
-        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
@@ -155,11 +151,9 @@ def budget(
 
 def _placed(own: Derivatives) -> Source:
     words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
-    size = own.circles.shape[-1]
-    sigma = 1e3 * own.designed_sigma_mm
-    return Source(
-        PLACED, "frame circles placed", "A", "estimated", words, sigma, "µm", np.zeros((size, size))
-    )  # it moves faces, not circles
+    sigma, size = 1e3 * own.designed_sigma_mm, own.circles.shape[-1]
+    covariance = np.zeros((size, size))  # it moves faces, not circles
+    return Source(PLACED, "frame circles placed", "A", "estimated", words, sigma, "µm", covariance)
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:

@@ -60,6 +60,10 @@ class Uncertainty(Part):
     coverage: float
     degrees_of_freedom: Finite
 
+    def share(self, key: str) -> float:
+        """Returns the share of one source in the variance."""
+        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
+
 
 class FaceUncertainty(Part):
     position_mm: list[float] | None

@@ -237,7 +237,7 @@ def budget_in_brief(file: BudgetFile) -> str:
         u = significant(each.distance_um.expanded)
         lines.append(f"longest distance {name_of(each.circles)}: {length} mm, U {u} µm")
     if ranked and (worst := _of_face(ranked[0][1])).standard:
-        shares = {row.title: (worst.contributions[row.key] / worst.standard) ** 2 for row in file.sources}
+        shares = {row.title: worst.share(row.key) for row in file.sources}
         most = sorted((title for title in shares if shares[title] > IN_OTHERS), key=lambda title: -shares[title])
         lines += _cut(f"from: {', '.join(f'{title} {shares[title]:.0%}' for title in most[:3])}")
     for test in file.length_tests[:1]:
@@ -415,10 +415,7 @@ def _slope(of: Uncertainty, source: SourceRow) -> float:
 
 def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[Block]:
     """Returns a figure with stacked shares of the variances, and its legend."""
-    shares = {
-        row.key: np.array([(u.contributions[row.key] / u.standard) ** 2 if u.standard else 0 for _, u in measurands])
-        for row in file.sources
-    }
+    shares = {row.key: np.array([u.share(row.key) for _, u in measurands]) for row in file.sources}
     drawn = [row for row in file.sources if shares[row.key].max(initial=0) > LEAST_SHARE]
     colours = {row.key: COLOURS[i % len(COLOURS)] for i, row in enumerate(drawn)}
 
