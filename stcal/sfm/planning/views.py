@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.design import TargetDesign
 from stcal.geometry.arrays import freeze
@@ -208,7 +209,7 @@ def tilt_deg(normal: np.ndarray, middle: np.ndarray, position: np.ndarray) -> fl
     return angle_deg(normal @ ray / np.linalg.norm(ray))
 
 
-def angle_deg(cosine: float) -> float:
+def angle_deg(cosine: ArrayLike) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 

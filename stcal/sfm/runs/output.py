@@ -83,7 +83,6 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
     of_print = joint if "faces" in sources else None
     rims = list(calibration.rim_mm.values())
     groups = {image.file.group for image in result.detection.images} | set(lost_groups(result.notes))
-    known_size = target.scale_sigma is not None and not design.up_to_scale
     return {
         "files": len(result.detection.images) + len(result.detection.skipped),
         "images": len(result.labelled),
@@ -99,7 +98,7 @@ def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.nda
         "circle_sigma_factor": factors.circles,
         "dot_sigma_factor": factors.dots,
         "printed_sigma_factor": factors.printed if design.has_printed else None,
-        "scale_sigma_ppm": 1e6 * target.scale_sigma if known_size else None,
+        "scale_sigma_ppm": None if target.scale_sigma is None or design.up_to_scale else 1e6 * target.scale_sigma,
         "sigma0": joint.sigma0 if joint else None,
         "redundancy": joint.redundancy if joint else None,
         "last_move_px": joint.last_move_px if joint else None,
