@@ -64,18 +64,14 @@ class Row:
     coverage: float  # simulated, of ``expanded``
     freedom: float  # effective degrees of freedom (Welch–Satterthwaite, JCGM 100 G.4)
 
-    def share(self, key: str) -> float:
-        """Returns the share of one source in the variance."""
-        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Number of photographs of a group, and the largest angle between two of their axes, rad."""
+    """Number of photographs of a group, and the largest angle between two of their axes."""
 
     group: str
     images: int
-    spread_rad: float
+    spread_deg: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,23 +99,14 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
             "E-BUDGET-NO-COVARIANCE",
             f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint",
         )
-    adjusted = adjusted_run(run)
-    contributions = contributions_of(adjusted.state)
-    derivatives_of_run = derivatives(contributions.joint, adjusted.start, run.target_design, run.faces.frame)
-    stated = statement or statement_of(run.board_design.stated)
-    rim = _rims(run, contributions, derivatives_of_run)
-    camera, refined = run.camera, run.options.refine_camera
+    adjusted, board, options = adjusted_run(run), run.board_design, run.options
+    found = contributions_of(adjusted.state)
+    own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)
+    stated = statement or statement_of(board.stated)
+    reference, rims = run.faces.reference_face, _rims(run, found, own)
+    camera_given = run.report["summary"].get("camera_given", True)
     return budget(
-        contributions,
-        derivatives_of_run,
-        camera,
-        run.board_design,
-        run.options.flatness_mm,
-        refined,
-        stated,
-        run.faces.reference_face,
-        rim,
-        run.report["summary"].get("camera_given", True),
+        found, own, run.camera, board, options.flatness_mm, options.refine_camera, stated, reference, rims, camera_given
     )
 
 
@@ -164,24 +151,21 @@ def budget(
 
 def _placed(own: Derivatives) -> Source:
     words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
-    size = own.circles.shape[-1]
-    sigma = 1e3 * own.designed_sigma_mm
-    return Source(
-        PLACED, "frame circles placed", "A", "estimated", words, sigma, "µm", np.zeros((size, size))
-    )  # it moves faces, not circles
+    sigma, size = 1e3 * own.designed_sigma_mm, own.circles.shape[-1]
+    covariance = np.zeros((size, size))  # it moves faces, not circles
+    return Source(PLACED, "frame circles placed", "A", "estimated", words, sigma, "µm", covariance)
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
     """Returns positions and rotations of all faces except the reference face, and the longest distances."""
     other_faces = [face for face in own.target_from_face if face != reference_face]
-    quantities = []
     kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
-    for kind, rows in kinds:
-        quantities += [
-            Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
-            for face in other_faces
-        ]
-    return quantities + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
+    poses = [
+        Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
+        for kind, rows in kinds
+        for face in other_faces
+    ]
+    return poses + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
@@ -235,5 +219,5 @@ def _coverage(covariance: np.ndarray, expanded: float, rng: np.random.Generator)
 
 def _view(model: MetricModel) -> View:
     axes = np.array([pose.rotation[2] for pose in model.camera_from_model])
-    spread = float(np.arccos(np.clip((axes @ axes.T).min(), -1, 1)))
-    return View(model.group, len(model.images), spread)
+    spread = np.arccos(np.clip((axes @ axes.T).min(), -1, 1))
+    return View(model.group, len(model.images), float(np.degrees(spread)))

@@ -1,6 +1,5 @@
 """Form of the JSON file of ``budget``, which its page and PDF show too."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Literal
@@ -16,7 +15,7 @@ from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
-from stcal.sfm.budget.sources import REFERENCE_C, Source, Statement
+from stcal.sfm.budget.sources import REFERENCE_C, Statement
 from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun, Verified
 
@@ -60,6 +59,10 @@ class Uncertainty(Part):
     expanded: float
     coverage: float
     degrees_of_freedom: Finite
+
+    def share(self, key: str) -> float:
+        """Returns the share of one source in the variance."""
+        return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
 
 
 class FaceUncertainty(Part):
@@ -250,11 +253,8 @@ def _content(budget: Budget, run: SavedRun, verified: Verified) -> dict[str, Any
         "coverage_factor": COVERAGE_FACTOR,
         "sigma0": budget.joint.sigma_scale,
         "redundancy": budget.joint.redundancy,
-        "views": [
-            {"group": each.group, "images": each.images, "spread_deg": float(np.degrees(each.spread_rad))}
-            for each in budget.views
-        ],
-        "sources": [_source(each) for each in budget.sources],
+        "views": budget.views,
+        "sources": budget.sources,
         "stated": [*_standard(run.board_design), *_stated(stated)],
         "definitions": _definitions(run),
         "correction_ppm": PPM * conditions.correction if conditions.size_known else None,
@@ -267,10 +267,9 @@ def _content(budget: Budget, run: SavedRun, verified: Verified) -> dict[str, Any
 
 def _standard(board: BoardDesign) -> list[dict]:
     """Returns rows on the board that gives the size: its grid and pitch, as far as it has them."""
-    values = {key: getattr(board, key, None) for key in ("rows", "columns", "pitch_mm")} if board.rows else {}
-    return [
-        {"body": "board", "key": key, "value": value, "origin": "board.toml"} for key, value in values.items() if value
-    ]
+    keys = ("rows", "columns", "pitch_mm") if board.rows else ()
+    values = {key: value for key in keys if (value := getattr(board, key, None))}
+    return [{"body": "board", "key": key, "value": value, "origin": "board.toml"} for key, value in values.items()]
 
 
 def _stated(statement: Statement) -> list[dict]:
@@ -291,17 +290,16 @@ def _stated(statement: Statement) -> list[dict]:
 def _definitions(run: SavedRun) -> list[str]:
     """Returns sentences that define the measurands."""
     faces = []
+    plane = run.faces.frame == "plane"
+    normal = "normal to the plane of all its circles, " if plane else ""
+    foot = ", at its foot on the plane of all circles" if plane else ""
     for face in run.target_design.faces:
-        if face.printed is not None:
-            faces.append(f"face {face.id}: the frame of its drawing, Z into the body")
-        else:
-            plane = run.faces.frame == "plane"
-            normal = "normal to the plane of all its circles, " if plane else ""
-            foot = ", at its foot on the plane of all circles" if plane else ""
-            faces.append(
-                f"face {face.id}: origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of "
-                f"circle {face.y}, Z {normal}out of the body"
-            )
+        drawn = "the frame of its drawing, Z into the body"
+        by_circles = (
+            f"origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of circle {face.y}, Z "
+            f"{normal}out of the body"
+        )
+        faces.append(f"face {face.id}: {drawn if face.printed is not None else by_circles}")
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
         "angle as its length, of the rotation that takes the axes of that frame to those of the face",
@@ -310,16 +308,10 @@ def _definitions(run: SavedRun) -> list[str]:
     ]
 
 
-def _source(source: Source) -> SourceRow:
-    return SourceRow(**{key: getattr(source, key) for key in SourceRow.model_fields})
-
-
 def _faces(budget: Budget, target_from_face: Mapping[str, Rigid]) -> dict[str, dict]:
-    rotations = {row.measurand.name: row for row in budget.of_kind("rotation")}
-    faces = {}
-    for row in budget.of_kind("position"):
-        rotation, pose = rotations[row.measurand.name], target_from_face[row.measurand.name]
-        known = budget.conditions.size_known
+    faces, known = {}, budget.conditions.size_known
+    for row, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
+        pose = target_from_face[row.measurand.name]
         position = pose.translation * (1 + budget.conditions.correction)
         faces[row.measurand.name] = {
             "position_mm": position.tolist() if known else None,
@@ -361,24 +353,18 @@ def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
     return {
         "contributions": contributions,
         "sensitivities": {
-            contribution.key: contributions[contribution.key] / contribution.sigma
-            for contribution in budget.sources
-            if contribution.sigma
+            source.key: contributions[source.key] / source.sigma for source in budget.sources if source.sigma
         },
         "standard": unit * row.standard,
         "expanded": unit * row.expanded,
         "coverage": row.coverage,
-        "degrees_of_freedom": row.freedom if math.isfinite(row.freedom) else None,
+        "degrees_of_freedom": row.freedom,
     }
-
-
-def _failed(run: SavedRun) -> list[dict]:
-    return [check for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
 
 
 def is_refused(run: SavedRun) -> bool:
     """Whether a run says that it must not be used, so that no uncertainty of it holds."""
-    return bool(_failed(run)) or (run.report.get("judgement") or {}).get("verdict") == "no"
+    return bool(run.failed_checks()) or (run.report.get("judgement") or {}).get("verdict") == "no"
 
 
 def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[str]:
@@ -387,7 +373,7 @@ def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[
     for run in runs:
         if is_refused(run):
             own = (run.report.get("judgement") or {}).get("use", "").removesuffix(".")
-            failed = "failed: " + "; ".join(check["title"] for check in _failed(run))
+            failed = "failed: " + "; ".join(check["title"] for check in run.failed_checks())
             reasons.append(f"may run {run.folder} be used? {own if own.startswith('No') else failed}")
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
@@ -432,7 +418,7 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
             f"for the stated expansion, lengths in faces.json are still to be changed by {ppm:+.1f} ppm; the tables "
             "here have them changed, and U holds for these"
         )
-    failed = _failed(run)
+    failed = run.failed_checks()
     if failed:
         invalid = join(invalidated(check["key"] for check in failed))
         notes.insert(

@@ -11,8 +11,7 @@ from scipy.stats import norm
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.io.table import LENGTHS, read_table
-from stcal.labels import CircleLabel, circle_labels
-from stcal.sfm.adjust.joint import JointResult
+from stcal.labels import CircleLabel
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
 from stcal.sfm.budget.sources import reference_temperature_c
 from stcal.sfm.data.model import ImageObservations
@@ -111,7 +110,7 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     _require_size(budget)
     _require_size(other)
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
-    rows, other_rows = (_places(calibration.joint, common) for calibration in (budget, other))
+    rows, other_rows = ([each.joint.labels.index(label) for label in common] for each in (budget, other))
     pairs = longest_of(common, budget.joint.xyz_model[rows])
     if not pairs:
         raise InputError(
@@ -172,11 +171,6 @@ def _require_size(budget: Budget) -> None:
             "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared; "
             "state one of the lengths with [[scale]] in target.toml, and run again",
         )
-
-
-def _places(joint: JointResult, labels: Sequence[CircleLabel]) -> list[int]:
-    places = {label: i for i, label in enumerate(joint.labels)}
-    return [places[label] for label in circle_labels(labels)]
 
 
 def _same(a: BoardDesign, b: BoardDesign) -> bool:

@@ -85,108 +85,36 @@ IN_OTHERS = 0.05
 
 def budget_report(file: BudgetFile) -> Document:
     """Returns the report of ``budget``: expanded uncertainties, inputs, contributions, and tests of lengths."""
-    faces, images = file.faces, sum(each.images for each in file.views)
-    placed = {f"face {f}": u for f, each in faces.items() if (u := each.position_um)}
-    kinds = [
-        ("positions of faces, x, y, z together, µm", placed),
-        ("rotations of faces, x, y, z together, mdeg", {f"face {f}": each.rotation_mdeg for f, each in faces.items()}),
-        ("longest distances, µm", {name_of(each.circles): each.distance_um for each in file.distances}),
+    kinds = _contributions(file)
+    measurands = [
+        (f"{name}, rotation" if title.startswith("rotations") else name, u)
+        for title, columns in kinds.items()
+        for name, u in columns.items()
     ]
-    kinds = [(title, columns) for title, columns in kinds if columns]
-    lengths = [
-        [
-            name_of(e.circles),
-            *(as_exact(v, 1e-3 * e.distance_um.expanded) for v in (e.length_mm, e.corrected_mm)),
-            significant(e.distance_um.expanded),
-        ]
-        for e in file.distances
-    ]
-    k = file.coverage_factor
-    positions = [
-        [face, *_with_u(e.position_mm, e.position_xyz_um, k)]
-        for face, e in faces.items()
-        if e.position_mm is not None and e.position_xyz_um is not None
-    ]
-    rotations = [[face, *_with_u(e.rotation_vector_deg, e.rotation_xyz_mdeg, k)] for face, e in faces.items()]
-    points = [
-        [label, *_with_u(e.position_mm, e.position_xyz_um, k)]
-        for label, e in sorted(file.circles.items(), key=lambda row: _in_order(row[0]))
-    ]
-    inputs = [
-        [each.title, NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}", *_origin(each)]
-        for each in file.sources
-    ]
-    stated = [[each.body, each.key, f"{each.value:g}", each.origin] for each in file.stated]
+    images, folder = sum(each.images for each in file.views), Path(file.run.folder).name
+    groups = f"{len(file.views)} group{'s' * (len(file.views) != 1)}"
     tone = "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
-    views = [[each.group, each.images, number(each.spread_deg, 0)] for each in file.views]
     hashes = [
-        ["folder of the run", Path(file.run.folder).name],
+        ["folder of the run", folder],
         ["folder of the photographs", Path(file.run.images).name],
         ["SHA-256 of stcal-run.json, which has those of all files", file.run.sha256],
         ["SHA-256 of faces.json", file.run.faces_sha256],
         ["run made by", f"stcal {file.run.version}"],
         ["budget made by", f"stcal {file.version}"],
     ]
-    groups = f"{len(file.views)} group{'s' * (len(file.views) != 1)}"
+    fields = [[HEADS.get(name, name.replace("_", " ")), value or NONE] for name, value in file.fields.items()]
+    signature = Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")
     return Document(
         title_of(file),
-        f"{Path(file.run.folder).name}: {images} photographs in {groups}; faces against face {file.reference_face}, "
-        "the target frame",
+        f"{folder}: {images} photographs in {groups}; faces against face {file.reference_face}, the target frame",
         [
-            Section(
-                "Result",
-                [
-                    tiles(_headline(file)),
-                    *([_what_u_is(file)] if faces else []),
-                    Notes([*([] if certifies(file) or not _is_valid(file) else [_no_certificate(file)]), *file.notes]),
-                    *([Printed([f"May the run be used? {file.use}"])] if file.use else []),
-                    *([file.holds] if file.holds and file.size_known else []),
-                    Table(_heads("position of face", "mm", "µm"), positions),
-                    Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
-                    Table(
-                        ["<distance of", "as in faces.json, mm", "corrected for what is stated, mm", "U, µm"], lengths
-                    ),
-                    *(
-                        _shares(file, [(name, u) for _, columns in kinds for name, u in columns.items()])
-                        if kinds
-                        else []
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Inputs",
-                [
-                    page_only(
-                        "Type A: by statistics of this run; type B: by other knowledge. What is stated comes from the "
-                        "user's files, what is estimated from this run; what is not stated is taken as exact"
-                    ),
-                    Table(["<input", "standard uncertainty", "<type", "<σ is", "<from"], inputs, css="text"),
-                    *([subheading("Stated sizes and temperatures")] if stated else []),
-                    page_only(Table(["<of", "<key", "value", "<from"], stated)),
-                    subheading("Views"),
-                    page_only(
-                        "Number and spread of the views act through the sensitivity to centres: µm of the result for "
-                        "each px of their σ"
-                    ),
-                    Table(["<group", "photographs", "largest angle between them, °"], views),
-                ],
-                terminal=True,
-            ),
-            Section("Contributions", [_table(title, columns, file) for title, columns in kinds], terminal=True),
+            Section("Result", [*_result(file), *(_shares(file, measurands) if kinds else [])], terminal=True),
+            Section("Inputs", _inputs(file), terminal=True),
+            Section("Contributions", [_table(title, columns, file) for title, columns in kinds.items()], terminal=True),
             Section(
                 "Length test", [block for test in file.length_tests for block in _length_test(test)], terminal=True
             ),
-            *(
-                [
-                    Section(
-                        "Circles and corners",
-                        [f"In the frame of face {file.reference_face}", Table(_heads("point", "mm", "µm"), points)],
-                    )
-                ]
-                if points
-                else []
-            ),
+            Section("Circles and corners", _points(file)),
             Section("What is measured", [bullets(file.definitions)]),
             Section(
                 "What it rests on",
@@ -201,21 +129,93 @@ def budget_report(file: BudgetFile) -> Document:
                     Table(["<Of", "<"], hashes, css="text facts"),
                 ],
             ),
-            *(
-                [Section("Signature", [RELATES, Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")])]
-                if certifies(file)
-                else []
-            ),
+            Section("Signature", [RELATES, signature] if certifies(file) else []),
         ],
         banner=[
-            *([macro("answers", [("May the run be used?", file.use)], tone)] if file.use else []),
-            Table(
-                ["<Field", "<"],
-                [[HEADS.get(name, name.replace("_", " ")), value or NONE] for name, value in file.fields.items()],
-                css="text facts",
-            ),
+            macro("answers", [("May the run be used?", file.use)], tone) if file.use else None,
+            Table(["<Field", "<"], fields, css="text facts"),
         ],
     )
+
+
+def _contributions(file: BudgetFile) -> dict[str, dict[str, Uncertainty]]:
+    """Returns the uncertainties by title of their table and name of the measurand."""
+    faces = file.faces
+    tables = {
+        "positions of faces, x, y, z together, µm": {
+            f"face {face}": u for face, each in faces.items() if (u := each.position_um)
+        },
+        "rotations of faces, x, y, z together, mdeg": {
+            f"face {face}": each.rotation_mdeg for face, each in faces.items()
+        },
+        "longest distances, µm": {name_of(each.circles): each.distance_um for each in file.distances},
+    }
+    return {title: columns for title, columns in tables.items() if columns}
+
+
+def _result(file: BudgetFile) -> list[Block]:
+    """Returns headline, notes, and the tables of positions, rotations and distances with their U."""
+    faces, k = file.faces, file.coverage_factor
+    lengths = [
+        [
+            name_of(e.circles),
+            *(as_exact(v, 1e-3 * e.distance_um.expanded) for v in (e.length_mm, e.corrected_mm)),
+            significant(e.distance_um.expanded),
+        ]
+        for e in file.distances
+    ]
+    positions = [
+        [face, *_with_u(e.position_mm, e.position_xyz_um, k)]
+        for face, e in faces.items()
+        if e.position_mm is not None and e.position_xyz_um is not None
+    ]
+    rotations = [[face, *_with_u(e.rotation_vector_deg, e.rotation_xyz_mdeg, k)] for face, e in faces.items()]
+    lacks_statements = _is_valid(file) and not certifies(file)
+    return [
+        tiles(_headline(file)),
+        _what_u_is(file) if faces else None,
+        Notes([*([_no_certificate(file)] if lacks_statements else []), *file.notes]),
+        Printed([f"May the run be used? {file.use}"] if file.use else []),
+        file.holds if file.size_known else None,
+        Table(_heads("position of face", "mm", "µm"), positions),
+        Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
+        Table(["<distance of", "as in faces.json, mm", "corrected for what is stated, mm", "U, µm"], lengths),
+    ]
+
+
+def _inputs(file: BudgetFile) -> list[Block]:
+    """Returns the sources, what is stated, and the views."""
+    inputs = []
+    for each in file.sources:
+        sigma = NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}"
+        inputs.append([each.title, sigma, each.evaluation, each.origin, each.words])
+    stated = [[each.body, each.key, f"{each.value:g}", each.origin] for each in file.stated]
+    views = [[each.group, each.images, number(each.spread_deg, 0)] for each in file.views]
+    return [
+        page_only(
+            "Type A: by statistics of this run; type B: by other knowledge. What is stated comes from the user's "
+            "files, what is estimated from this run; what is not stated is taken as exact"
+        ),
+        Table(["<input", "standard uncertainty", "<type", "<σ is", "<from"], inputs, css="text"),
+        subheading("Stated sizes and temperatures") if stated else None,
+        page_only(Table(["<of", "<key", "value", "<from"], stated)),
+        subheading("Views"),
+        page_only(
+            "Number and spread of the views act through the sensitivity to centres: µm of the result for each px of "
+            "their σ"
+        ),
+        Table(["<group", "photographs", "largest angle between them, °"], views),
+    ]
+
+
+def _points(file: BudgetFile) -> list[Block]:
+    """Returns the places of circles and corners with their U."""
+    points = [
+        [label, *_with_u(e.position_mm, e.position_xyz_um, file.coverage_factor)]
+        for label, e in sorted(file.circles.items(), key=lambda row: _in_order(row[0]))
+    ]
+    frame = f"In the frame of face {file.reference_face}"
+    return [frame, Table(_heads("point", "mm", "µm"), points)] if points else []
 
 
 MOST_FACES = 5
@@ -237,7 +237,7 @@ def budget_in_brief(file: BudgetFile) -> str:
         u = significant(each.distance_um.expanded)
         lines.append(f"longest distance {name_of(each.circles)}: {length} mm, U {u} µm")
     if ranked and (worst := _of_face(ranked[0][1])).standard:
-        shares = {row.title: (worst.contributions[row.key] / worst.standard) ** 2 for row in file.sources}
+        shares = {row.title: worst.share(row.key) for row in file.sources}
         most = sorted((title for title in shares if shares[title] > IN_OTHERS), key=lambda title: -shares[title])
         lines += _cut(f"from: {', '.join(f'{title} {shares[title]:.0%}' for title in most[:3])}")
     for test in file.length_tests[:1]:
@@ -321,10 +321,6 @@ def _what_u_is(file: BudgetFile) -> str:
 def _heads(of: str, unit: str, unit_of_u: str) -> list[str]:
     """Returns the heads of a table of vectors and of their expanded uncertainties."""
     return [f"<{of}", *(f"{axis}, {unit}" for axis in "xyz"), *(f"U of {axis}, {unit_of_u}" for axis in "xyz")]
-
-
-def _origin(each: SourceRow) -> tuple[str, str, str]:
-    return each.evaluation, each.origin, each.words
 
 
 def _length_test(test: LengthTestPart) -> list[Block]:
@@ -417,22 +413,14 @@ def _slope(of: Uncertainty, source: SourceRow) -> float:
     return of.sensitivities[source.key] if share > NEGLIGIBLE else 0.0
 
 
-def _measurand_names(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[str]:
-    rotations = [any(u is face.rotation_mdeg for face in file.faces.values()) for _, u in measurands]
-    return [name + ", rotation" * turned for (name, _), turned in zip(measurands, rotations, strict=True)]
-
-
 def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list[Block]:
     """Returns a figure with stacked shares of the variances, and its legend."""
-    shares = {
-        row.key: np.array([(u.contributions[row.key] / u.standard) ** 2 if u.standard else 0 for _, u in measurands])
-        for row in file.sources
-    }
+    shares = {row.key: np.array([u.share(row.key) for _, u in measurands]) for row in file.sources}
     drawn = [row for row in file.sources if shares[row.key].max(initial=0) > LEAST_SHARE]
     colours = {row.key: COLOURS[i % len(COLOURS)] for i, row in enumerate(drawn)}
 
     def draw() -> Drawing:
-        names, place = _measurand_names(file, measurands), np.arange(len(measurands))[::-1]
+        names, place = [name for name, _ in measurands], np.arange(len(measurands))[::-1]
         drawing = Drawing(9.0, 0.6 + 0.24 * len(measurands))
         left = min(20 + LETTER * SMALL * max(map(len, names)), 290)
         axes = Axes(drawing, drawing.panels(left=left, top=4)[0], (0, 100), (-0.6, len(measurands) - 0.4))

@@ -151,7 +151,6 @@ def sources_of(
     camera_given: bool = True,  # False if the camera was found from the photographs
 ) -> tuple[Source, ...]:
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
-    zero = np.zeros_like(contributions.joint.covariance_mm2)
     common = contributions.joint.board_common
     shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
     by_dots = f"sigma_mm of board.toml × σ₀ {contributions.joint.sigma_scale:.3f}; {shape}"
@@ -174,7 +173,7 @@ def sources_of(
         rows.append(_flatness(contributions, flatness_mm))
     rows.append(_intrinsics(contributions, camera, refined, camera_given))
     if board.rows:
-        rows.append(_scale(contributions.by_scale, zero, statement))
+        rows.append(_scale(contributions.by_scale, statement))
     grown = contributions.joint.xyz_model - contributions.joint.xyz_model.mean(0)
     bodies = (("board", statement.board, contributions.by_scale), ("target", statement.target, -grown.ravel()))
     if board.rows:
@@ -251,32 +250,35 @@ def _camera_row(origin: Origin, words: str, covariance: np.ndarray, evaluation: 
     return Source("intrinsics", "intrinsics", evaluation, origin, words, None, "", covariance)
 
 
-def _scale(by_scale: np.ndarray, none: np.ndarray, statement: Statement) -> Source:
-    sigma = statement.board.pitch_sigma_ppm
-    if sigma is None:
-        return Source("board_pitch", "board's pitch", "B", "not stated", "no pitch_sigma_ppm", None, "ppm", none)
-    words = f"pitch_sigma_ppm of {statement.origin['board', 'pitch_sigma_ppm']}"
-    covariance = (sigma * PPM) ** 2 * np.outer(by_scale, by_scale)
-    return Source("board_pitch", "board's pitch", "B", "stated", words, sigma, "ppm", covariance)
+def _stated(
+    key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma: float | None, covariance: np.ndarray
+) -> Source:
+    """Returns the row of an input that the user states; where keys are absent from the statement, it is exact."""
+    if absent:
+        zero = np.zeros_like(covariance)
+        return Source(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, zero)
+    return Source(key, title, "B", "stated", words, sigma, unit, covariance)
+
+
+def _scale(by_scale: np.ndarray, statement: Statement) -> Source:
+    name, sigma = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm
+    words = f"{name} of {statement.origin['board', name]}"
+    covariance = ((sigma or 0.0) * PPM) ** 2 * np.outer(by_scale, by_scale)
+    return _stated("board_pitch", "board's pitch", "ppm", [name] * (sigma is None), words, sigma, covariance)
 
 
 def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
     """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
-    zero = np.zeros((len(effect), len(effect)))
     warmer = warmer_k(stated)
-    for key, title, sigma, factor, unit in (
-        ("temperature", f"{what}'s temperature", stated.temperature_sigma_k, stated.expansion_ppm_per_k, "K"),
-        ("expansion", f"{what}'s expansion", stated.expansion_sigma_ppm_per_k, warmer, "ppm/K"),
+    for key, name, needed, factor, unit in (
+        ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
+        ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer, "ppm/K"),
     ):
-        name = "temperature_sigma_k" if key == "temperature" else "expansion_sigma_ppm_per_k"
-        needed = "expansion_ppm_per_k" if key == "temperature" else "temperature_c"
-        if factor is None or sigma is None:
-            absent = " and ".join([name] * (sigma is None) + [needed] * (factor is None))
-            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {absent}", None, unit, zero)
-        else:
-            words = f"{name} of {statement.origin[what, name]}"
-            covariance = (sigma * factor * PPM) ** 2 * np.outer(effect, effect)
-            yield Source(f"{what}_{key}", title, "B", "stated", words, sigma, unit, covariance)
+        sigma = getattr(stated, name)
+        absent = [name] * (sigma is None) + [needed] * (factor is None)
+        words = f"{name} of {statement.origin[what, name]}"
+        covariance = ((sigma or 0.0) * (factor or 0.0) * PPM) ** 2 * np.outer(effect, effect)
+        yield _stated(f"{what}_{key}", f"{what}'s {key}", unit, absent, words, sigma, covariance)
 
 
 def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> Source:
@@ -288,13 +290,9 @@ def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> So
         absent += [f"{key} of [{body}]" for key, value in keys if value is None]
         sigmas.append(sigma)
         total = total + (sigma or 0.0) * (rate or 0.0) * PPM * effect
-    title, covariance = "temperature of board and target", np.outer(total, total)
-    if absent:
-        words = f"no {' and '.join(absent)}"
-        return Source("temperature", title, "B", "not stated", words, None, "K", np.zeros_like(covariance))
     sigma = sigmas[0] if sigmas[0] == sigmas[1] else None
-    words = "temperature_sigma_k of both, one_thermometer: fully correlated"
-    return Source("temperature", title, "B", "stated", words, sigma, "K", covariance)
+    title, words = "temperature of board and target", "temperature_sigma_k of both, one_thermometer: fully correlated"
+    return _stated("temperature", title, "K", absent, words, sigma, np.outer(total, total))
 
 
 def warmer_k(stated: StatedSize) -> float | None:

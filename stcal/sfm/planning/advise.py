@@ -131,8 +131,8 @@ def doubts(run: SavedRun) -> str:
 
 def failures_of(run: SavedRun) -> str:
     """Returns in words which checks of a run failed; empty if none did."""
-    failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
-    return f"{len(failed)} checks of {run.folder} failed, first {failed[0]}" if failed else ""
+    failed = run.failed_checks()
+    return f"{len(failed)} checks of {run.folder} failed, first {failed[0]['title']}" if failed else ""
 
 
 @require_arguments

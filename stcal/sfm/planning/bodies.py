@@ -10,7 +10,6 @@ import numpy as np
 
 from stcal.design import (
     BoardDesign,
-    FaceDesign,
     KnownDistance,
     ScaleReference,
     TargetDesign,
@@ -29,9 +28,9 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.mapping.incremental import assemble
 from stcal.sfm.mapping.placed import unknown_lens
-from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, nominal_poses, variance_shares
-from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_with_board, widest_aperture_mm
-from stcal.sfm.planning.views import PlannedView, axes_of, looking_at, single
+from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, nominal_poses
+from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_as_asked, plan_with_board
+from stcal.sfm.planning.views import ROLLS_DEG, PlannedView, angle_deg, axes_of, looking_at, single, tilt_deg
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
 
 GROUP = "."
@@ -39,7 +38,7 @@ DISTANCE_SIGMA_MM = 0.02
 """σ of a distance that is measured with a caliper, as a remedy."""
 LEAST_COSINE = -0.2
 """Smallest cosine of the angle between two faces that one view is to show."""
-MAX_TILT_RAD = float(np.radians(60))
+MAX_TILT_DEG = 60.0
 """Largest tilt of a face whose corners count as seen."""
 
 
@@ -98,27 +97,15 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
         target, faces=tuple(replace(face, rough_target_from_face=nominal[face.id]) for face in target.faces)
     )
     scene, model, setup = planned_photographs(options, placed)
-    expected = forecast([model], setup)
-    half_print = forecast([model], setup.better_board(0.5), expected.derivatives)
-    measured = forecast([model], _with_distance(setup, model), expected.derivatives)
-    remedies = [
+    now = plan_as_asked(options, setup, [model], "print and size of half the σ")
+    measured = forecast([model], _with_distance(setup, model), now.forecast.derivatives)
+    remedies = (
         _remedy("twice the images", replace(options, images=2 * options.images), placed),
-        Remedy("print and size of half the σ", half_print.worst()[1]),
+        *now.remedies,
         Remedy(f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm", measured.worst()[1]),
         _remedy("nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), placed),
-    ]
-    return Plan(
-        options,
-        setup,
-        (GROUP,),
-        len(model.image_index),
-        float(np.sqrt((model.sigma_px() ** 2).mean())),
-        widest_aperture_mm([model], scene.camera),
-        expected,
-        variance_shares(expected, [model], setup),
-        tuple(remedies),
-        scene.hardly_seen(),
     )
+    return replace(now, remedies=remedies, hardly_seen=scene.hardly_seen())
 
 
 def _with_distance(setup: Setup, model: MetricModel) -> Setup:
@@ -188,7 +175,6 @@ def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservati
 
 SHARES = (0.35, 0.5, 0.65)
 """Where candidates stand between the normals of two faces."""
-ROLLS_DEG = (0.0, 90.0)
 
 
 def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
@@ -196,6 +182,7 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
     target_from_face = setup.start.target_from_face
     faces = [face for face in setup.target.faces if face.id in target_from_face]
     normals = {face.id: face.outward * target_from_face[face.id].rotation[:, 2] for face in faces}
+    middles = {face.id: target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
     centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
     towards = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
     distance = float(np.median(np.linalg.norm(towards, axis=1)))
@@ -212,8 +199,8 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
             right, up, ahead = (axes @ direction).tolist()
             pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
             position = centre + distance * direction
-            tilts = {face.id: _tilt(position, target_from_face[face.id], normals[face.id], face) for face in faces}
-            shown = {face for face, tilt in tilts.items() if tilt < MAX_TILT_RAD}
+            tilts = {face.id: tilt_deg(normals[face.id], middles[face.id], position) for face in faces}
+            shown = {face for face, tilt in tilts.items() if tilt < MAX_TILT_DEG}
             labels: list[Label] = [
                 label for label in model.labels if isinstance(label, CircleLabel) and label.face in shown
             ]
@@ -226,16 +213,10 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
                     float(np.degrees(np.arcsin(np.clip(up, -1, 1))).round()),
                     roll,
                     distance,
-                    {face: float(np.degrees(tilts[face])) for face in sorted(shown)},
+                    {face: tilts[face] for face in sorted(shown)},
                     model.images[near],
                     model.images[near],
-                    float(np.degrees(np.arccos(np.clip(cosine[near], -1, 1)))),
+                    angle_deg(cosine[near]),
                 )
             )
     return views
-
-
-def _tilt(position: np.ndarray, target_from_face: Rigid, normal: np.ndarray, face: FaceDesign) -> float:
-    """Returns the angle between the normal of a face and the line of sight from a position, rad."""
-    ray = position - target_from_face @ np.append(face.xy_mm.mean(0), 0.0)
-    return float(np.arccos(np.clip(normal @ ray / np.linalg.norm(ray), -1, 1)))

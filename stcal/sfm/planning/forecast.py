@@ -10,7 +10,7 @@ from scipy.special import ellipe, ellipk
 
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, reference_target
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_fields
+from stcal.geometry.arrays import frozen, require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Rigid
@@ -170,17 +170,13 @@ class CentreNoise:
         sampled = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
         corner = [_is_corner(model, radius_mm) for model in sampled]
         corners = [m.sigma_px()[own] for m, own in zip(sampled, corner, strict=True) if own.any()]
-        corner_px = float(np.sqrt((np.concatenate(corners) ** 2).mean())) if corners else CORNER_SIGMA_PX
+        corner_px = rms(np.concatenate(corners)) if corners else CORNER_SIGMA_PX
         sampled = [model.observed(np.flatnonzero(~own)) for model, own in zip(sampled, corner, strict=True)]
         if not any(len(model.point_index) for model in sampled):
             return replace(cls.expected(), corner_px=corner_px)
         rims = [_Rims.of(model, camera, radius_mm) for model in sampled]
-        ratio = np.concatenate(
-            [
-                np.trace(rim.information @ m.covariance_px2, axis1=1, axis2=2) / 2
-                for rim, m in zip(rims, sampled, strict=True)
-            ]
-        )
+        both = [rim.information @ model.covariance_px2 for rim, model in zip(rims, sampled, strict=True)]
+        ratio = np.trace(np.concatenate(both), axis1=1, axis2=2) / 2
         narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
         usual = ratio <= 4 * np.median(ratio)
         slope, level = np.polyfit(narrow[usual], ratio[usual], 1)

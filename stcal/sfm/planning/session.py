@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, require_fields
+from stcal.geometry.arrays import Brief, require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
@@ -165,13 +165,11 @@ def plan_with_board(
             f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
         )
     inputs = (target, board, nominal)
-    twice = replace(options, images=2 * options.images)
-    nearer = replace(options, distance_mm=NEARER * options.distance_mm)
     jobs = [
         (_now, scene, options, board),
-        (_remedy, "twice the images", twice, *inputs),
+        (_remedy, "twice the images", replace(options, images=2 * options.images), *inputs),
         (_wider, options, *inputs),
-        (_remedy, "nearer by 20 %", nearer, *inputs),
+        (_remedy, "nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), *inputs),
     ]
     workers = None if dots > MANY_DOTS else 1
     now, more, wider, near = run_in_order(_called, jobs, workers)
@@ -185,20 +183,23 @@ def _called(function: Callable[..., R], *arguments) -> R:
 
 
 def _now(scene: Scene, options: PlanOptions, board: BoardDesign) -> Plan:
-    """Returns the plan as it is asked for, with a better board as the only remedy."""
-    setup, models = _setup(scene, options, board), _models(scene, options)
+    return plan_as_asked(options, _setup(scene, options, board), _models(scene, options), "a board of half the σ")
+
+
+def plan_as_asked(options: PlanOptions, setup: Setup, models: Sequence[MetricModel], half_sigma: str) -> Plan:
+    """Returns the plan of these photographs, with ``half_sigma``, half the σ of what tells the size, as only remedy."""
     expected = forecast(models, setup)
-    half_board = forecast(models, setup.better_board(0.5), expected.derivatives)
+    better = forecast(models, setup.better_board(0.5), expected.derivatives)
     return Plan(
         options,
         setup,
-        tuple(scene.groups),
-        sum(len(m.image_index) for m in models),
-        float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models]).mean())),
-        widest_aperture_mm(models, scene.camera),
+        tuple(model.group for model in models),
+        sum(len(model.image_index) for model in models),
+        rms(np.concatenate([model.sigma_px() for model in models])),
+        widest_aperture_mm(models, setup.camera),
         expected,
         variance_shares(expected, models, setup),
-        (Remedy("a board of half the σ", half_board.worst()[1]),),
+        (Remedy(half_sigma, better.worst()[1]),),
     )
 
 
@@ -220,7 +221,6 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
 def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
     """Returns the scene with the nominal geometry, in which nothing is misplaced."""
     file = None if options.camera is None else camera_model(options.camera)
-    height = round(options.width * 2 / 3)
     shape = SceneOptions(
         seed=options.seed,
         centre_sigma=0.0,
@@ -232,7 +232,7 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         face_shift_mm=0.0,
         face_turn_deg=0.0,
         width=options.width,
-        height=height,
+        height=round(options.width * 2 / 3),
         margin_mm=options.margin_mm,
     )
     if file is not None:

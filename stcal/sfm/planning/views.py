@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.design import TargetDesign
 from stcal.geometry.arrays import freeze
@@ -149,7 +150,7 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
                 _tilts_deg(scene, model.group, position, labels),
                 stand.middle,
                 model.images[int(np.argmax(cosine))],
-                float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1)))),
+                angle_deg(cosine.max()),
             )
         )
     return views
@@ -199,10 +200,17 @@ def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label])
     plates = {"board": (-board, scene.board_outline(group).mean(0))}
     for face_id in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
         plates[face_id] = scene.target_from_face[face_id].rotation[:, 2], scene.face_outline(face_id).mean(0)
-    return {
-        key: float(np.degrees(np.arccos(np.clip(normal @ (position - at) / np.linalg.norm(position - at), -1, 1))))
-        for key, (normal, at) in plates.items()
-    }
+    return {key: tilt_deg(normal, middle, position) for key, (normal, middle) in plates.items()}
+
+
+def tilt_deg(normal: np.ndarray, middle: np.ndarray, position: np.ndarray) -> float:
+    """Returns the angle between the normal of a plate and the line of sight from its middle to a position."""
+    ray = position - middle
+    return angle_deg(normal @ ray / np.linalg.norm(ray))
+
+
+def angle_deg(cosine: ArrayLike) -> float:
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:

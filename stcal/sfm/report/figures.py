@@ -1,7 +1,7 @@
 """Figures of a run's report: residuals, the target in space, photographs with overlays."""
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 
@@ -35,7 +35,7 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     ``residuals_um``: (3,) by ``board:row:column``; ``reach_um``: drawn as long as the pitch; ``height_um``: end of the
     colour scale."""
     cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
-    vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
+    vectors = _points(residuals_um.values())
     per_cell = reach_um if reach_um > 0 else 1.0
     height_um = height_um if height_um > 0 else 1.0
     bar_um = round_below(per_cell)
@@ -112,13 +112,23 @@ def upright(report: dict) -> dict:
     return {**report, "faces": faces, "scene": {**scene, "cameras": cameras, "circles": circles, "boards": boards}}
 
 
+def _points(places: Iterable) -> np.ndarray:
+    """Returns places as an array (n, 3), also if there are none."""
+    return np.array(list(places), float).reshape(-1, 3)
+
+
+def _length(share: float, points: np.ndarray) -> float:
+    """Returns a share of the largest extent of points along an axis, mm; 1 if there are none."""
+    return share * float(np.ptp(points, axis=0).max()) if len(points) else 1.0
+
+
 def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> Drawing:
     """Draws cameras, boards and the target's circles in the target frame."""
-    target = np.array(list(scene["circles"].values()), float).reshape(-1, 3)
-    positions = np.array([view["position_mm"] for view in scene["cameras"]], float).reshape(-1, 3)
-    boards = {name: np.array(xyz, float).reshape(-1, 3) for name, xyz in scene["boards"].items()}
+    target = _points(scene["circles"].values())
+    positions = _points(view["position_mm"] for view in scene["cameras"])
+    boards = {name: _points(xyz) for name, xyz in scene["boards"].items()}
     everything = np.vstack([target, positions, *boards.values()])
-    depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
+    depth = _length(CAMERA, everything)
     drawing = Drawing(5.4, 4.9)
     space = Space(drawing, everything, 22, azimuth)
     for name, xyz in boards.items():
@@ -134,8 +144,8 @@ def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: floa
 def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> Drawing:
     """Draws the target's circles, and the frame of each face with its name at the end of the normal."""
     parts = _faces(circles, faces)
-    xyz = np.array(list(circles.values()), float).reshape(-1, 3)
-    shown = [np.array(part["xyz"], float).reshape(-1, 3) for part in parts]
+    xyz = _points(circles.values())
+    shown = [_points(part["xyz"]) for part in parts]
     drawing = Drawing(5.4, 4.9)
     space = Space(drawing, np.vstack([xyz, *shown]), 24, azimuth)
     for part, own in zip(parts, shown, strict=True):
@@ -192,7 +202,7 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
             parts.append(_part("text", [np.mean(dots, axis=0)], colours.get(group, INK), name=f"group {group}"))
     places = [view["position_mm"] for view in scene["cameras"]]
     everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])
-    depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
+    depth = _length(CAMERA, everything)
     for camera in scene["cameras"]:
         lines = frustum(camera, report["camera"], depth)
         path = np.vstack([section for line in lines for section in (lines[0][:1], line)])  # back to the tip each time
@@ -202,13 +212,11 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
 
 def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict]:
     """Returns sheet, axes and name of each face."""
-    xyz = np.array(list(circles.values()), float).reshape(-1, 3)
-    reach = AXIS * float(np.ptp(xyz, axis=0).max()) if len(xyz) else 1.0
+    xyz = _points(circles.values())
+    reach = _length(AXIS, xyz)
     parts = []
     for name, face in faces.items():
-        centres = np.array([p for label, p in circles.items() if parse_label(label).plane == name], float).reshape(
-            -1, 3
-        )
+        centres = _points(place for label, place in circles.items() if parse_label(label).plane == name)
         pose = np.array(face["target_from_face"], float)
         parts += [_part("sheet", corners, SHEET, target=True) for corners in outline(centres, pose)]
         origin = pose[:3, 3]

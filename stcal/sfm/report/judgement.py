@@ -186,6 +186,10 @@ def _use(report: dict) -> tuple[Use, str]:
     return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
 
 
+def _capital(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
 def _drawn(report: dict) -> list[tuple[str, str]]:
     """Returns in which ways the faces are not where they were drawn, and what to do about each."""
     notes = [note.removeprefix(NOT_AS_DRAWN) for note in report["notes"] if note.startswith(NOT_AS_DRAWN)]
@@ -194,7 +198,7 @@ def _drawn(report: dict) -> list[tuple[str, str]]:
 
 def _by_drawing(report: dict) -> _Cause | None:
     for what, remedy in _drawn(report):
-        return _Cause(f"The drawing: {what}.", f"{remedy[:1].upper()}{remedy[1:]}.")
+        return _Cause(f"The drawing: {what}.", f"{_capital(remedy)}.")
     return None
 
 
@@ -276,21 +280,16 @@ def _faces(names: list[str]) -> str:
     return f"face{'' if len(names) == 1 else 's'} {join(names)}"
 
 
-def _absent(report: dict) -> list[str]:
-    """Returns the faces of the design, and of those expected, that are not in the result."""
-    return list(report["summary"]["faces_not_seen"])
-
-
 def _lacking(report: dict) -> list[str]:
     """Returns the faces without which the result is a part: of the design, or of those that the user expects."""
     wanted = report["options"].get("expect_faces")
-    return [face for face in _absent(report) if not wanted or face in wanted]
+    return [face for face in report["summary"]["faces_not_seen"] if not wanted or face in wanted]
 
 
 def _missing_faces(report: dict) -> list[str]:
     """Returns the faces that were expected from the photographs and are missing from the result."""
     expected = report["summary"].get("faces_expected") or []
-    return [face for face in _absent(report) if face in expected]
+    return [face for face in report["summary"]["faces_not_seen"] if face in expected]
 
 
 def lost_groups(notes: Iterable[str]) -> list[str]:
@@ -326,7 +325,7 @@ def _has_circles(report: dict, face: str) -> bool:
 def _gaps(report: dict) -> list[str]:
     """Returns in words what is missing: faces that are not in the result, or in one image alone, and lost groups."""
     never, words = [], []
-    for face in _absent(report):
+    for face in report["summary"]["faces_not_seen"]:
         images = _left_out_in(report, face)
         if images:
             shown = "1 image" if len(images) == 1 else f"{len(images)} images"
@@ -445,8 +444,8 @@ def _by_checks(report: dict) -> _Cause | None:
     for verdict in ("failed", "suspicious"):
         if verdict in verdicts:
             check = _first(report, verdict)
-            remedy = check["remedy"] or "look at what the check names"
-            found, remedy = f"{check['title']}: {check['reason']}.", f"{remedy[0].upper()}{remedy[1:]}."
+            remedy = f"{_capital(check['remedy'] or 'look at what the check names')}."
+            found = f"{check['title']}: {check['reason']}."
             if verdict == "failed":
                 return _Cause(found, remedy)
             limits = _by_gaps(report) or _by_size(report) or _by_sigma(report)
@@ -475,7 +474,7 @@ def _by_lost_group(report: dict) -> _Cause | None:
     for note in report["notes"]:
         if note.startswith(f"{LEFT_OUT_WHOLE}group "):
             found, _, remedy = note.removeprefix(LEFT_OUT_WHOLE).partition("; ")
-            return _Cause(f"Left out: {found}.", f"{remedy[:1].upper()}{remedy[1:]}." if remedy else "Take it again.")
+            return _Cause(f"Left out: {found}.", f"{_capital(remedy)}." if remedy else "Take it again.")
     return None
 
 
@@ -557,7 +556,7 @@ def _source(report: dict, kind: str) -> tuple[str, str]:
             common = "all edges may have the same error, which no residual shows"
             return "The size, by the edges of tags", f"{few}{common}; {distance} with [[scale]] in target.toml."
         remedy = f"measure it better than size_sigma_mm says, or {distance} with [[scale]] in target.toml."
-        return "The size of the print", (few + remedy) if few else remedy[0].upper() + remedy[1:]
+        return "The size of the print", f"{few}{remedy}" if few else _capital(remedy)
     remedies = {
         "board": ("The places of the board's dots", "measure them, or take a better plate, and state sigma_mm in "
                   "board.toml."),
@@ -570,7 +569,7 @@ def _source(report: dict, kind: str) -> tuple[str, str]:
                        "file."),
     }  # fmt: skip
     name, remedy = remedies[kind]
-    return name, (few + remedy) if few else remedy[0].upper() + remedy[1:]
+    return name, f"{few}{remedy}" if few else _capital(remedy)
 
 
 def _more(report: dict, verdict: Use) -> list[str]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from stcal.io.images import TOP_GROUP
@@ -9,6 +10,7 @@ from stcal.labels import BOARD, parse_label
 from stcal.report.document import (
     Block,
     Document,
+    Html,
     Section,
     Swatch,
     Table,
@@ -25,7 +27,6 @@ from stcal.report.document import (
     tiles,
     tone_of,
 )
-from stcal.report.svg import Drawing
 from stcal.report.text import cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
@@ -39,9 +40,6 @@ from stcal.sfm.report.sections import (
     settings,
     trust,
 )
-
-View = tuple[Drawing, Drawing, str]
-"""Cameras, target, and words for the side that they are seen from."""
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
@@ -63,28 +61,25 @@ def report_html(
         report = without_sigma(report)
     report = _with_named_groups(report)
     colours = figures.group_colours([group["name"] for group in report["groups"]])
-    boards, views, bars = _drawn(report, colours)
     summary, words = report["summary"], Words.of(report)
     sections = [
-        Section("Faces", _answer(report, colours, views, words), name="faces"),
+        Section("Faces", _answer(report, colours, words)),
         Section("May I use it?", _use(report, judgement, words), name="use"),
         Section("How far to trust it", trust(report, judgement, words), name="trust"),
         Section("Faces in detail", _faces_in_detail(report), name="detail"),
-        Section("Scale", _scale(report, boards, words), name="scale"),
-        Section("Residuals", _residuals(report, colours, bars), name="residuals"),
-        Section("Focus", _focus(report), name="focus"),
+        Section("Scale", _scale(report, words)),
+        Section("Residuals", _residuals(report, colours)),
+        Section("Focus", _focus(report)),
         Section("Initial pairs", _pairs(report), name="pairs"),
-        Section("Left out", _left_out(report, words), name="left-out"),
+        Section("Left out", _left_out(report, words)),
         Section(
             "As published", published_section(report["comparison"]) if "comparison" in report else [], name="comparison"
         ),
         Section(
             "Cross-check", crosscheck_section(report["crosscheck"]) if "crosscheck" in report else [], name="crosscheck"
         ),
-        Section(
-            "Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")], name="settings"
-        ),
-        Section("Overlays", _overlays(report, overlays, residuals or {}, gone, words), name="overlays"),
+        Section("Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")]),
+        Section("Overlays", _overlays(report, overlays, residuals or {}, gone, words)),
     ]
     counts = (
         f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
@@ -113,28 +108,23 @@ def _with_named_groups(report: dict) -> dict:
 
 def _warning(report: dict) -> Block:
     """Returns what makes all faces useless, or that there are none."""
+    warning = ""
     if not report["faces"]:
-        return alarms(
-            [
-                "The board alone: no face of the target was recognised. λ and the board's residuals of each group are "
-                "under Scale; there is no calibrated target. If a face is in view, look at the overlays."
-            ]
+        warning = (
+            "The board alone: no face of the target was recognised. λ and the board's residuals of each group are "
+            "under Scale; there is no calibrated target. If a face is in view, look at the overlays."
         )
-    if report["options"]["solve"] == "paper":
-        return alarms(
-            [
-                "As published, for comparison: centres of contours with equal weights, without the eccentricity. Faces "
-                "are biased by tens of µm; residuals do not show it. Do not use these faces."
-            ]
+    elif report["options"]["solve"] == "paper":
+        warning = (
+            "As published, for comparison: centres of contours with equal weights, without the eccentricity. Faces "
+            "are biased by tens of µm; residuals do not show it. Do not use these faces."
         )
-    if not report["options"]["eccentricity"]:
-        return alarms(
-            [
-                "Eccentricity is off: this is an uncorrected control. Faces are biased along their normals by tens of "
-                "µm; residuals do not show it. Do not use these faces."
-            ]
+    elif not report["options"]["eccentricity"]:
+        warning = (
+            "Eccentricity is off: this is an uncorrected control. Faces are biased along their normals by tens of "
+            "µm; residuals do not show it. Do not use these faces."
         )
-    return None
+    return alarms([warning] if warning else [])
 
 
 HOW_TO_USE = """import json, numpy as np
@@ -148,7 +138,7 @@ covariance = faces["target_from_face_covariance"]["{face}"]"""
 """Program that reads the result."""
 
 
-def _answer(report: dict, colours: dict[str, str], views: list[View], words: Words) -> list[Block]:
+def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     """Returns the faces with σ, the target in space, and how to use the result."""
     rows = []
     for name, face in report["faces"].items():
@@ -170,12 +160,12 @@ def _answer(report: dict, colours: dict[str, str], views: list[View], words: Wor
     others = [face for face in report["faces"] if face != report["reference_face"]]
     with_it = "boards and cameras" if words.board else "cameras"
     origin = "origin circle" if words.point == "circle" else "origin"
-    stills = []
-    for scene, target, side in views:
+    scene, stills = report["scene"], []
+    for azimuth, side in SIDES.items():
         text = f"Cameras{', boards' if words.board else ''} and target (black){side}"
-        stills += [plot(lambda picture=scene: picture, text, css="")]
+        stills.append(plot(partial(figures.scene_view, scene, report["camera"], colours, azimuth), text, css=""))
         text = f"{words.points.capitalize()} of the target, frames of its faces{side}"
-        stills += [plot(lambda picture=target: picture, text, css="")]
+        stills.append(plot(partial(figures.target_view, scene["circles"], report["faces"], azimuth), text, css=""))
     space = [
         macro(
             "turned",
@@ -209,21 +199,6 @@ def _use(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     """Returns the answers in words, the headline, and the checks."""
     checks = checks_section(report["checks"]) if "checks" in report else []
     return [macro("answers", judgement.answers(), tone_of(judgement.verdict)), *checks, tiles(headline(report, words))]
-
-
-def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, Drawing], list[View], Drawing]:
-    """Returns the plots: the boards' residuals by group, views from two sides, and bars of the images."""
-    scene, faces = report["scene"], report["faces"]
-    boards = {name: figures.board_residuals(*board) for name, board in _boards(report).items()}
-    views = [
-        (
-            figures.scene_view(scene, report["camera"], colours, azimuth),
-            figures.target_view(scene["circles"], faces, azimuth),
-            side,
-        )
-        for azimuth, side in SIDES.items()
-    ]
-    return boards, views, figures.image_bars(report["residuals_by_image"], colours)
 
 
 # --- faces and scale --------------------------------------------------------------------------------------------------
@@ -270,7 +245,7 @@ def _faces_in_detail(report: dict) -> list[Block]:
     ]
 
 
-def _scale(report: dict, boards: dict[str, Drawing], words: Words) -> list[Block]:
+def _scale(report: dict, words: Words) -> list[Block]:
     """Returns λ and the board's residuals of each group."""
     heads = [
         "<Group",
@@ -283,16 +258,7 @@ def _scale(report: dict, boards: dict[str, Drawing], words: Words) -> list[Block
     ]
     shown = [k for k in range(11) if words.board or k not in BY_ROWS]
     heads += ["Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]
-    pictures = [
-        plot(
-            lambda picture=boards[group["name"]]: picture,
-            f"Residual vectors of the board, group {group['name']}",
-            f"Group {group['name']}: RMS {number(group['scale']['board_rms_um'], 1)} µm",
-            "",
-        )
-        for group in report["groups"]
-        if group["name"] in boards
-    ]
+    pictures = _board_residuals(report["groups"])
     without = (
         "Without a board in view, λ is from the corners of faces with printed boards or tags, or from known distances "
         "between points: they stand for the dots in this table"
@@ -310,7 +276,7 @@ def _scale(report: dict, boards: dict[str, Drawing], words: Words) -> list[Block
         else "λ turns a group's model into mm, by least squares over all corners of printed faces, or over the known "
         "distances between points. σ is that of λ from their stated σ",
         Table([heads[k] for k in shown], [[row[k] for k in shown] for row in _scales(report)]),
-        *([without] if words.board and len(pictures) < len(report["groups"]) else []),
+        without if words.board and len(pictures) < len(report["groups"]) else "",
         *(of_boards if pictures else []),
     ]
 
@@ -328,23 +294,27 @@ def _scales(report: dict) -> list[list]:
     ]
 
 
-def _boards(report: dict) -> dict[str, tuple]:
-    """Returns the input of the plots of the boards' residuals, by group."""
-    residuals = {
-        group["name"]: group["scale"]["board_residuals_um"]
-        for group in report["groups"]
-        if group["scale"].get("source", "board") == "board"
-    }
-    vectors = [vector for board_residuals in residuals.values() for vector in board_residuals.values()]
+def _board_residuals(groups: list[dict]) -> list[Html]:
+    """Returns the plots of the boards' residuals, all on one scale."""
+    scales = {each["name"]: each["scale"] for each in groups if each["scale"].get("source", "board") == "board"}
+    vectors = [vector for scale in scales.values() for vector in scale["board_residuals_um"].values()]
     reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
     height = max((abs(vector[2]) for vector in vectors), default=0.0)
-    return {name: (board_residuals, reach, height) for name, board_residuals in residuals.items()}
+    return [
+        plot(
+            partial(figures.board_residuals, scale["board_residuals_um"], reach, height),
+            f"Residual vectors of the board, group {name}",
+            f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
+            "",
+        )
+        for name, scale in scales.items()
+    ]
 
 
 # --- residuals, pairs, left out ---------------------------------------------------------------------------------------
 
 
-def _residuals(report: dict, colours: dict[str, str], bars: Drawing) -> list[Block]:
+def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
     """Returns the residuals by image; and by label, face by face and board by board."""
     target: dict[str, list] = {}
     board: dict[str, list] = {}
@@ -369,11 +339,12 @@ def _residuals(report: dict, colours: dict[str, str], bars: Drawing) -> list[Blo
         group = f" of group {worst['group']}" if worst["group"] else ""
         named = f". The worst label is {worst['label']}{group} with {worst['rms_px']:.4f} px RMS"
     table = Table(["No.", "<Image", "<Group", "Centres", "RMS (px)", "Max (px)", "<Worst label"], images)
+    bars = partial(figures.image_bars, report["residuals_by_image"], colours)
     return [
         f"RMS is per axis, max is the length of the largest vector{named}",
         subheading("By image"),
         legend(colours, "Groups:"),
-        plot(lambda: bars, "Residuals by image", "Bars: RMS of the image; ticks: its largest"),
+        plot(bars, "Residuals by image", "Bars: RMS of the image; ticks: its largest"),
         fold(f"All {len(images)} images", table) if len(images) > FIRST_IMAGES else table,
         subheading("By label"),
         _by_label(target),

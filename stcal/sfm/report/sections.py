@@ -124,16 +124,13 @@ def headline(report: dict, words: Words) -> list[tuple[str, str, str]]:
     summary = report["summary"]
     sigma = _largest_sigma(report, "translation_sigma_um")
     ppm = max((abs(group["scale"]["difference_ppm"]) for group in report["groups"]), default=None)
+    of_board = (number(ppm, 1), "ppm", "largest difference of the scale by the board's rows from that by all dots")
     return [
         (number(summary["residual_rms_px"], 4), "px", "residual, RMS per axis"),
         (number(summary["sigma0"], 2), "", "σ₀ of the joint adjustment"),
         (number(summary["sigma_factor"], 2), "×", factor_in_words(summary["sigma_factor"])),
         (number(sigma and sigma[0], 1), "µm", "largest σ of a face's position"),
-        *(
-            [(number(ppm, 1), "ppm", "largest difference of the scale by the board's rows from that by all dots")]
-            if words.board
-            else []
-        ),
+        *([of_board] if words.board else []),
     ]
 
 
@@ -144,16 +141,13 @@ def settings(report: dict, words: Words) -> list[list[str]]:
     solve, frame = str(options["solve"]), str(options["frame"])
     round_ = words.point != "corner"
     single = sum(row.get("gate") == "views" for row in left_out["circles"])
-    return [
+    eccentricity = "corrected" if options["eccentricity"] else "off (uncorrected control)"
+    rows = [
         ["Solve", SOLVES.get(solve, solve)],
         ["Face frames", FRAMES.get(frame, frame) if round_ else "those of their drawings"],
-        *(
-            [["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"]]
-            if round_
-            else []
-        ),
-        *([["Surface", f"luminous, behind rims of {rim:.3f} mm"]] if (rim := summary.get("rim_mm")) else []),
-        *([["Dots of the board", f"behind rims of {rim:.3f} mm"]] if (rim := summary.get("dot_rim_mm")) else []),
+        ["Eccentricity", eccentricity if round_ else ""],
+        ["Surface", f"luminous, behind rims of {rim:.3f} mm" if (rim := summary.get("rim_mm")) else ""],
+        ["Dots of the board", f"behind rims of {rim:.3f} mm" if (rim := summary.get("dot_rim_mm")) else ""],
         ["Reference face", report["reference_face"]],
         ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
@@ -173,6 +167,7 @@ def settings(report: dict, words: Words) -> list[list[str]]:
         ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
         ["Program", f"stcal {report['version']}"],
     ]
+    return [[name, value] for name, value in rows if value]
 
 
 def _worst_values(report: dict, words: Words) -> list[list[str]]:

@@ -26,7 +26,6 @@ from stcal.io.files import (
     MODELS,
     REFINED_CAMERA,
     REPORT_PDF,
-    RUN_MARKER,
     TARGET,
     TARGET_MODEL,
     json_text,
@@ -53,7 +52,7 @@ from stcal.sfm.report.sections import Words
 from stcal.sfm.runs.output import report_of, residuals_px
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.saved import AnyRun, SavedRun, folder_of, verify
+from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, folder_of, require_run, verify
 from stcal.sfm.runs.text import found_in_all
 from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
 
@@ -161,11 +160,9 @@ class ReportAgain:
 
     def text(self) -> str:
         """Returns the text for the terminal."""
-        warnings = (
-            [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
-        )
-        notes = (f"note: {note}" for note in self.notes)
-        return "\n".join([*warnings, *notes, *(f"report: {path}" for path in self.files)])
+        lines = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join([*lines, *(f"report: {path}" for path in self.files)])
 
 
 @require_arguments
@@ -192,10 +189,7 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
         Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
     """
     run, out = folder_of(run), None if out is None else Path(out)
-    if not (run / RUN_MARKER).is_file():
-        raise InputError(
-            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
-        )
+    require_run(run)
     if out is not None and out.suffix.lower() == ".pdf":
         raise InputError(
             "E-OUTPUT-SUFFIX",
@@ -215,28 +209,25 @@ def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) 
 def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
     """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
     path = run / "report.json"
-    report = read_json(path, "run", "run it again")
-    try:
-        checked(report, ReportFile)
-    except InputError as error:
-        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
+    report = read_json(path, "run", AGAIN)
     with _as_written(path):
+        checked(report, ReportFile)
         shown = shown_overlays(report)
         overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
     with _as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
-    outputs: list[tuple[Path, bytes]] = [(out, page.encode("utf-8", "backslashreplace"))]
+    contents: dict[Path, str | bytes] = {out: page}
     if pdf:
-        outputs.append((out.with_suffix(".pdf"), pdf_of(page)))
-    for file, content in outputs:
+        contents[out.with_suffix(".pdf")] = pdf_of(page)
+    for file, content in contents.items():
         save(file, content)
-    return tuple(file for file, _ in outputs), gone
+    return tuple(contents), gone
 
 
-def _report_page(run: Path, report: dict) -> bytes:
+def _report_page(run: Path, report: dict) -> str:
     overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, _residuals(run, list(overlays))).encode("utf-8", "backslashreplace")
+    return report_html(report, overlays, _residuals(run, list(overlays)))
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
@@ -312,7 +303,7 @@ def _page(
     labelled: Sequence[LabelledImage],
     folder: RunFolder,
 ) -> str:
-    rows, rest = [], max(len(labelled) - FIRST_IMAGES, 0)
+    rows, rest, shown = [], max(len(labelled) - FIRST_IMAGES, 0), _photographs(detection, labelled, folder)
     for each in labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
@@ -320,18 +311,14 @@ def _page(
     left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
-        Section("What was found", [seen, Table(HEADS, rows)]),
+        Section("What was found", [seen, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
-        Section("Overlays", [macro("photographs", _photographs(detection, labelled, folder), rest, WORDS)]),
+        Section("Overlays", [macro("photographs", shown, rest, Words("point", True))]),
     ]
     answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
     about = f"{len(labelled)} images, no calibrated target"
     return Document(name, about, sections, [answer], f"{name}: no calibration").page()
-
-
-HEADS = ["<Image", "<Faces", "Points", "Dots"]
-WORDS = Words("point", True)
 
 
 def _photographs(detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder) -> Photographs:

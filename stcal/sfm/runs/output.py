@@ -6,6 +6,7 @@ import numpy as np
 
 import stcal
 from stcal.design import faces_of_known_shape
+from stcal.geometry.arrays import rms
 from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
@@ -20,104 +21,101 @@ MICRO = 1e3
 
 def report_of(result: RunResult) -> ReportFile:
     """Returns the report of a run."""
-    models, joint = _final_models(result), result.calibration.joint
-    residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
-    all_residuals = np.concatenate(list(residual.values()))
+    models, calibration = _final_models(result), result.calibration
+    residual = {name: model.residuals_px(calibration.camera) for name, model in models.items()}
+    options, camera = result.options, calibration.camera
+    content = {
+        "format": "stcal report 1",
+        "version": stcal.__version__,
+        "target": result.target_design.name,
+        "reference_face": result.target.reference_face,
+        "options": {
+            "solve": options.solve,
+            "frame": options.frame,
+            "eccentricity": options.eccentricity,
+            "refine_camera": options.refine_camera,
+            "expect_faces": list(options.expect_faces),
+            "max_pair_angle_deg": round(float(np.degrees(options.pairs.limit_rad())), 9),
+        },
+        "camera": {
+            "model": result.camera.colmap_model,
+            "size_px": [result.camera.width, result.camera.height],
+            "focal_px": camera.focal,
+            "centre_px": camera.centre,
+            "distortion": camera.coefficients(),
+        },
+        "summary": _summary(result, models, np.concatenate(list(residual.values()))),
+        "faces": {face: _face(result, face) for face in result.target.target_from_face},
+        "between_faces": _between(result),
+        "chains": {
+            face: [
+                {
+                    "faces": list(chain.faces),
+                    "groups": list(chain.groups),
+                    "translation_um": MICRO * chain.translation_mm,
+                    "rotation_mdeg": MICRO * float(np.degrees(chain.rotation_rad)),
+                }
+                for chain in chains
+            ]
+            for face, chains in result.chains.items()
+        },
+        "checks": result.checks,
+        "groups": [_group(result, solution) for solution in result.solutions],
+        "residuals_by_image": _by_image(models, residual),
+        "residuals_by_label": _by_label(models, residual),
+        "left_out": _left_out(result),
+        "notes": list(result.notes),
+        "images": [
+            {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
+            for i, image in enumerate(result.observations(), start=1)
+        ],
+        "focus": [_focus(image.focus) for image in result.labelled if image.focus is not None],
+        "scene": _scene(result),
+    }
+    return ReportFile.model_validate(content | ({} if result.comparison is None else {"comparison": result.comparison}))
+
+
+def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.ndarray) -> dict:
+    """Returns the counts and the factors; ``residuals`` : (n, 2) of all models, px."""
+    calibration, target, design = result.calibration, result.target, result.target_design
+    joint, factors, sources = calibration.joint, calibration.sigma_factors, result.scale_from()
     printed = max(faces_of_known_shape(result.board_design), key=lambda face: face.size_sigma, default=None)
-    return ReportFile.model_validate(
-        {
-            "format": "stcal report 1",
-            "version": stcal.__version__,
-            "target": result.target_design.name,
-            "reference_face": result.target.reference_face,
-            "options": {
-                "solve": result.options.solve,
-                "frame": result.options.frame,
-                "eccentricity": result.options.eccentricity,
-                "refine_camera": result.options.refine_camera,
-                "expect_faces": list(result.options.expect_faces),
-                "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
-            },
-            "camera": {
-                "model": result.camera.colmap_model,
-                "size_px": [result.camera.width, result.camera.height],
-                "focal_px": result.calibration.camera.focal,
-                "centre_px": result.calibration.camera.centre,
-                "distortion": result.calibration.camera.coefficients(),
-            },
-            "summary": {
-                "files": len(result.detection.images) + len(result.detection.skipped),
-                "images": len(result.labelled),
-                "images_mapped": sum(len(model.images) for model in models.values()),
-                "groups": len(models),
-                "faces": len(result.target.target_from_face),
-                "faces_not_seen": [
-                    f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
-                ],
-                "faces_expected": result.options.faces_expected(
-                    {image.file.group for image in result.detection.images} | set(lost_groups(result.notes)),
-                    result.target_design,
-                ),
-                "observations": len(all_residuals),
-                "residual_rms_px": float(np.sqrt((all_residuals**2).mean())),
-                "centre_sigma_rms_px": float(
-                    np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())
-                ),
-                "sigma_factor": result.calibration.sigma_factors.all,
-                "circle_sigma_factor": result.calibration.sigma_factors.circles,
-                "dot_sigma_factor": result.calibration.sigma_factors.dots,
-                "printed_sigma_factor": result.calibration.sigma_factors.printed
-                if result.target_design.has_printed
-                else None,
-                "scale_sigma_ppm": None
-                if result.target.scale_sigma is None or result.target_design.up_to_scale
-                else 1e6 * result.target.scale_sigma,
-                "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
-                "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
-                "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
-                "photographs_differ": joint.differ if joint else None,
-                "sigma_enlarged": joint.enlarged if joint else None,
-                "rim_mm": float(np.mean(rims)) if (rims := list(result.calibration.rim_mm.values())) else None,
-                "rim_sigma_mm": result.calibration.rim_sigma_mm if rims else None,
-                "dot_rim_mm": result.board_design.rim_mm or None,
-                "scale_from": result.scale_from(),
-                "print_factor": joint.print_factor if joint and "faces" in result.scale_from() else None,
-                "bend_factor": joint.bend_factor if joint and "faces" in result.scale_from() else None,
-                "camera_given": result.camera_given,
-                "circle_sigma_px": result.calibration.circle_sigma_px,
-                "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
-                "edge_share": printed.edge_share if printed else None,
-                "printed_faces": sorted(result.target_design.printed_ids()),
-            },
-            "faces": {face: _face(result, face) for face in result.target.target_from_face},
-            "between_faces": _between(result),
-            "chains": {
-                face: [
-                    {
-                        "faces": list(chain.faces),
-                        "groups": list(chain.groups),
-                        "translation_um": MICRO * chain.translation_mm,
-                        "rotation_mdeg": MICRO * float(np.degrees(chain.rotation_rad)),
-                    }
-                    for chain in chains
-                ]
-                for face, chains in result.chains.items()
-            },
-            "checks": result.checks,
-            "groups": [_group(result, solution) for solution in result.solutions],
-            "residuals_by_image": _by_image(models, residual),
-            "residuals_by_label": _by_label(models, residual),
-            "left_out": _left_out(result),
-            "notes": list(result.notes),
-            "images": [
-                {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
-                for i, image in enumerate(result.observations(), start=1)
-            ],
-            "focus": [_focus(image.focus) for image in result.labelled if image.focus is not None],
-            "scene": _scene(result),
-        }
-        | ({} if result.comparison is None else {"comparison": result.comparison})
-    )
+    of_print = joint if "faces" in sources else None
+    rims = list(calibration.rim_mm.values())
+    groups = {image.file.group for image in result.detection.images} | set(lost_groups(result.notes))
+    return {
+        "files": len(result.detection.images) + len(result.detection.skipped),
+        "images": len(result.labelled),
+        "images_mapped": sum(len(model.images) for model in models.values()),
+        "groups": len(models),
+        "faces": len(target.target_from_face),
+        "faces_not_seen": [face.id for face in design.faces if face.id not in target.target_from_face],
+        "faces_expected": result.options.faces_expected(groups, design),
+        "observations": len(residuals),
+        "residual_rms_px": rms(residuals),
+        "centre_sigma_rms_px": rms(np.concatenate([model.sigma_px() for model in models.values()])),
+        "sigma_factor": factors.all,
+        "circle_sigma_factor": factors.circles,
+        "dot_sigma_factor": factors.dots,
+        "printed_sigma_factor": factors.printed if design.has_printed else None,
+        "scale_sigma_ppm": None if target.scale_sigma is None or design.up_to_scale else 1e6 * target.scale_sigma,
+        "sigma0": joint.sigma0 if joint else None,
+        "redundancy": joint.redundancy if joint else None,
+        "last_move_px": joint.last_move_px if joint else None,
+        "photographs_differ": joint.differ if joint else None,
+        "sigma_enlarged": joint.enlarged if joint else None,
+        "rim_mm": float(np.mean(rims)) if rims else None,
+        "rim_sigma_mm": calibration.rim_sigma_mm if rims else None,
+        "dot_rim_mm": result.board_design.rim_mm or None,
+        "scale_from": sources,
+        "print_factor": of_print.print_factor if of_print else None,
+        "bend_factor": of_print.bend_factor if of_print else None,
+        "camera_given": result.camera_given,
+        "circle_sigma_px": calibration.circle_sigma_px,
+        "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
+        "edge_share": printed.edge_share if printed else None,
+        "printed_faces": sorted(design.printed_ids()),
+    }
 
 
 def residuals_px(result: RunResult) -> list[np.ndarray]:
@@ -250,7 +248,7 @@ def _by_image(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
                     "image": image,
                     "group": name,
                     "observations": len(indices),
-                    "rms_px": float(np.sqrt((residual[name][indices] ** 2).mean())),
+                    "rms_px": rms(residual[name][indices]),
                     "max_px": float(length[worst]),
                     "worst": model.labels[model.point_index[worst]],
                 }
@@ -270,7 +268,7 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
             "label": label,
             "group": group or None,
             "observations": len(rows),
-            "rms_px": float(np.sqrt((np.array(rows) ** 2).mean())),
+            "rms_px": rms(np.array(rows)),
             "max_px": float(np.linalg.norm(rows, axis=1).max()),
         }
         for (group, label), rows in sorted(gathered.items())
@@ -278,7 +276,7 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
 
 
 def _left_out(result: RunResult) -> dict:
-    observed = {(labelled_image.observations.name): labelled_image for labelled_image in result.labelled}
+    observed = {image.observations.name: image for image in result.labelled}
     images, circles = [], []
     for solution in result.solutions:
         mapped = set(solution.model.labels)
@@ -313,9 +311,7 @@ def _left_out(result: RunResult) -> dict:
         "files": result.detection.skipped,
         "images": images,
         "circles": circles,
-        "notes": [
-            {"image": name, "note": note} for name, labelled_image in observed.items() for note in labelled_image.notes
-        ],
+        "notes": [{"image": name, "note": note} for name, image in observed.items() for note in image.notes],
     }
 
 
@@ -349,20 +345,9 @@ def _scene(result: RunResult) -> dict:
     cameras, boards = [], {}
     for model in result.calibration.models:
         for image, pose in zip(model.images, model.camera_from_model, strict=True):
-            target_from_camera = pose.inverse()
-            cameras.append(
-                {
-                    "image": image,
-                    "group": model.group,
-                    "position_mm": target_from_camera.translation,
-                    "axes": target_from_camera.rotation.T,
-                }
-            )
+            position_mm = pose.inverse().translation
+            cameras.append({"image": image, "group": model.group, "position_mm": position_mm, "axes": pose.rotation})
         dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
         if dots:
             boards[model.group] = model.xyz_model[dots]
-    return {
-        "cameras": cameras,
-        "boards": boards,
-        "circles": result.target.circles,
-    }
+    return {"cameras": cameras, "boards": boards, "circles": result.target.circles}

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import rms
 from stcal.geometry.camera import Camera
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -14,7 +15,7 @@ from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX
-from stcal.sfm.runs.result import ComparedRow, Comparison, FaceOff, RunResult, SigmaRow
+from stcal.sfm.runs.result import ComparedRow, Comparison, FaceOff, RunResult
 
 MICRO = 1e3
 AS_PUBLISHED = "as published"
@@ -53,7 +54,7 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
     rms = residual_rms_px(joint.models, result.calibration.camera)
     rows.append(_compared(f"+ {STEPS[-1]}", {}, [], scales, rms, None))
     sigma = {
-        face: SigmaRow(
+        face: FaceOff(
             translation_um=MICRO * float(np.sqrt(np.trace(c[3:, 3:]))),
             rotation_mdeg=MICRO * float(np.degrees(np.sqrt(np.trace(c[:3, :3])))),
         )
@@ -65,12 +66,10 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
 
 def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
     """Answers, or errors, from the run's own circles by the step added last, without the joint adjustment."""
-    equal_models = [_alike(solution.model) for solution in result.solutions]
-    weighted_models = [solution.model for solution in result.solutions]
+    weighted = [solution.model for solution in result.solutions]
+    equal = [_alike(model) for model in weighted]
     answers: dict[str, Answer | StcalError] = {}
-    for step, models, eccentricity in zip(
-        STEPS[:-1], (equal_models, equal_models, weighted_models), (False, True, True), strict=True
-    ):
+    for step, models, eccentricity in zip(STEPS[:-1], (equal, equal, weighted), (False, True, True), strict=True):
         try:
             answers[f"+ {step}"] = _chained(result, models, eccentricity)
         except StcalError as error:
@@ -123,7 +122,7 @@ def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera:
 
 def residual_rms_px(models: Sequence[GroupModel], camera: Camera) -> float:
     """Returns the RMS of the residuals per coordinate."""
-    return float(np.sqrt(np.concatenate([model.residuals_px(camera).ravel() ** 2 for model in models]).mean()))
+    return rms(np.concatenate([model.residuals_px(camera) for model in models]))
 
 
 def _compared(

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief
+from stcal.geometry.arrays import Brief, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
@@ -57,11 +57,6 @@ class ComparedRow(Part):
     reason: str | None
 
 
-class SigmaRow(Part):
-    translation_um: float
-    rotation_mdeg: float
-
-
 class Comparison(Part):
     """Content that ``--compare paper`` adds to ``report.json``."""
 
@@ -73,7 +68,7 @@ class Comparison(Part):
         "Table 1); "
         "`residual_rms_px` per coordinate; `reason` where a row has no result, null otherwise"
     )
-    sigma: dict[ByFace, SigmaRow] = Field(
+    sigma: dict[ByFace, FaceOff] = Field(
         description="of the last row by face: `translation_um`, `rotation_mdeg`, lengths of σ over the three axes"
     )
 
@@ -110,7 +105,7 @@ class ImageResult(Brief):
     @property
     def rms_px(self) -> float:
         """RMS of the residuals per axis, px."""
-        return float(np.sqrt((self.residuals_px**2).mean()))
+        return rms(self.residuals_px)
 
 
 def _images(model: MetricModel, camera: Camera, scale: float) -> list[ImageResult]:

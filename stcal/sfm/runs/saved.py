@@ -54,6 +54,7 @@ from stcal.sfm.runs.transaction import RESULTS, MarkerFile, complete_interrupted
 
 AGAIN = "run it again"
 ReportPart = TypeVar("ReportPart", bound=Part)
+Value = TypeVar("Value")
 COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
 
 
@@ -87,19 +88,14 @@ class SavedRun(Brief):
     @property
     def target(self) -> CalibratedTarget:
         """The calibrated target with the covariances of ``faces.json``; poses of groups are not kept."""
-        faces = self.faces
-        labels = circle_labels(faces.circles)
-        covariance = dict(
-            zip(circle_labels(faces.circle_covariance_mm2), faces.circle_covariance_mm2.values(), strict=True)
-        )
-        joint = faces.circles_joint_covariance_mm2
+        faces, joint = self.faces, self.faces.circles_joint_covariance_mm2
         return CalibratedTarget(
             faces.reference_face,
             faces.poses(),
-            dict(zip(labels, faces.circles.values(), strict=True)),
+            _by_circle(faces.circles),
             {},
             dict(faces.target_from_face_covariance),
-            covariance,
+            _by_circle(faces.circle_covariance_mm2),
             {},
             None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
             None if joint is None else joint.matrix(),
@@ -119,18 +115,16 @@ class SavedRun(Brief):
 
     def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
         """Heights of the rims behind which the faces lie, by circle, and σ of all, mm, 0 if they are stated."""
-        heights = dict(zip(circle_labels(self.faces.rim_mm), self.faces.rim_mm.values(), strict=True))
-        return heights, self.report["summary"].get("rim_sigma_mm") or 0.0
+        return _by_circle(self.faces.rim_mm), self.report["summary"].get("rim_sigma_mm") or 0.0
+
+    def failed_checks(self) -> list[dict]:
+        """Returns the checks that failed, as ``report.json`` has them."""
+        return [check for check in self.report.get("checks", ()) if check["verdict"] == "failed"]
 
     def report_as(self, part: type[ReportPart]) -> ReportPart:
         """Returns the part of ``report.json`` that a command needs."""
-        try:
+        with as_written(self.folder / "report.json"):
             return checked(self.report, part)
-        except InputError as error:
-            path = self.folder / "report.json"
-            raise InputError(
-                "E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again"
-            ) from error
 
     def adjusted_camera(self, own: ReportCamera) -> Camera:
         """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
@@ -138,6 +132,11 @@ class SavedRun(Brief):
             return self.camera
         camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
         return Camera.of(camera, self.camera.colmap_model)
+
+
+def _by_circle(values: dict[str, Value]) -> dict[CircleLabel, Value]:
+    """Returns values of ``faces.json`` by the labels of the circles."""
+    return dict(zip(circle_labels(values), values.values(), strict=True))
 
 
 AnyRun = SavedRun | RunResult | str | Path
@@ -156,6 +155,14 @@ def folder_of(run: AnyRun) -> Path:
 def saved_run(run: AnyRun) -> SavedRun:
     """Returns the run as read back from its folder; errors as of :func:`load_run`."""
     return run if isinstance(run, SavedRun) else load_run(folder_of(run))
+
+
+def require_run(folder: Path) -> None:
+    """Refuses a folder that is not of a run."""
+    if not (folder / RUN_MARKER).is_file():
+        raise InputError(
+            "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
 
 
 @require_arguments
@@ -178,23 +185,13 @@ def load_run(folder: str | Path) -> SavedRun:
         Not a run's folder, an unfinished run, or a damaged file in the folder.
     """
     folder = Path(folder)
-    if not (folder / RUN_MARKER).is_file():
-        raise InputError(
-            "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
-        )
+    require_run(folder)
     complete_interrupted(folder)
     has_target = (folder / TARGET).is_file()
     target = load_body(folder / TARGET) if has_target else None
     without_board = target is not None and target.has_scale and not (folder / BOARD).exists()
-    needed = (
-        CAMERA,
-        TARGET,
-        *(() if without_board else (BOARD,)),
-        "labels.csv",
-        DATABASE,
-        "report.json",
-        "faces.json",
-    )
+    inputs = (CAMERA, TARGET) if without_board else (CAMERA, TARGET, BOARD)
+    needed = (*inputs, "labels.csv", DATABASE, "report.json", "faces.json")
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing == ["faces.json"]:
         raise InputError(
@@ -211,14 +208,14 @@ def load_run(folder: str | Path) -> SavedRun:
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
     board = scale_reference(None if without_board else load_run_board(folder / BOARD), target)
-    with _as_written(folder / RUN_MARKER):
+    with as_written(folder / RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
         options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
-    with _as_written(folder / "report.json"):
+    with as_written(folder / "report.json"):
         names = checked(report, ReportRead).names()
-    with _as_written(folder / "faces.json"):
+    with as_written(folder / "faces.json"):
         result = checked(faces, FacesFile)
-    with _as_written(folder / "labels.csv"):
+    with as_written(folder / "labels.csv"):
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
         board = with_edge_sigma(board, observations)
@@ -256,13 +253,13 @@ def _options(stored: dict) -> RunOptions:
 
 
 @contextmanager
-def _as_written(path: Path) -> Iterator[None]:
+def as_written(file: Path | str) -> Iterator[None]:
     """Raises InputError that names the file if it is not as a run of this version writes it."""
     try:
         yield
     except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({reason}); run it again") from error
+        raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
@@ -325,7 +322,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
     start = CalibratedTarget(
         run.faces.reference_face,
         run.faces.poses(),
-        dict(zip(circle_labels(run.faces.circles), run.faces.circles.values(), strict=True)),
+        _by_circle(run.faces.circles),
         {model.group: Rigid() for model in models},
     )
     prior = camera_prior(run.camera) if run.options.refine_camera else None
@@ -358,18 +355,11 @@ def verify(run: AnyRun) -> Verified:
     Raises InputError: not a run's folder, or one without hashes.
     """
     run = folder_of(run)
-    if not (run / RUN_MARKER).is_file():
-        raise InputError(
-            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
-        )
+    require_run(run)
     complete_interrupted(run)
-    content = read_json(run / RUN_MARKER, "run", "run it again")
-    try:
+    content = read_json(run / RUN_MARKER, "run", AGAIN)
+    with as_written(f"run {run / RUN_MARKER}"):
         marker = checked(content, MarkerFile)
-    except InputError as error:
-        raise InputError(
-            "E-RUN-DAMAGED", f"run {run / RUN_MARKER}: damaged, or of another version ({error}); run it again"
-        ) from error
     if marker.sha256 is None:
         raise InputError(
             "E-RUN-UNFINISHED",

@@ -227,13 +227,8 @@ def _left_out(error: StcalError) -> str:
 
 
 def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
-    """Refuses a group that cannot be solved: of one image, without a needed board, or without a face."""
+    """Refuses a group that cannot be solved: without a needed board, or without a face."""
     where = f"group {group[0].group}"
-    if len(group) < 2:
-        raise MappingError(
-            "E-GROUP-FEW-IMAGES",
-            f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places",
-        )
     if not board_alone and not any(image.face_ids() for image in group):
         raise MappingError(
             "E-GROUP-NO-FACE",
@@ -485,7 +480,20 @@ def solve_groups(
 ) -> tuple[list[GroupSolution], list[str]]:
     """Maps and refines group by group; returns the solutions, and the reasons why groups have none. If there is no
     solution, the error of the first group is raised."""
-    groups = _groups(observations, graph, camera, target, board, options, names)
+    groups = [
+        _Group(
+            images,
+            [observations[i].name for i in graph.skeleton[name]],
+            _pairs_within(name, observations, graph),
+            camera,
+            target,
+            board,
+            options.pairs,
+            options.eccentricity,
+        )
+        for name, images in by_group(observations).items()
+        if names is None or name in names
+    ]
     paths = [cache / f"group-{group.key()}.npz" for group in groups]
     found: list[GroupSolution | StcalError | None] = [kept(path, _stored) for path in paths]
     pending = [k for k, solution in enumerate(found) if solution is None]
@@ -519,34 +527,10 @@ def solve_groups(
     return solutions, [_left_out(error) for error in errors]
 
 
-def _groups(
-    observations: Sequence[ImageObservations],
-    graph: ImageGraph,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    names: Collection[str] | None,
-) -> list[_Group]:
-    """Returns the groups to solve, with the pairs of the graph that lie within them."""
-    groups = []
-    for name, images in by_group(observations).items():
-        if names is not None and name not in names:
-            continue
-        place = np.full(len(observations), -1)
-        members = [i for i, image in enumerate(observations) if image.group == name]
-        place[members] = np.arange(len(members))
-        matched = place[graph.pairs]
-        groups.append(
-            _Group(
-                images,
-                [observations[i].name for i in graph.skeleton[name]],
-                matched[(matched >= 0).all(1)],
-                camera,
-                target,
-                board,
-                options.pairs,
-                options.eccentricity,
-            )
-        )
-    return groups
+def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:
+    """Returns the pairs of the graph that lie within a group, (n, 2) indices in the group."""
+    members = [i for i, image in enumerate(observations) if image.group == group]
+    place = np.full(len(observations), -1)
+    place[members] = np.arange(len(members))
+    pairs = place[graph.pairs]
+    return pairs[(pairs >= 0).all(1)]

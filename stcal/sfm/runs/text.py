@@ -239,23 +239,20 @@ def _faces(result: RunResult) -> Iterator[str]:
         yield line
     absent = [f.id for f in result.target_design.faces if f.id not in target.target_from_face]
     notes = [(image.observations.name, note) for image in result.labelled for note in image.notes]
-    seen = {label.plane for image in result.labelled for label in image.observations.labels}
+    used = {name for solution in result.solutions for name in solution.model.images}
+    unseen = []
     for face in absent:
-        images = images_left_out(face, notes)
-        if images:
+        shown = [i.name for i in result.observations() if any(label.plane == face for label in i.labels)]
+        if images := images_left_out(face, notes):
             yield f"read and left out, of {len(images)} images: face {face}"
-        elif face in seen:
-            images = sum(any(x.plane == face for x in i.observations.labels) for i in result.labelled)
-            used = {name for solution in result.solutions for name in solution.model.images}
-            shown = [i.observations for i in result.labelled if any(x.plane == face for x in i.observations.labels)]
-            if images == 1:
-                what = "1 image; 2 needed, better 5"
-            elif not used.intersection(image.name for image in shown):
-                what = f"{images} images, which were left out"
-            else:
-                what = f"{images} images, but by too few points for its frame"
-            yield f"face {face} is not in the result: seen in {what}"
-    if unseen := [face for face in absent if face not in seen and not images_left_out(face, notes)]:
+        elif len(shown) == 1:
+            yield f"face {face} is not in the result: seen in 1 image; 2 needed, better 5"
+        elif shown:
+            why = "but by too few points for its frame" if used.intersection(shown) else "which were left out"
+            yield f"face {face} is not in the result: seen in {len(shown)} images, {why}"
+        else:
+            unseen.append(face)
+    if unseen:
         yield f"not seen in any image: face{'' if len(unseen) == 1 else 's'} {', '.join(unseen)}"
 
 

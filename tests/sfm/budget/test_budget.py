@@ -79,11 +79,13 @@ def test_sigma_that_checks_enlarged_are_larger_here_too(saved, plain):
         assert after.standard == pytest.approx(1.5 * before.standard, rel=0.02)
 
 
-def test_contributions_add_up_as_squares(plain):
+def test_contributions_add_up_as_squares(saved, plain):
     assert len(plain.rows) == 3 + 3 + 5
+    for face in BudgetFile.of(plain, saved, verify(saved.folder)).faces.values():
+        for written in (face.position_um, face.rotation_mdeg):
+            assert sum(written.share(key) for key in written.contributions) == pytest.approx(1)
     for row in plain.rows:
         assert min(row.contributions.values()) >= 0
-        assert sum(row.share(key) for key in row.contributions) == pytest.approx(1)
         assert np.hypot.reduce(list(row.contributions.values())) == pytest.approx(row.standard)
         assert row.expanded == 2 * row.standard
         # 95.45 % for one number, up to 99.3 % for three alike; of 100 000 draws.

@@ -33,7 +33,8 @@ def test_two_images_with_board_and_face_will_do(group):
 
 
 def test_what_is_missing_is_named(group):
-    refuses("E-GROUP-FEW-IMAGES", require_usable, group[:1])
+    with fails_with("E-GROUP-FEW-IMAGES … 1 usable image"):
+        usable_groups({group[0].group: group[:1]}, [])
     refuses("E-GROUP-NO-FACE … 5", require_usable, only(group, board=True))
     refuses("E-GROUP-NO-BOARD … 5", require_usable, only(group, board=False))
 
