@@ -322,6 +322,11 @@ def _has_circles(report: dict, face: str) -> bool:
     return any(row["label"].startswith(f"{face}:") for row in rows)
 
 
+def _some_unused(report: dict) -> bool:
+    """Whether photographs were left out, which may show what was seen in no other."""
+    return bool(report["left_out"]["images"] or _lost_groups(report))
+
+
 def _gaps(report: dict) -> list[str]:
     """Returns in words what is missing: faces that are not in the result, or in one image alone, and lost groups."""
     never, words = [], []
@@ -331,12 +336,13 @@ def _gaps(report: dict) -> list[str]:
             shown = "1 image" if len(images) == 1 else f"{len(images)} images"
             words.append(f"face {face} was read in {shown} and left out")
         elif _has_circles(report, face):
-            words.append(f"face {face} is not in it, though circles of it were seen: they do not hold its frame")
+            lost = f" without {join(_lost_groups(report))}" if _lost_groups(report) else ""
+            words.append(f"face {face} is not in it, though circles of it were seen: they do not hold its frame{lost}")
         else:
             never.append(face)
     if never:
         was = "was seen in no image" if len(never) == 1 else "were seen in no image"
-        if report["left_out"]["images"]:  # which may show them
+        if _some_unused(report):
             was = "is in no image that was used" if len(never) == 1 else "are in no image that was used"
         words.insert(0, f"{_faces(never)} of the design {was}")
     single = [name for name, face in report["faces"].items() if face["images"] == 1]
@@ -582,7 +588,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
         read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
         unseen = [face for face in missing if face not in read]
         if unseen:
-            seen = "in no image that was used" if report["left_out"]["images"] else "not seen in any image"
+            seen = "in no image that was used" if _some_unused(report) else "not seen in any image"
             body = "" if verdict == "part" else "; if they are in the images, check that target.toml is of this body"
             advice.append(f"Photograph {_faces(unseen)} together with one of the others: {seen}{body}.")
         if read:
