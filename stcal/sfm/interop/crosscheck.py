@@ -234,19 +234,11 @@ def _comparison(
         only_native=sorted(native_images - pycolmap_images),
         only_pycolmap=sorted(pycolmap_images - native_images),
     )
-    faces = run.faces.target_from_face_covariance
-    mapping = MappingCompared(
-        faces=_faces(external.target.target_from_face, of_pycolmap.target.target_from_face, faces),
-        circles_um=_circles(external.target.circles, of_pycolmap.target.circles),
-        circles_sigmas=_circle_sigmas(external.target.circles, of_pycolmap.target.circles, run),
-        cameras=_cameras(external, of_pycolmap, run),
-    )
-    result = ResultCompared(
-        faces=face_differences(again.target, run),
-        circles_um=_circles(again.target.circles, run.faces.circles),
-        circles_sigmas=_circle_sigmas(again.target.circles, run.faces.circles, run),
-    )
-    if not faces:
+    ours = of_pycolmap.target
+    between = _targets(external.target, ours.target_from_face, ours.circles, run)
+    mapping = MappingCompared(**dict(between), cameras=_cameras(external, of_pycolmap, run))
+    result = _targets(again.target, run.faces.poses(), run.faces.circles, run)
+    if not run.faces.target_from_face_covariance:
         tolerances = tolerances.without_sigma()
     return Crosscheck(
         native=native.version,
@@ -264,6 +256,21 @@ def _comparison(
         plain=FacesCompared(faces=face_differences(external.target, run)),
         notes=[*external.notes, *_camera_notes(mapping, result)],
         differences=_differences(images, mapping, result, tolerances),
+    )
+
+
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultCompared:
+    """Returns the differences of a target from other faces and circles, also in the run's σ."""
+    covariances = run.faces.circle_covariance_mm2
+    off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
+    return ResultCompared(
+        faces=_faces(target.target_from_face, faces, run.faces.target_from_face_covariance),
+        circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
+        circles_sigmas={
+            label: _sigmas(v, np.asarray(covariances[label]), FACE_FLOOR[3:])
+            for label, v in off.items()
+            if label in covariances
+        },
     )
 
 
@@ -297,19 +304,6 @@ def _off(pose: Rigid, other: Rigid) -> np.ndarray:
 def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float:
     """Returns √(dᵀC⁻¹d/k) of k differences. ``floor`` : (k,) σ of negligible differences, added to the covariance."""
     return float(np.sqrt(off @ np.linalg.solve(covariance + np.diag(floor**2), off) / len(off)))
-
-
-def _circle_sigmas(a: dict, b: dict, run: SavedRun) -> dict[str, float]:
-    covariances = run.faces.circle_covariance_mm2
-    return {
-        label: _sigmas(np.subtract(a[label], b[label]), np.asarray(covariances[label]), FACE_FLOOR[3:])
-        for label in a
-        if label in b and label in covariances
-    }
-
-
-def _circles(a: dict, b: dict) -> dict[str, float]:
-    return {label: MICRO * float(np.linalg.norm(np.subtract(a[label], b[label]))) for label in a if label in b}
 
 
 def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDifference]:

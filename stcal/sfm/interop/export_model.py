@@ -79,10 +79,7 @@ def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: R
         row = limits.get(image)
         if row is None or row.observations != len(view.labels) or not len(view.labels):
             expected = 0 if row is None else row.observations
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image} shows {len(view.labels)} points, {expected} by report.json; run it again",
-            )
+            raise _not_of_run(path, f"image {image} shows {len(view.labels)} points, {expected} by report.json")
         limit = (1 + ROUNDING) * max(row.max_px, 0.0) + ROUNDING_PX
         off_px = view.off_px(camera)
         farthest = int(np.argmax(off_px))
@@ -103,18 +100,17 @@ def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel
     camera_of_image = {camera.image: camera for camera in report.scene.cameras}
     missing = sorted(camera_of_image.keys() ^ views.keys())
     if missing:
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN", f"model {path}: image {missing[0]} is not in both model and report.json; run it again"
-        )
+        raise _not_of_run(path, f"image {missing[0]} is not in both model and report.json")
     for image, view in views.items():
         off = np.linalg.norm(view.camera_from_target.inverse().translation - camera_of_image[image].position_mm)
         axes_off = np.abs(view.camera_from_target.rotation - camera_of_image[image].axes).max()
         if not (off <= SAME_PLACE_MM and axes_off <= SAME_AXES):
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image}: its camera is {off:.3g} mm from where report.json has it (axes differ "
-                f"by {axes_off:.2g}), {SAME_PLACE_MM:g} mm allowed; run it again",
-            )
+            moved = f"its camera is {off:.3g} mm from where report.json has it (axes differ by {axes_off:.2g})"
+            raise _not_of_run(path, f"image {image}: {moved}, {SAME_PLACE_MM:g} mm allowed")
+
+
+def _not_of_run(path: Path, fault: str) -> InputError:
+    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
 
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "nvm", "bundler"]
@@ -246,17 +242,12 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     reconstruction = open_model(path)
     native = colmap_camera(run.camera)
     if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN", f"model {path}: its camera is not that of the run's cameras.txt; run it again"
-        )
+        raise _not_of_run(path, "its camera is not that of the run's cameras.txt")
     place = {image.name: i for i, image in enumerate(run.observations)}
     image_of = {}
     for image_id, image in reconstruction.images.items():
         if image.name not in place or not image.has_pose:
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image.name} is not as in the run's labels.csv; run it again",
-            )
+            raise _not_of_run(path, f"image {image.name} is not as in the run's labels.csv")
         i = place[image.name]
         image_of[image_id] = run.observations[i]
         require_keypoints(path, image, run.observations[i].labels, run.corrected_px[i])
@@ -266,10 +257,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
         names = {image_of[image_id].labels[k] for image_id, k in views}
         if len(names) != 1:
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: point {point_id} is of {len(names)} labels, 1 needed; run it again",
-            )
+            raise _not_of_run(path, f"point {point_id} is of {len(names)} labels, 1 needed")
         label = names.pop()
         groups = {image_of[image_id].group for image_id, _ in views}
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
