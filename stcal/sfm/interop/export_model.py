@@ -301,7 +301,6 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
     """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, principal point zero.
     MeshLab needs the spaces at the ends of the first lines. A space in a name is written as a quotation mark."""
     images = _images(reconstruction)
-    place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["NVM_V3 ", " ", f"{len(images)}  "]
     for image in images:
         pose = image.cam_from_world()
@@ -309,8 +308,7 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
         centre = image.projection_center().tolist()
         lines.append(f"{image.name.replace(' ', chr(34))} {_numbers(focal_px, w, x, y, z, *centre, 0, 0)}")
     lines += ["", str(len(points))]
-    for point, xy in zip(points, _ideal_px(reconstruction, points, run, focal_px), strict=True):
-        views = [(place[i], k, *at) for (i, k), at in zip(point.views, xy.tolist(), strict=True)]
+    for point, views in zip(points, _ideal_views(reconstruction, points, run, focal_px), strict=True):
         lines.append(_numbers(*point.xyz, *point.rgb, len(views), *(value for view in views for value in view)))
     return "\n".join([*lines, "", "0", ""])
 
@@ -320,17 +318,15 @@ def _bundler(
 ) -> tuple[str, str]:
     """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, view along −z, image centre zero."""
     images = _images(reconstruction)
-    place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]
     up_from_down = np.diag([1.0, -1.0, -1.0])
     for image in images:
         pose = rigid_from_colmap(image.cam_from_world())
         rows = [*(up_from_down @ pose.rotation), up_from_down @ pose.translation]
         lines += [_numbers(focal_px, 0, 0), *(_numbers(*row.tolist()) for row in rows)]
-    for point, xy in zip(points, _ideal_px(reconstruction, points, run, focal_px), strict=True):
-        views = [(place[i], k, x, -y) for (i, k), (x, y) in zip(point.views, xy.tolist(), strict=True)]
+    for point, views in zip(points, _ideal_views(reconstruction, points, run, focal_px), strict=True):
         lines += [_numbers(*point.xyz), _numbers(*point.rgb)]
-        lines.append(_numbers(len(views), *(value for view in views for value in view)))
+        lines.append(_numbers(len(views), *(value for i, k, x, y in views for value in (i, k, x, -y))))
     return "\n".join([*lines, ""]), "".join(f"{image.name}\n" for image in images)
 
 
@@ -338,14 +334,19 @@ def _images(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [reconstruction.image(image_id) for image_id in sorted(reconstruction.reg_image_ids())]
 
 
-def _ideal_px(
+def _ideal_views(
     reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
-) -> list[np.ndarray]:
-    """Returns the views of every point in the ideal camera, (n, 2) px, relative to its principal point, y down."""
+) -> list[list[tuple[int, int, float, float]]]:
+    """Returns the views of every point in the ideal camera: place of the image, keypoint, and x and y, px, relative to
+    the principal point, y down."""
+    place = {image.image_id: i for i, image in enumerate(_images(reconstruction))}
     xy_px = [[reconstruction.image(i).points2D[k].xy for i, k in point.views] for point in points]
     counts = np.cumsum([len(views) for views in xy_px])
     ideal = focal_px * run.camera.normalised_from_pixel(from_colmap_px(np.concatenate(xy_px)))
-    return np.split(ideal, counts[:-1])
+    return [
+        [(place[i], k, x, y) for (i, k), (x, y) in zip(point.views, xy.tolist(), strict=True)]
+        for point, xy in zip(points, np.split(ideal, counts[:-1]), strict=True)
+    ]
 
 
 def _numbers(*values: float) -> str:
