@@ -8,7 +8,7 @@ from typing import Self, TypeVar
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import freeze, frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, Similarity
@@ -71,9 +71,10 @@ class ImageObservations(Measured):
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
         for f in fields(self)[3:]:
-            shape, values = (len(self.labels), *ROW_SHAPES.get(f.name, ())), getattr(self, f.name)
-            values = np.zeros(shape) if values is None and f.default is None else values
-            object.__setattr__(self, f.name, frozen(values, shape, f.name))
+            shape = (len(self.labels), *ROW_SHAPES.get(f.name, ()))
+            if getattr(self, f.name) is None and f.default is None:
+                object.__setattr__(self, f.name, np.zeros(shape))
+            freeze(self, f.name, shape, f.name)
 
     def __len__(self) -> int:
         return len(self.labels)

@@ -215,8 +215,6 @@ def label_images(
 ) -> list[LabelledImage]:
     """Returns the labelled circles of all images, in the order of their groups."""
     circles = target.with_faces(printed=False)
-    if len(circles.faces) == len(target.faces):
-        return _label_circles(detection, target, board, options, cache, workers)
     if circles.faces or board is not None:
         labelled = _label_circles(detection, circles, board, options, cache, workers)
     else:

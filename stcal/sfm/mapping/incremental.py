@@ -2,7 +2,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,7 +97,7 @@ def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], know
 
 
 def rays_of(
-    images: Sequence[ImageObservations], poses: Mapping[str, Rigid], labels: Collection[Label]
+    images: Sequence[ImageObservations], poses: dict[str, Rigid], labels: Collection[Label]
 ) -> dict[Label, tuple[np.ndarray, np.ndarray]]:
     """Returns by label the rays on which placed images see it: projection centres, (k, 3), and directions, (k, 3)."""
     rays: dict[Label, list[tuple[np.ndarray, np.ndarray]]] = {}
@@ -107,7 +107,10 @@ def rays_of(
             if label in labels:
                 direction = pose.rotation.T @ np.append(image.centre[k], 1.0)
                 rays.setdefault(label, []).append((pose.inverse().translation, direction / np.linalg.norm(direction)))
-    return {label: tuple(map(np.array, zip(*seen, strict=True))) for label, seen in rays.items()}
+    return {
+        label: (np.array([centre for centre, _ in seen]), np.array([direction for _, direction in seen]))
+        for label, seen in rays.items()
+    }
 
 
 def widest_angle_rad(direction: np.ndarray) -> float:
