@@ -3,21 +3,58 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import freeze, frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.table import csv_text
 from stcal.labels import CircleLabel, Label, parse_labels
 
+ROW_SHAPES = {
+    "centre_px": (2,),
+    "centre": (2,),
+    "shape": (2, 2),
+    "covariance_px2": (2, 2),
+    "uneven_px": (2,),
+    "domes": (3,),
+}
+"""Shape of a circle's value in each field of measured circles that is not one number."""
+
+
+class Rows:
+    """Base of dataclasses whose fields are arrays with a row for each circle."""
+
+    __slots__ = ()
+
+    def select(self, keep: np.ndarray) -> Self:
+        """Returns the circles of the indices or mask ``keep``."""
+        return type(self)(*(getattr(self, f.name)[keep] for f in fields(self)))  # type: ignore[arg-type]
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Returns the circles of all parts, one part after the other."""
+        names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+class Measured:
+    """Base of measurements with a covariance each."""
+
+    __slots__ = ()
+    covariance_px2: np.ndarray  # (n, 2, 2)
+
+    def sigma_px(self) -> np.ndarray:
+        """Returns the standard deviation of each measurement per axis (RMS over both axes), (n,)."""
+        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImageObservations:
+class ImageObservations(Measured):
     """n labelled circles of one image."""
 
     name: str
@@ -33,23 +70,14 @@ class ImageObservations:
 
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
-        n = len(self.labels)
-        for field, shape in (("centre_px", (n, 2)), ("centre", (n, 2)), ("shape", (n, 2, 2))):
-            object.__setattr__(self, field, frozen(getattr(self, field), shape, field))
-        freeze(self, "covariance_px2", (n, 2, 2), "covariance_px2")
-        uneven = np.zeros((n, 2)) if self.uneven_px is None else self.uneven_px
-        object.__setattr__(self, "uneven_px", frozen(uneven, (n, 2), "uneven_px"))
-        blur = np.zeros(n) if self.blur_px is None else self.blur_px
-        object.__setattr__(self, "blur_px", frozen(blur, (n,), "blur_px"))
-        domes = np.zeros((n, 3)) if self.domes is None else self.domes
-        object.__setattr__(self, "domes", frozen(domes, (n, 3), "domes"))
+        for f in fields(self)[3:]:
+            shape = (len(self.labels), *ROW_SHAPES.get(f.name, ()))
+            if getattr(self, f.name) is None and f.default is None:
+                object.__setattr__(self, f.name, np.zeros(shape))
+            freeze(self, f.name, shape, f.name)
 
     def __len__(self) -> int:
         return len(self.labels)
-
-    def sigma_px(self) -> np.ndarray:
-        """Returns the standard deviation of each centre per axis (RMS over both axes), (n,)."""
-        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
 
     def face_ids(self) -> list[str]:
         """Returns the ids of the target's faces that the labels name, in order of appearance."""
@@ -84,7 +112,7 @@ def detections_csv(observations: list[ImageObservations]) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Centres:
+class Centres(Rows, Measured):
     """n measured ellipses."""
 
     centre_px: np.ndarray  # (n, 2) of the ideal ellipse, distorted into the original image (OpenCV pixel origin)
@@ -102,37 +130,32 @@ class Centres:
     ok: np.ndarray  # (n,) True if the ellipse is usable
 
     def __post_init__(self):
-        n = len(self.centre_px)
-        for name, shape in (
-            ("centre_px", (n, 2)),
-            ("centre", (n, 2)),
-            ("shape", (n, 2, 2)),
-            ("blur_px", (n,)),
-            ("covariance_px2", (n, 2, 2)),
-            ("contrast", (n,)),
-            ("noise", (n,)),
-            ("rim", (n,)),
-            ("uneven_px", (n, 2)),
-            ("domes", (n, 3)),
-        ):
-            freeze(self, name, shape, name)
-        freeze(self, "ok", (n,), "ok", dtype=bool)
+        for f in fields(self):
+            shape, dtype = (len(self.centre_px), *ROW_SHAPES.get(f.name, ())), bool if f.name == "ok" else float
+            freeze(self, f.name, shape, f.name, dtype)
 
     def __len__(self) -> int:
         return len(self.centre_px)
 
-    def select(self, keep: np.ndarray) -> "Centres":
-        """Returns the ellipses of the indices or mask ``keep``."""
-        return Centres(*(getattr(self, f.name)[keep] for f in fields(self)))
-
     @classmethod
-    def concatenate(cls, parts: list["Centres"]) -> "Centres":
-        """Returns the ellipses of all parts, one part after the other."""
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
-
-    def sigma_px(self) -> np.ndarray:
-        """Returns the standard deviation of each centre per axis (RMS over both axes), (n,)."""
-        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
+    def without_rims(
+        cls, centre_px: np.ndarray, centre: np.ndarray, shape: np.ndarray, covariance_px2: np.ndarray, contrast=None
+    ) -> "Centres":
+        """Returns centres of which no rim is measured, as those of corners; ``contrast`` is zero if None."""
+        n = len(centre_px)
+        return cls(
+            centre_px,
+            centre,
+            shape,
+            covariance_px2,
+            blur_px=np.zeros(n),
+            contrast=np.zeros(n) if contrast is None else contrast,
+            noise=np.zeros(n),
+            rim=np.ones(n),
+            uneven_px=np.zeros((n, 2)),
+            domes=np.zeros((n, 3)),
+            ok=np.ones(n, bool),
+        )
 
 
 _PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
@@ -151,7 +174,7 @@ class Outlier:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GroupModel:
+class GroupModel(Measured):
     """m images, p points and n observations of one group: the common base of models with and without a unit."""
 
     group: str
@@ -178,10 +201,6 @@ class GroupModel:
     def corrected_px(self) -> np.ndarray:
         """Returns the images of the circles' centres, (n, 2): measured ellipse centres minus eccentricity."""
         return self.measured_px - self.shift_px
-
-    def sigma_px(self) -> np.ndarray:
-        """Returns the standard deviation of each measurement per axis (RMS over both axes), (n,)."""
-        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
 
     def whiten(self, values_px: np.ndarray) -> np.ndarray:
         """Whitens values (n, 2) or (n, 2, k), px, by the covariances of their observations."""

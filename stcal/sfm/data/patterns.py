@@ -8,14 +8,16 @@ from typing import Literal
 import numpy as np
 
 from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity, TargetDesign
-from stcal.errors import DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import (
+    camera_from_plane,
     circle_image_offset,
     circle_images,
     fit_homography,
     homography_jacobian,
+    refine_planar_pose,
     shape_of_square,
 )
 from stcal.geometry.rigid import Rigid, skew
@@ -100,6 +102,14 @@ def ideal_border(camera: Camera) -> np.ndarray:
     return frozen(np.stack([ideal.min(0), ideal.max(0)]))
 
 
+def planar_pose(xy_mm: np.ndarray, xy: np.ndarray) -> Rigid | None:
+    """Returns camera_from_plane by points of a plane, (n, 2), and their ideal images; None if these determine none."""
+    try:
+        return refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
+    except (ConvergenceError, DegenerateError):
+        return None
+
+
 NEAREST_MM = 1e-6
 """Lower bound of the depth. Behind the camera the numbers only have to be finite."""
 
@@ -112,10 +122,6 @@ class CircleImages:
     depth: np.ndarray  # (h, n) of the circles' centres, mm; where it is not positive, nothing else has a meaning
     by_pose: np.ndarray  # (h, n, 2, 6) by the left perturbation of camera_from_target (rad, mm)
     by_circle: np.ndarray  # (h, n, 2, 3) by the circles' centres in the target frame, per mm, normals fixed
-
-    def of(self, rows) -> "CircleImages":
-        """Returns the images in the poses of the indices or mask ``rows``."""
-        return CircleImages(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
 def project_circles(

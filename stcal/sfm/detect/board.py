@@ -199,7 +199,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     placements = sorted((p for reading in readings for p in reading), key=lambda p: (p.unexplained, -len(p.inside)))
     if not placements:
         return None
-    return _reading(placements, candidates, board)
+    return _reading(placements, index, candidates, board)
 
 
 def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
@@ -268,7 +268,6 @@ class _Placement:
     unexplained: int  # number of dots outside of it, or expected and missing
     inside: np.ndarray  # (n,) those on it
     cells: np.ndarray  # (n, 2) their row and column
-    index: np.ndarray  # (n,) of the candidates
 
 
 def _place(
@@ -301,7 +300,7 @@ def _place(
         absent = board.flat(grid_cells[missing])
         expected = _inside_image(apply_homography(homography, absent), homography, absent, image_corners)
         unexplained = int(expected.sum() + outside_count)
-        placements.append(_Placement(unexplained, inside, column_row[:, ::-1], index))
+        placements.append(_Placement(unexplained, inside, column_row[:, ::-1]))
     return placements
 
 
@@ -333,12 +332,14 @@ def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
     return (distance > margin[:, None]).all(1)
 
 
-def _reading(placements: list[_Placement], candidates: Candidates, board: BoardDesign) -> BoardReading:
+def _reading(
+    placements: list[_Placement], index: np.ndarray, candidates: Candidates, board: BoardDesign
+) -> BoardReading:
     """Returns the dots that all likely placements number, their numberings, homographies and unlikely numberings."""
     most = placements[0].unexplained + MAX_UNEXPLAINED
     likely = [p for p in placements if p.unexplained <= most]
     common = np.logical_and.reduce([p.inside for p in likely])
-    index = placements[0].index[common]
+    index = index[common]
     numberings = np.stack([p.cells[common] for p in likely])
     places = [board.pitch_mm * board.flat(n[:, ::-1].astype(float)) for n in numberings]
     homographies = [fit_homography(xy_mm, candidates.xy[index]) for xy_mm in places]

@@ -5,12 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.robust import huber_weights, ratio_limit, robust_sigma
 from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.data.patterns import Pattern
+from stcal.sfm.data.patterns import Pattern, planar_pose
 
 MIN_PLANE = 5
 """Smallest number of circles of a plane for its pose. Four determine it, a fifth allows a check."""
@@ -117,16 +115,16 @@ def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_p
     for i, label in enumerate(image.labels):
         if image.blur_px[i] > 0:
             planes.setdefault(label.plane, []).append(i)
-    rows, inverse_depth, gradient = [], [], []
+    rows: list[int] = []
+    inverse_depth, gradient = [np.zeros(0)], [np.zeros((0, 2))]
     for plane, members in planes.items():
         if len(members) < MIN_PLANE or plane not in patterns:
             continue
         pattern = patterns[plane]
         place = {label: k for k, label in enumerate(pattern.labels)}
         xy_mm, xy = pattern.xy_mm[[place[image.labels[i]] for i in members]], image.centre[members]
-        try:
-            pose = refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
-        except (ConvergenceError, DegenerateError):
+        pose = planar_pose(xy_mm, xy)
+        if pose is None:
             continue
         normal = pose.rotation[:, 2] / (pose.rotation[:, 2] @ pose.translation)
         rows += members
@@ -134,12 +132,12 @@ def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_p
         gradient.append(np.tile(normal[:2] / focal_px, (len(xy), 1)))
     chosen = np.array(rows, int)
     blur2 = image.blur_px[chosen] ** 2
-    smaller = np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px if rows else np.zeros(0)
+    smaller = np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px
     wide2 = blur2 / smaller**2
     return _Views(
         chosen,
-        np.concatenate(inverse_depth) if rows else np.zeros(0),
-        np.concatenate(gradient) if rows else np.zeros((0, 2)),
+        np.concatenate(inverse_depth),
+        np.concatenate(gradient),
         blur2,
         RESPONSE + RESPONSE_OF_BLUR2 * np.minimum(wide2, 1.0),
         np.where(wide2 > FAR_BLUR**2, FAR_SIGMA, RESPONSE_SIGMA),

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -97,7 +98,8 @@ def detect_files(
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options, pictures)
-    jobs = [(file, camera, size_from, target, board, options, settings, detector, pictures) for file in files]
+    detect = partial(detector or detect_image, camera=camera, target=target, board=board, options=options)
+    jobs = [(file, camera, size_from, detect, settings, pictures) for file in files]
     outcomes: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
@@ -190,11 +192,8 @@ def _detect_file(
     file: ImageFile,
     camera: Camera,
     size_from: str,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: EllipseOptions,
+    detect: Callable[[np.ndarray], ImageDetection],
     settings: str,
-    detector: Detector | None,
     pictures: bool,
 ) -> tuple[str, bytes] | Skipped:
     """Detects circles in one file; returns the key of the result and its content for the cache."""
@@ -203,7 +202,7 @@ def _detect_file(
         return loaded
     data, image = loaded
     try:
-        detection = (detector or detect_image)(image, camera, target, board, options)
+        detection = detect(image)
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
@@ -345,12 +344,8 @@ def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
     try:
-        data = file.read()
-    except OSError:
-        return None
-    try:
-        image = decode(data, file.name, (camera.width, camera.height))
-    except InputError:
+        image = decode(file.read(), file.name, (camera.width, camera.height))
+    except (InputError, OSError):
         return None
     return measure_predicted(image, camera, predicted, options)
 

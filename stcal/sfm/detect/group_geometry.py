@@ -49,6 +49,18 @@ class Arrangement:
             foreign={i: self.foreign.get(i, ()) + views for i, views in gone.items()},
         )
 
+    def stacks(self) -> tuple[PoseStack, PoseStack]:
+        """Returns the poses of the images, and those of the planes."""
+        return PoseStack.of(*self.camera_from_group.values()), PoseStack.of(*self.group_from_plane.values())
+
+    def moved(self, cameras: PoseStack, planes: PoseStack) -> "Arrangement":
+        """Returns the arrangement with other poses, in the order of :meth:`stacks`."""
+        return replace(
+            self,
+            camera_from_group={i: cameras.rigid(a) for a, i in enumerate(self.camera_from_group)},
+            group_from_plane={p: planes.rigid(b) for b, p in enumerate(self.group_from_plane)},
+        )
+
     def explained(self) -> int:
         """Returns the number of circles of the readings that fit."""
         return sum(len(view.rows) for views in self.views.values() for view in views)
@@ -290,15 +302,7 @@ def _adjusted(arrangement: Arrangement, focal_px: float) -> Arrangement:
         focal_px * np.concatenate([v.xy for _, _, v in rows]),
         focal_px,
     )
-    poses, placed = bundle.adjusted(
-        PoseStack.of(*(arrangement.camera_from_group[i] for i in images)),
-        PoseStack.of(*(arrangement.group_from_plane[p] for p in planes)),
-    )
-    return replace(
-        arrangement,
-        camera_from_group={i: poses.rigid(a) for a, i in enumerate(images)},
-        group_from_plane={p: placed.rigid(b) for b, p in enumerate(planes)},
-    )
+    return arrangement.moved(*bundle.adjusted(*arrangement.stacks()))
 
 
 def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: float) -> Arrangement:
@@ -318,6 +322,74 @@ def _off_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) 
     """Returns the median distance of circles from their places in the arrangement, at the depth of these places."""
     xyz = camera_from_group @ (known[view.plane] @ view.xyz_mm())
     return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
+
+
+HUBER_PX = 1.5
+"""Residual beyond which an observation loses weight.
+
+Such residuals are deviations of printed planes, not of centres.
+"""
+BUNDLE_SETTLED = 1e-4
+"""Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
+BUNDLE_STEPS = 30
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneBundle:
+    """Points of planes: ``image``, ``plane`` (n,); ``xyz`` (n, 3) in the plane; ``seen`` (n, 2) measured, ideal px."""
+
+    image: np.ndarray
+    plane: np.ndarray
+    xyz: np.ndarray
+    seen: np.ndarray
+    focal_px: float
+
+    def select(self, keep: np.ndarray) -> "PlaneBundle":
+        """Returns the points of the mask ``keep``."""
+        return PlaneBundle(self.image[keep], self.plane[keep], self.xyz[keep], self.seen[keep], self.focal_px)
+
+    def adjusted(self, poses: PoseStack, planes: PoseStack) -> tuple[PoseStack, PoseStack]:
+        """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
+        fixed.
+
+        Without convergence the last state is returned, and the start where a point lies behind its camera: predictions
+        are verified anyway.
+        """
+        if not np.isfinite(self._off(planes, poses)).all():
+            return poses, planes
+        a = Adjustment()
+        placed, cameras = a.block("planes", planes, fixed=[0]), a.block("cameras", poses, eliminate=True)
+        on = [(placed, self.plane), (cameras, self.image)]
+        a.factor(self._off, on, derivatives=self._slopes, loss=Huber(HUBER_PX))
+        found = a.minimum(settled=BUNDLE_SETTLED, max_steps=BUNDLE_STEPS, damping=1e-3).state
+        return found["cameras"], found["planes"]
+
+    def _off(self, planes: PoseStack, poses: PoseStack) -> np.ndarray:
+        xyz = self.placed(planes, poses)[2]
+        if (xyz[:, 2] <= 0).any():
+            return np.full(self.seen.shape, np.inf)
+        return self.focal_px * xyz[:, :2] / xyz[:, 2:] - self.seen
+
+    def _slopes(self, planes: PoseStack, poses: PoseStack) -> tuple[np.ndarray, np.ndarray]:
+        turned, placed, xyz = self.placed(planes, poses)
+        by_point = self.by_point(xyz)
+        by_world = by_point @ poses.rotation[self.image]
+        by_plane = np.concatenate([-by_world @ skew(turned), by_world], axis=2)
+        return by_plane, np.concatenate([-by_point @ skew(placed), by_point], axis=2)
+
+    def by_point(self, xyz_camera: np.ndarray) -> np.ndarray:
+        """Returns the derivatives of images by points in the camera frame, (n, 2, 3), px/mm."""
+        by_point = np.zeros((len(xyz_camera), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1
+        by_point[:, :, 2] = -xyz_camera[:, :2] / xyz_camera[:, 2:]
+        by_point *= (self.focal_px / xyz_camera[:, 2])[:, None, None]
+        return by_point
+
+    def placed(self, planes: PoseStack, poses: PoseStack) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the points turned into the world, turned into the cameras, and in the cameras' frames, (n, 3)."""
+        turned = np.einsum("nij,nj->ni", planes.rotation[self.plane], self.xyz)
+        placed = np.einsum("nij,nj->ni", poses.rotation[self.image], turned + planes.translation[self.plane])
+        return turned, placed, placed + poses.translation[self.image]
 
 
 MIN_LIMIT_PX = 0.5
@@ -359,7 +431,7 @@ def outlying_circles(
     for k, reason in reasons.items():
         image, label = circles.rows[k]
         found.setdefault(image, {})[label] = reason
-    return circles.rearranged(arrangement), found
+    return arrangement.moved(circles.camera_from_group, circles.group_from_plane), found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -367,12 +439,8 @@ class _Circles:
     """n circles of a group, and its arrangement as stacks."""
 
     rows: list[tuple[int, Label]]  # image and label of each
-    image: np.ndarray  # (n,) place in the arrangement, as ``plane``
-    plane: np.ndarray
-    xyz_mm: np.ndarray  # (n, 3) in the plane
-    centre_px: np.ndarray  # (n, 2) images of the circles' centres, ideal, without eccentricity
+    bundle: PlaneBundle  # by places in the arrangement; the images of the circles' centres, without eccentricity
     sigma_px: np.ndarray
-    focal_px: float
     camera_from_group: PoseStack
     group_from_plane: PoseStack
 
@@ -400,87 +468,71 @@ class _Circles:
                     rows.append((i, label))
                     columns.append((a, planes.index(label.plane), *images[i].centre[k], sigma[k], *design[label]))
         table = np.array(columns, float).reshape(-1, 9)
-        circles = cls(
-            rows,
-            table[:, 0].astype(int),
-            table[:, 1].astype(int),
-            table[:, 5:8],
-            focal_px * table[:, 2:4],
-            table[:, 4],
-            focal_px,
-            PoseStack.of(*arrangement.camera_from_group.values()),
-            PoseStack.of(*arrangement.group_from_plane.values()),
-        )
-        return (
-            replace(circles, centre_px=circles.centre_px - circles._eccentricity_px(table[:, 8])) if rows else circles
-        )
-
-    def rearranged(self, arrangement: Arrangement) -> Arrangement:
-        """Returns the arrangement with these poses."""
-        cameras = {i: self.camera_from_group.rigid(a) for a, i in enumerate(arrangement.camera_from_group)}
-        planes = {p: self.group_from_plane.rigid(b) for b, p in enumerate(arrangement.group_from_plane)}
-        return replace(arrangement, camera_from_group=cameras, group_from_plane=planes)
+        image, plane = table[:, :2].astype(int).T
+        bundle = PlaneBundle(image, plane, table[:, 5:8], focal_px * table[:, 2:4], focal_px)
+        circles = cls(rows, bundle, table[:, 4], *arrangement.stacks())
+        if not rows:
+            return circles
+        seen = bundle.seen - circles._eccentricity_px(table[:, 8])
+        return replace(circles, bundle=replace(bundle, seen=seen))
 
     def adjusted(self, keep: np.ndarray) -> "_Circles":
         """Returns the circles with poses adjusted to those to ``keep`` on planes with enough circles for a pose."""
         use = keep & self.enough()
         if not use.any():
             return self
-        bundle = PlaneBundle(self.image[use], self.plane[use], self.xyz_mm[use], self.centre_px[use], self.focal_px)
-        cameras, planes = bundle.adjusted(self.camera_from_group, self.group_from_plane)
+        cameras, planes = self.bundle.select(use).adjusted(self.camera_from_group, self.group_from_plane)
         return replace(self, camera_from_group=cameras, group_from_plane=planes)
 
     def enough(self) -> np.ndarray:
         """Returns the mask of the circles on planes with enough circles."""
-        return np.bincount(self.plane, minlength=1)[self.plane] >= MIN_USUAL
+        return np.bincount(self.bundle.plane, minlength=1)[self.bundle.plane] >= MIN_USUAL
 
     def in_one_image(self) -> np.ndarray:
         """Returns the mask of the circles of faces that only one image shows."""
-        images = [len(np.unique(self.image[self.plane == p])) for p in range(len(self.group_from_plane))]
+        image, plane = self.bundle.image, self.bundle.plane
+        images = [len(np.unique(image[plane == p])) for p in range(len(self.group_from_plane))]
         return np.array(
-            [images[p] == 1 and row[1].plane != BOARD for p, row in zip(self.plane, self.rows, strict=True)]
+            [images[p] == 1 and label.plane != BOARD for p, (_, label) in zip(plane, self.rows, strict=True)]
         )
 
     def off_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns centres minus their places, (n, 2) px, and derivatives (n, 2, 2) by the place in the plane, px/mm."""
         rotation, xyz = self._placed()
-        ideal = xyz[:, :2] / xyz[:, 2:]
-        by_point = np.zeros((len(xyz), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1
-        by_point[:, :, 2] = -ideal
-        by_point *= (self.focal_px / xyz[:, 2])[:, None, None]
-        return self.centre_px - self.focal_px * ideal, by_point @ rotation[:, :, :2]
+        off_px = self.bundle.seen - self.bundle.focal_px * (xyz[:, :2] / xyz[:, 2:])
+        return off_px, self.bundle.by_point(xyz) @ rotation[:, :, :2]
 
     def _placed(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns rotations camera_from_plane (n, 3, 3), and circles in the camera frame (n, 3)."""
-        camera, plane = self.camera_from_group[self.image], self.group_from_plane[self.plane]
-        xyz = np.einsum("nij,nj->ni", plane.rotation, self.xyz_mm) + plane.translation
-        return camera.rotation @ plane.rotation, np.einsum("nij,nj->ni", camera.rotation, xyz) + camera.translation
+        camera, plane = self.camera_from_group[self.bundle.image], self.group_from_plane[self.bundle.plane]
+        xyz = self.bundle.placed(self.group_from_plane, self.camera_from_group)[2]
+        return camera.rotation @ plane.rotation, xyz
 
     def _eccentricity_px(self, radius_mm: np.ndarray) -> np.ndarray:
         rotation, xyz = self._placed()
         centre = circle_image_offset(xyz, rotation[:, :, 2], radius_mm)
-        return self.focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
+        return self.bundle.focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
 
 
 def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
     """Returns the worst outlying circle to ``keep`` of each plane and image, as it biases the others."""
+    image, plane = circles.bundle.image, circles.bundle.plane
     shift, by_place = circles.off_px()
     off_px, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * circles.sigma_px)
     alone, enough = circles.in_one_image(), circles.enough()
     usual = np.full(len(off_px), np.median(off_px[keep]))
-    for plane in np.unique(circles.plane[keep & enough]):
-        usual[circles.plane == plane] = np.median(off_px[keep & (circles.plane == plane)])
+    for p in np.unique(plane[keep & enough]):
+        usual[plane == p] = np.median(off_px[keep & (plane == p)])
     limit = np.where(alone & enough, limit, np.maximum(limit, BEYOND * usual))
     outlying = keep & (off_px > limit)
     moved_mm = np.linalg.solve(by_place, shift[..., None])[..., 0]
     reasons: dict[int, str] = {}
     for k in np.flatnonzero(outlying):
-        same = keep & (circles.image != circles.image[k]) & [label == circles.rows[k][1] for _, label in circles.rows]
+        same = keep & (image != image[k]) & [label == circles.rows[k][1] for _, label in circles.rows]
         apart_px = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
         outlying[k] = not (apart_px < ALIKE * off_px[k]).any()
-    for image, plane in {(circles.image[k], circles.plane[k]) for k in np.flatnonzero(outlying)}:
-        circles_of_face = np.flatnonzero(keep & (circles.image == image) & (circles.plane == plane))
+    for i, p in {(image[k], plane[k]) for k in np.flatnonzero(outlying)}:
+        circles_of_face = np.flatnonzero(keep & (image == i) & (plane == p))
         worst = circles_of_face[
             np.argmax(np.where(outlying[circles_of_face], off_px[circles_of_face] / limit[circles_of_face], 0))
         ]
@@ -491,62 +543,3 @@ def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
         else:
             reasons[int(worst)] = error
     return reasons
-
-
-HUBER_PX = 1.5
-"""Residual beyond which an observation loses weight.
-
-Such residuals are deviations of printed planes, not of centres.
-"""
-BUNDLE_SETTLED = 1e-4
-"""Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
-BUNDLE_STEPS = 30
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaneBundle:
-    """Points of planes: ``image``, ``plane`` (n,); ``xyz`` (n, 3) in the plane; ``seen`` (n, 2) measured, ideal px."""
-
-    image: np.ndarray
-    plane: np.ndarray
-    xyz: np.ndarray
-    seen: np.ndarray
-    focal_px: float
-
-    def adjusted(self, poses: PoseStack, planes: PoseStack) -> tuple[PoseStack, PoseStack]:
-        """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
-        fixed.
-
-        Without convergence the last state is returned, and the start where a point lies behind its camera: predictions
-        are verified anyway.
-        """
-        if not np.isfinite(self._off(planes, poses)).all():
-            return poses, planes
-        a = Adjustment()
-        placed, cameras = a.block("planes", planes, fixed=[0]), a.block("cameras", poses, eliminate=True)
-        on = [(placed, self.plane), (cameras, self.image)]
-        a.factor(self._off, on, derivatives=self._slopes, loss=Huber(HUBER_PX))
-        found = a.minimum(settled=BUNDLE_SETTLED, max_steps=BUNDLE_STEPS, damping=1e-3).state
-        return found["cameras"], found["planes"]
-
-    def _off(self, planes: PoseStack, poses: PoseStack) -> np.ndarray:
-        xyz = self._placed(planes, poses)[2]
-        if (xyz[:, 2] <= 0).any():
-            return np.full(self.seen.shape, np.inf)
-        return self.focal_px * xyz[:, :2] / xyz[:, 2:] - self.seen
-
-    def _slopes(self, planes: PoseStack, poses: PoseStack) -> tuple[np.ndarray, np.ndarray]:
-        turned, placed, xyz = self._placed(planes, poses)
-        by_point = np.zeros((len(xyz), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1
-        by_point[:, :, 2] = -xyz[:, :2] / xyz[:, 2:]
-        by_point *= (self.focal_px / xyz[:, 2])[:, None, None]
-        by_world = by_point @ poses.rotation[self.image]
-        by_plane = np.concatenate([-by_world @ skew(turned), by_world], axis=2)
-        return by_plane, np.concatenate([-by_point @ skew(placed), by_point], axis=2)
-
-    def _placed(self, planes: PoseStack, poses: PoseStack) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the points turned into the world, turned into the cameras, and in the cameras' frames, (n, 3)."""
-        turned = np.einsum("nij,nj->ni", planes.rotation[self.plane], self.xyz)
-        placed = np.einsum("nij,nj->ni", poses.rotation[self.image], turned + planes.translation[self.plane])
-        return turned, placed, placed + poses.translation[self.image]

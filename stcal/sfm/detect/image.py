@@ -162,12 +162,8 @@ def _outline_px(view: BoardView, board: CornerBoard) -> np.ndarray:
 
 def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> Centres:
     """Returns corners as centres of ellipses without extent."""
-    n = len(xy_px)
-    zero, one = np.zeros(n), np.ones(n)
-    flat, centre = np.zeros((n, 2, 2)), camera.normalised_from_pixel(xy_px)
-    return Centres(
-        xy_px, centre, flat, covariance_px2, zero, zero, zero, one, np.zeros((n, 2)), np.zeros((n, 3)), np.ones(n, bool)
-    )
+    flat, centre = np.zeros((len(xy_px), 2, 2)), camera.normalised_from_pixel(xy_px)
+    return Centres.without_rims(xy_px, centre, flat, covariance_px2)
 
 
 def _detect_circles(

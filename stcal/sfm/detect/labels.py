@@ -6,7 +6,7 @@ The numbering of a group's first image is a convention.
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,18 +83,8 @@ def labelled_image(
     name: str, group: str, labels: Sequence[Label], centres: Centres, notes: Sequence[str]
 ) -> LabelledImage:
     """Returns the image of labelled circles; identical notes are merged."""
-    observations = ImageObservations(
-        name=name,
-        group=group,
-        labels=tuple(labels),
-        centre_px=centres.centre_px,
-        centre=centres.centre,
-        shape=centres.shape,
-        covariance_px2=centres.covariance_px2,
-        uneven_px=centres.uneven_px,
-        blur_px=centres.blur_px,
-        domes=centres.domes,
-    )
+    measured = {f.name: getattr(centres, f.name) for f in fields(ImageObservations)[3:]}
+    observations = ImageObservations(name, group, tuple(labels), **measured)
     times = Counter(notes)
     return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))
 
@@ -225,8 +215,6 @@ def label_images(
 ) -> list[LabelledImage]:
     """Returns the labelled circles of all images, in the order of their groups."""
     circles = target.with_faces(printed=False)
-    if len(circles.faces) == len(target.faces):
-        return _label_circles(detection, target, board, options, cache, workers)
     if circles.faces or board is not None:
         labelled = _label_circles(detection, circles, board, options, cache, workers)
     else:
@@ -517,10 +505,7 @@ def is_board_alone(detection: DetectionResult) -> bool:
 
 def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
     """Returns the labelled dots of all images, in the order of their groups."""
-    groups: dict[str, list[DetectedImage]] = {}
-    for image in detection.images:
-        groups.setdefault(image.file.group, []).append(image)
-    found = [each for images in groups.values() for each in _label_group(images, target, board)]
+    found = [each for images, _ in _groups(detection) for each in _label_group(images, target, board)]
     return without_defocus(found, detection.camera, patterns_of(target, board))
 
 
@@ -530,12 +515,9 @@ def _label_group(images: list[DetectedImage], target: TargetDesign, board: Board
     found = []
     for i, image in enumerate(images):
         notes = [*image.detection.notes, *([reasons[i]] if i in reasons else [])]
-        view = chosen.get(i)
-        labels = () if view is None else view.labels
-        rows = np.zeros(0, int) if view is None else view.rows
-        found.append(
-            labelled_image(image.file.name, image.file.group, labels, image.detection.centres.select(rows), notes)
-        )
+        labels, rows = (chosen[i].labels, chosen[i].rows) if i in chosen else ((), np.zeros(0, int))
+        centres = image.detection.centres.select(rows)
+        found.append(labelled_image(image.file.name, image.file.group, labels, centres, notes))
     return found
 
 

@@ -184,20 +184,19 @@ def measure_predicted(
 
 def stands_out(found: Centres, polarity: Sequence[Polarity]) -> np.ndarray:
     """Returns the mask of the circles whose contrast has the right sign and is far above the noise."""
-    return _signed(found, polarity) >= _needed(found)
+    contrast, needed = _contrast(found, polarity)
+    return contrast >= needed
 
 
-def _signed(found: Centres, polarity: Sequence[Polarity]) -> np.ndarray:
-    return found.contrast * [1 if each == "bright" else -1 for each in polarity]
-
-
-def _needed(found: Centres) -> np.ndarray:
-    return MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
+def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the contrast of each circle, positive with the right sign, and the contrast needed."""
+    contrast = found.contrast * [1 if each == "bright" else -1 for each in polarity]
+    return contrast, MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
 
 
 def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
     """Returns by fit why it is not the expected circle, with the remedy; empty if it is."""
-    contrast, needed = _signed(found, polarity), _needed(found)
+    contrast, needed = _contrast(found, polarity)
     off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
     widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
     reasons = []

@@ -210,20 +210,8 @@ def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptio
 
 
 def _centres(ellipses: Ellipses, candidates: Candidates) -> Centres:
-    n = len(ellipses)
-    return Centres(
-        centre_px=ellipses.centre_px,
-        centre=candidates.xy,
-        shape=candidates.shape,
-        covariance_px2=np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (n, 2, 2)),
-        blur_px=np.zeros(n),
-        contrast=ellipses.contrast,
-        noise=np.zeros(n),
-        rim=np.ones(n),
-        uneven_px=np.zeros((n, 2)),
-        domes=np.zeros((n, 3)),
-        ok=np.ones(n, bool),
-    )
+    equal = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(ellipses), 2, 2))
+    return Centres.without_rims(ellipses.centre_px, candidates.xy, candidates.shape, equal, ellipses.contrast)
 
 
 class _Rules:

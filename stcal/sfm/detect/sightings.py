@@ -7,12 +7,11 @@ from functools import lru_cache
 import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign
-from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label
 from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
 from stcal.sfm.data.model import Centres
+from stcal.sfm.data.patterns import planar_pose
 
 SECOND_BOARD_SHARE = 0.8
 """Smallest number of dots of a second board, as a share of the dots of the first."""
@@ -164,18 +163,11 @@ def _view(
     xy = detection.centres.centre[rows]
     if len(rows) < MIN_POSE_CIRCLES:
         return None
-    pose = _pose(xy_mm, xy)
+    pose = planar_pose(xy_mm, xy)
     if pose is None:
         return None
     area = float(np.abs(np.linalg.det(detection.centres.shape[rows])).sum())
     return PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
-
-
-def _pose(xy_mm: np.ndarray, xy: np.ndarray) -> Rigid | None:
-    try:
-        return refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
-    except (ConvergenceError, DegenerateError):
-        return None
 
 
 def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:

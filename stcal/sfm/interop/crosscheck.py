@@ -234,19 +234,11 @@ def _comparison(
         only_native=sorted(native_images - pycolmap_images),
         only_pycolmap=sorted(pycolmap_images - native_images),
     )
-    faces = run.faces.target_from_face_covariance
-    mapping = MappingCompared(
-        faces=_faces(external.target.target_from_face, of_pycolmap.target.target_from_face, faces),
-        circles_um=_circles(external.target.circles, of_pycolmap.target.circles),
-        circles_sigmas=_circle_sigmas(external.target.circles, of_pycolmap.target.circles, run),
-        cameras=_cameras(external, of_pycolmap, run),
-    )
-    result = ResultCompared(
-        faces=face_differences(again.target, run),
-        circles_um=_circles(again.target.circles, run.faces.circles),
-        circles_sigmas=_circle_sigmas(again.target.circles, run.faces.circles, run),
-    )
-    if not faces:
+    ours = of_pycolmap.target
+    between = _targets(external.target, ours.target_from_face, ours.circles, run)
+    mapping = MappingCompared(**dict(between), cameras=_cameras(external, of_pycolmap, run))
+    result = _targets(again.target, run.faces.poses(), run.faces.circles, run)
+    if not run.faces.target_from_face_covariance:
         tolerances = tolerances.without_sigma()
     return Crosscheck(
         native=native.version,
@@ -264,6 +256,21 @@ def _comparison(
         plain=FacesCompared(faces=face_differences(external.target, run)),
         notes=[*external.notes, *_camera_notes(mapping, result)],
         differences=_differences(images, mapping, result, tolerances),
+    )
+
+
+def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultCompared:
+    """Returns the differences of a target from other faces and circles, also in the run's σ."""
+    covariances = run.faces.circle_covariance_mm2
+    off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
+    return ResultCompared(
+        faces=_faces(target.target_from_face, faces, run.faces.target_from_face_covariance),
+        circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
+        circles_sigmas={
+            label: _sigmas(v, np.asarray(covariances[label]), FACE_FLOOR[3:])
+            for label, v in off.items()
+            if label in covariances
+        },
     )
 
 
@@ -299,63 +306,39 @@ def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float
     return float(np.sqrt(off @ np.linalg.solve(covariance + np.diag(floor**2), off) / len(off)))
 
 
-def _circle_sigmas(a: dict, b: dict, run: SavedRun) -> dict[str, float]:
-    covariances = run.faces.circle_covariance_mm2
-    return {
-        label: _sigmas(np.subtract(a[label], b[label]), np.asarray(covariances[label]), FACE_FLOOR[3:])
-        for label in a
-        if label in b and label in covariances
-    }
-
-
-def _circles(a: dict, b: dict) -> dict[str, float]:
-    return {label: MICRO * float(np.linalg.norm(np.subtract(a[label], b[label]))) for label in a if label in b}
-
-
 def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDifference]:
-    """Returns the differences of camera positions and attitudes relative to the target."""
-    sigmas = _camera_sigmas(a, b, run)
-    poses = [
-        {n: p for m in calibration.models for n, p in zip(m.images, m.camera_from_model, strict=True)}
-        for calibration in (a, b)
-    ]
-    rows = []
-    for name in sorted(poses[0].keys() & poses[1].keys()):
-        target_from_a, target_from_b = poses[0][name].inverse(), poses[1][name].inverse()
-        turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
-        rows.append(
-            CameraDifference(
-                image=name,
-                position_um=MICRO * float(np.linalg.norm(target_from_a.translation - target_from_b.translation)),
-                rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
-                sigmas=sigmas[name],
-            )
-        )
-    return rows
-
-
-def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, float]:
-    """Differences of the cameras in their σ, relative to the circles of their group, the covariances' datum."""
+    """Returns the differences of camera positions and attitudes relative to the target; those in σ are relative to the
+    circles of their group, the covariances' datum."""
     factors = run.sigma_factors()
     model_of_group = {model.group: model for model in b.models}
-    sigmas = {}
+    rows = []
     for theirs in a.models:
         model = model_of_group.get(theirs.group)
         if model is None:
             continue
         index_of_label = {label: i for i, label in enumerate(theirs.labels)}
         pairs = [(index_of_label[label], i) for i, label in enumerate(model.labels) if label in index_of_label]
-        rows = np.array(pairs, int).reshape(-1, 2).T
-        alignment = align_similarity(model.xyz_model[rows[1]], theirs.xyz_model[rows[0]])
+        common = np.array(pairs, int).reshape(-1, 2).T
+        alignment = align_similarity(model.xyz_model[common[1]], theirs.xyz_model[common[0]])
         network = free_network(with_sigma(model, factors), run.camera)
         covariance = dict(zip(model.images, network.pose_covariance(), strict=True))
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
         for name, pose in zip(theirs.images, theirs.camera_from_model, strict=True):
-            if name in poses:
-                turned = pose.rotation @ alignment.rigid.rotation.T
-                moved = Rigid(turned, alignment.scale * pose.translation - turned @ alignment.rigid.translation)
-                sigmas[name] = _sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6))
-    return sigmas
+            if name not in poses:
+                continue
+            turned = pose.rotation @ alignment.rigid.rotation.T
+            moved = Rigid(turned, alignment.scale * pose.translation - turned @ alignment.rigid.translation)
+            target_from_a, target_from_b = pose.inverse(), poses[name].inverse()
+            turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
+            rows.append(
+                CameraDifference(
+                    image=name,
+                    position_um=MICRO * float(np.linalg.norm(target_from_a.translation - target_from_b.translation)),
+                    rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
+                    sigmas=_sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6)),
+                )
+            )
+    return sorted(rows, key=lambda row: row.image)
 
 
 def _camera_notes(mapping: MappingCompared, result: ResultCompared) -> list[str]:

@@ -115,23 +115,21 @@ def _told(blob: object) -> str:
 
 def require_of_run(database: Path, copy: sqlite3.Connection, run: SavedRun) -> None:
     """Checks that a whole database holds the run's camera, images, centres, and the matches of their labels."""
-    _require_camera(database, copy, run)
     ids = image_ids(run.observations)
-    _require_keypoints(database, copy, run, ids)
-    _require_matches(database, copy, run, ids)
+    for faults in (_other_camera(copy, run), _other_keypoints(copy, run, ids), _other_matches(copy, run, ids)):
+        for fault in faults:
+            raise InputError("E-RUN-DATABASE", f"{database}: {fault}; run again")
 
 
-def _require_camera(database: Path, copy: sqlite3.Connection, run: SavedRun) -> None:
+def _other_camera(copy: sqlite3.Connection, run: SavedRun) -> Iterator[str]:
     camera = colmap_camera(run.camera)
     wanted = (camera.model.value, camera.width, camera.height, np.asarray(camera.params, float).tobytes())
     if copy.execute("SELECT model, width, height, params FROM cameras").fetchall() != [wanted]:
-        raise InputError(
-            "E-RUN-DATABASE", f"{database}: its camera is not that of {run.folder / 'cameras.txt'}; run again"
-        )
+        yield f"its camera is not that of {run.folder / 'cameras.txt'}"
 
 
-def _require_keypoints(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
-    """Checks that the keypoints of each image are the labelled centres of the image of that name."""
+def _other_keypoints(copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> Iterator[str]:
+    """Yields the images whose keypoints are not the labelled centres of the image of that name."""
     names = dict(copy.execute("SELECT name, image_id FROM images"))
     keypoints = {image: content for image, *content in copy.execute("SELECT image_id, cols, data FROM keypoints")}
     labels = f"not those of {run.folder / 'labels.csv'}"
@@ -139,28 +137,22 @@ def _require_keypoints(database: Path, copy: sqlite3.Connection, run: SavedRun, 
         cols, data = keypoints.get(ids[image.name], (2, b""))
         xy = from_colmap_px(np.frombuffer(data or b"", np.float32).reshape(-1, cols or 2)[:, :2])
         if names.get(image.name) != ids[image.name] or len(xy) != len(expected):
-            raise InputError("E-RUN-DATABASE", f"{database}: its keypoints of {image.name} are {labels}; run again")
+            yield f"its keypoints of {image.name} are {labels}"
         off_px = np.abs(xy - expected).max(initial=0)
         if not off_px <= KEYPOINT_TOLERANCE_PX:
-            raise InputError(
-                "E-RUN-DATABASE",
-                f"{database}: its keypoints of {image.name} are {labels} (up to {off_px:.3g} px off, "
-                f"{KEYPOINT_TOLERANCE_PX:g} allowed); run again",
-            )
+            off = f"up to {off_px:.3g} px off, {KEYPOINT_TOLERANCE_PX:g} allowed"
+            yield f"its keypoints of {image.name} are {labels} ({off})"
     if len(names) > len(ids):
         unknown = next(name for name in names if name not in ids)
-        raise InputError("E-RUN-DATABASE", f"{database}: its images, with {unknown}, are {labels}; run again")
+        yield f"its images, with {unknown}, are {labels}"
 
 
-def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
-    """Checks that each pair matches circles of the same label, and that a small set has every pair."""
+def _other_matches(copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> Iterator[str]:
+    """Yields the pairs that do not match circles of the same label, and tables of a small set that lack a pair."""
     images = {ids[image.name]: image for image in run.observations}
     all_pairs = kind_of_graph(len(run.observations)) == "all"
-    wanted = (
-        {(i + 1, j + 1) for i, j in image_graph(run.observations, run.board_design, "all").pairs.tolist()}
-        if all_pairs
-        else set()
-    )
+    graph = image_graph(run.observations, run.board_design, "all") if all_pairs else None
+    wanted = set() if graph is None else {(i + 1, j + 1) for i, j in graph.pairs.tolist()}
     for table in PAIRED:
         pairs = set()
         for first, second, matches in _matches(copy, table):
@@ -169,10 +161,10 @@ def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, id
             if not np.array_equal(matches, match_labels(a, b)):
                 wrong = [f"{a.labels[i]} with {b.labels[j]}" for i, j in matches.tolist() if a.labels[i] != b.labels[j]]
                 fault = f"match {wrong[0]}" if wrong else "do not match all that have the same label"
-                raise InputError("E-RUN-DATABASE", f"{database}: {table}: {a.name} and {b.name} {fault}; run again")
+                yield f"{table}: {a.name} and {b.name} {fault}"
         if all_pairs and pairs != wanted:
-            count = f"{len(pairs)} pairs of images, the {len(wanted)} of {run.folder / 'labels.csv'} needed"
-            raise InputError("E-RUN-DATABASE", f"{database}: {table}: {count}; run again")
+            needed = f"the {len(wanted)} of {run.folder / 'labels.csv'} needed"
+            yield f"{table}: {len(pairs)} pairs of images, {needed}"
 
 
 HEADER = b"SQLite format 3\0"
@@ -346,63 +338,64 @@ def _differences(name: str, found: SchemaTable | None, wanted: SchemaTable | Non
 
 def _require_expressible(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
     """Raises InputError for the first content of the database that has no place in the schema."""
-    _require_known(database, copy, wanted, "camera", "cameras", "model", "camera_models")
-    _require_known(database, copy, wanted, "pair", "two_view_geometries", "config", "pair_configurations")
-    _require_known(database, copy, wanted, "image", "descriptors", "type", "descriptor_types")
-    if wanted.tables.get("pose_priors") != SOURCE.tables["pose_priors"]:
-        priors = _count(copy, "SELECT 1 FROM pose_priors")
-        if priors:
-            raise _no_place(database, wanted, f"{priors} pose priors; they are of another kind there", "4.0")
-    if "camera1" not in wanted.tables["two_view_geometries"].column_names():
-        pairs = _count(copy, "SELECT 1 FROM two_view_geometries WHERE camera1 NOT NULL OR camera2 NOT NULL")
-        if pairs:
-            raise _no_place(database, wanted, f"{pairs} pairs of images with cameras of their own", "4.2")
+    for what, since in _inexpressible(copy, wanted):
+        remedy = f"give --schema {since} or later" if since else "no version known here has it"
+        raise InputError("E-SCHEMA-NO-PLACE", f"{database}: {what}: schema {wanted.name} has no place for it; {remedy}")
+
+
+def _inexpressible(copy: sqlite3.Connection, wanted: Schema) -> Iterator[tuple[str, str | None]]:
+    """Yields content that has no place in the schema, and the first later schema with a place for it."""
+    yield from _unknown(copy, wanted, "camera", "cameras", "model", "camera_models")
+    yield from _unknown(copy, wanted, "pair", "two_view_geometries", "config", "pair_configurations")
+    yield from _unknown(copy, wanted, "image", "descriptors", "type", "descriptor_types")
+    priors = _count(copy, "SELECT 1 FROM pose_priors")
+    if priors and wanted.tables.get("pose_priors") != SOURCE.tables["pose_priors"]:
+        yield f"{priors} pose priors; they are of another kind there", "4.0"
+    pairs = _count(copy, "SELECT 1 FROM two_view_geometries WHERE camera1 NOT NULL OR camera2 NOT NULL")
+    if pairs and "camera1" not in wanted.tables["two_view_geometries"].column_names():
+        yield f"{pairs} pairs of images with cameras of their own", "4.2"
     if "rigs" not in wanted.tables:
-        _require_no_rigs(database, copy, wanted)
+        for fault in _own_rigs(copy):
+            yield fault, "3.12"
 
 
-def _require_known(database, copy, wanted: Schema, what: str, table: str, column: str, enumeration: str) -> None:
-    """Checks that every number in ``column`` has a meaning in the schema."""
+def _unknown(
+    copy: sqlite3.Connection, wanted: Schema, what: str, table: str, column: str, enumeration: str
+) -> Iterator[tuple[str, str | None]]:
+    """Yields the numbers in ``column`` that have no meaning in the schema."""
     key = SOURCE.tables[table].columns[0].name
     meanings = getattr(wanted, enumeration)
     for first, number in copy.execute(f"SELECT min({key}), {column} FROM {table} GROUP BY {column}"):
         if number not in meanings:
-            having = [name for name, schema_with in SCHEMAS.items() if number in getattr(schema_with, enumeration)]
+            having = (name for name, schema_with in SCHEMAS.items() if number in getattr(schema_with, enumeration))
             name = getattr(SOURCE, enumeration).get(number, "unknown")
-            raise _no_place(database, wanted, f"{what} {first} with {column} {number} ({name})", *having[:1])
+            yield f"{what} {first} with {column} {number} ({name})", next(having, None)
 
 
-def _require_no_rigs(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
-    """Checks that every rig is one camera and every frame one image, as versions after 3.11 make of older databases."""
-    extra_sensors = _count(copy, "SELECT 1 FROM rig_sensors")
-    if extra_sensors:
-        raise _no_place(database, wanted, f"a rig of more than one sensor ({extra_sensors} beside the first)", "3.12")
-    foreign_rigs = _count(
+def _own_rigs(copy: sqlite3.Connection) -> Iterator[str]:
+    """Yields what shows that not every rig is one camera and every frame one image, as versions after 3.11 make of
+    older databases."""
+    if sensors := _count(copy, "SELECT 1 FROM rig_sensors"):
+        yield f"a rig of more than one sensor ({sensors} beside the first)"
+    if rigs := _count(
         copy,
         "SELECT 1 FROM rigs WHERE ref_sensor_type <> :camera OR rig_id <> ref_sensor_id"
         " OR ref_sensor_id NOT IN (SELECT camera_id FROM cameras)",
-    )
-    if foreign_rigs:
-        raise _no_place(database, wanted, f"{foreign_rigs} rigs that are not each one camera of the same id", "3.12")
-    foreign_frames = _count(
+    ):
+        yield f"{rigs} rigs that are not each one camera of the same id"
+    if frames := _count(
         copy,
         "SELECT frame_id FROM frames LEFT JOIN frame_data USING (frame_id) LEFT JOIN images ON image_id = data_id"
         " GROUP BY frame_id HAVING count(*) <> 1 OR sensor_type IS NOT :camera OR frame_id IS NOT image_id"
         " OR sensor_id IS NOT camera_id OR rig_id IS NOT camera_id"
         " UNION ALL SELECT image_id FROM images WHERE image_id NOT IN (SELECT frame_id FROM frames)",
-    )
-    if foreign_frames:
-        raise _no_place(database, wanted, f"{foreign_frames} frames that are not each one image of the same id", "3.12")
+    ):
+        yield f"{frames} frames that are not each one image of the same id"
 
 
 def _count(connection: sqlite3.Connection, select: str) -> int:
     (number,) = connection.execute(f"SELECT count(*) FROM ({select})", {"camera": CAMERA_SENSOR}).fetchone()
     return number
-
-
-def _no_place(database: Path, wanted: Schema, what: str, since: str | None = None) -> InputError:
-    remedy = f"give --schema {since} or later" if since else "no version known here has it"
-    return InputError("E-SCHEMA-NO-PLACE", f"{database}: {what}: schema {wanted.name} has no place for it; {remedy}")
 
 
 def _shared_columns(table: SchemaTable) -> str:

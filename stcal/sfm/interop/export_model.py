@@ -79,10 +79,7 @@ def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: R
         row = limits.get(image)
         if row is None or row.observations != len(view.labels) or not len(view.labels):
             expected = 0 if row is None else row.observations
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image} shows {len(view.labels)} points, {expected} by report.json; run it again",
-            )
+            raise _not_of_run(path, f"image {image} shows {len(view.labels)} points, {expected} by report.json")
         limit = (1 + ROUNDING) * max(row.max_px, 0.0) + ROUNDING_PX
         off_px = view.off_px(camera)
         farthest = int(np.argmax(off_px))
@@ -103,18 +100,17 @@ def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel
     camera_of_image = {camera.image: camera for camera in report.scene.cameras}
     missing = sorted(camera_of_image.keys() ^ views.keys())
     if missing:
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN", f"model {path}: image {missing[0]} is not in both model and report.json; run it again"
-        )
+        raise _not_of_run(path, f"image {missing[0]} is not in both model and report.json")
     for image, view in views.items():
         off = np.linalg.norm(view.camera_from_target.inverse().translation - camera_of_image[image].position_mm)
         axes_off = np.abs(view.camera_from_target.rotation - camera_of_image[image].axes).max()
         if not (off <= SAME_PLACE_MM and axes_off <= SAME_AXES):
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image}: its camera is {off:.3g} mm from where report.json has it (axes differ "
-                f"by {axes_off:.2g}), {SAME_PLACE_MM:g} mm allowed; run it again",
-            )
+            moved = f"its camera is {off:.3g} mm from where report.json has it (axes differ by {axes_off:.2g})"
+            raise _not_of_run(path, f"image {image}: {moved}, {SAME_PLACE_MM:g} mm allowed")
+
+
+def _not_of_run(path: Path, fault: str) -> InputError:
+    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
 
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "nvm", "bundler"]
@@ -246,17 +242,12 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     reconstruction = open_model(path)
     native = colmap_camera(run.camera)
     if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN", f"model {path}: its camera is not that of the run's cameras.txt; run it again"
-        )
+        raise _not_of_run(path, "its camera is not that of the run's cameras.txt")
     place = {image.name: i for i, image in enumerate(run.observations)}
     image_of = {}
     for image_id, image in reconstruction.images.items():
         if image.name not in place or not image.has_pose:
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image.name} is not as in the run's labels.csv; run it again",
-            )
+            raise _not_of_run(path, f"image {image.name} is not as in the run's labels.csv")
         i = place[image.name]
         image_of[image_id] = run.observations[i]
         require_keypoints(path, image, run.observations[i].labels, run.corrected_px[i])
@@ -266,10 +257,7 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
         names = {image_of[image_id].labels[k] for image_id, k in views}
         if len(names) != 1:
-            raise InputError(
-                "E-MODEL-NOT-OF-RUN",
-                f"model {path}: point {point_id} is of {len(names)} labels, 1 needed; run it again",
-            )
+            raise _not_of_run(path, f"point {point_id} is of {len(names)} labels, 1 needed")
         label = names.pop()
         groups = {image_of[image_id].group for image_id, _ in views}
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
@@ -313,7 +301,6 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
     """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, principal point zero.
     MeshLab needs the spaces at the ends of the first lines. A space in a name is written as a quotation mark."""
     images = _images(reconstruction)
-    place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["NVM_V3 ", " ", f"{len(images)}  "]
     for image in images:
         pose = image.cam_from_world()
@@ -321,8 +308,7 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
         centre = image.projection_center().tolist()
         lines.append(f"{image.name.replace(' ', chr(34))} {_numbers(focal_px, w, x, y, z, *centre, 0, 0)}")
     lines += ["", str(len(points))]
-    for point, xy in zip(points, _ideal_px(reconstruction, points, run, focal_px), strict=True):
-        views = [(place[i], k, *at) for (i, k), at in zip(point.views, xy.tolist(), strict=True)]
+    for point, views in zip(points, _ideal_views(reconstruction, points, run, focal_px), strict=True):
         lines.append(_numbers(*point.xyz, *point.rgb, len(views), *(value for view in views for value in view)))
     return "\n".join([*lines, "", "0", ""])
 
@@ -332,17 +318,15 @@ def _bundler(
 ) -> tuple[str, str]:
     """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, view along −z, image centre zero."""
     images = _images(reconstruction)
-    place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]
     up_from_down = np.diag([1.0, -1.0, -1.0])
     for image in images:
         pose = rigid_from_colmap(image.cam_from_world())
         rows = [*(up_from_down @ pose.rotation), up_from_down @ pose.translation]
         lines += [_numbers(focal_px, 0, 0), *(_numbers(*row.tolist()) for row in rows)]
-    for point, xy in zip(points, _ideal_px(reconstruction, points, run, focal_px), strict=True):
-        views = [(place[i], k, x, -y) for (i, k), (x, y) in zip(point.views, xy.tolist(), strict=True)]
+    for point, views in zip(points, _ideal_views(reconstruction, points, run, focal_px), strict=True):
         lines += [_numbers(*point.xyz), _numbers(*point.rgb)]
-        lines.append(_numbers(len(views), *(value for view in views for value in view)))
+        lines.append(_numbers(len(views), *(value for i, k, x, y in views for value in (i, k, x, -y))))
     return "\n".join([*lines, ""]), "".join(f"{image.name}\n" for image in images)
 
 
@@ -350,14 +334,19 @@ def _images(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return [reconstruction.image(image_id) for image_id in sorted(reconstruction.reg_image_ids())]
 
 
-def _ideal_px(
+def _ideal_views(
     reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
-) -> list[np.ndarray]:
-    """Returns the views of every point in the ideal camera, (n, 2) px, relative to its principal point, y down."""
+) -> list[list[tuple[int, int, float, float]]]:
+    """Returns the views of every point in the ideal camera: place of the image, keypoint, and x and y, px, relative to
+    the principal point, y down."""
+    place = {image.image_id: i for i, image in enumerate(_images(reconstruction))}
     xy_px = [[reconstruction.image(i).points2D[k].xy for i, k in point.views] for point in points]
     counts = np.cumsum([len(views) for views in xy_px])
     ideal = focal_px * run.camera.normalised_from_pixel(from_colmap_px(np.concatenate(xy_px)))
-    return np.split(ideal, counts[:-1])
+    return [
+        [(place[i], k, x, y) for (i, k), (x, y) in zip(point.views, xy.tolist(), strict=True)]
+        for point, xy in zip(points, np.split(ideal, counts[:-1]), strict=True)
+    ]
 
 
 def _numbers(*values: float) -> str:

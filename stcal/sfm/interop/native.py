@@ -193,18 +193,12 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
                 f"model {source.path}: its camera is up to {_camera_change_px(source.camera, run):.2g} px off the "
                 "run's at the keypoints; the model's is used"
             )
-        if source.unlabelled:
-            notes.append(
-                f"model {source.path}: points left out, since their keypoints name no one circle: {source.unlabelled}"
-            )
-        if source.split:
-            notes.append(
-                f"model {source.path}: circles that are several points each, longest tracks taken: {source.split}"
-            )
-        if source.absent:
-            notes.append(
-                f"model {source.path}: points that keypoints name, but the model does not have: {source.absent}"
-            )
+        counts = {
+            "points left out, since their keypoints name no one circle": source.unlabelled,
+            "circles that are several points each, longest tracks taken": source.split,
+            "points that keypoints name, but the model does not have": source.absent,
+        }
+        notes += [f"model {source.path}: {what}: {count}" for what, count in counts.items() if count]
         for model in source.groups:
             if model.group in models:
                 notes.append(f"group {model.group}: in several models; the one with the most images was taken")

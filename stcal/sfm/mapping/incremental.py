@@ -1,7 +1,8 @@
 """Incremental mapping with pycolmap, seeded with the initial pair, and resection of images that it left out."""
 
 import shutil
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,21 +86,36 @@ def _resect(
 
 def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], known) -> dict[Label, np.ndarray]:
     """Returns the places of circles that are not ``known``, by label: least squares of distances from the rays."""
-    rays: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for image in images:
-        pose = poses[image.name]
-        for k, label in enumerate(image.labels):
-            if label not in known:
-                direction = pose.rotation.T @ np.append(image.centre[k], 1.0)
-                rays.setdefault(label, []).append((pose.inverse().translation, direction / np.linalg.norm(direction)))
+    unknown = {label for image in images for label in image.labels} - known
     places = {}
-    for label, rays_of_label in rays.items():
-        centre, direction = (np.array(values) for values in zip(*rays_of_label, strict=True))
-        if np.arccos(np.clip(direction @ direction.T, -1, 1)).max() < MIN_RAY_ANGLE_RAD:
+    for label, (centre, direction) in rays_of(images, poses, unknown).items():
+        if widest_angle_rad(direction) < MIN_RAY_ANGLE_RAD:
             continue
         across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
         places[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
     return places
+
+
+def rays_of(
+    images: Sequence[ImageObservations], poses: dict[str, Rigid], labels: Collection[Label]
+) -> dict[Label, tuple[np.ndarray, np.ndarray]]:
+    """Returns by label the rays on which placed images see it: projection centres, (k, 3), and directions, (k, 3)."""
+    rays: dict[Label, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for image in images:
+        pose = poses[image.name]
+        for k, label in enumerate(image.labels):
+            if label in labels:
+                direction = pose.rotation.T @ np.append(image.centre[k], 1.0)
+                rays.setdefault(label, []).append((pose.inverse().translation, direction / np.linalg.norm(direction)))
+    return {
+        label: (np.array([centre for centre, _ in seen]), np.array([direction for _, direction in seen]))
+        for label, seen in rays.items()
+    }
+
+
+def widest_angle_rad(direction: np.ndarray) -> float:
+    """Returns the largest angle between unit directions (n, 3)."""
+    return float(np.arccos(np.clip(direction @ direction.T, -1, 1)).max())
 
 
 SEED = 1
@@ -189,10 +205,7 @@ def left_out(
 
 
 def _require_agreement(model: WorldModel, group: list[ImageObservations]) -> None:
-    count: dict[str, int] = {}
-    for image in group:
-        for label in image.labels:
-            count[label] = count.get(label, 0) + 1
+    count = Counter(label for image in group for label in image.labels)
     wanted = sum(n >= 2 for n in count.values())
     if len(model.labels) < MIN_AGREEMENT * wanted:
         raise MappingError(
@@ -258,20 +271,15 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(start.rotation), start.translation)
     first, second = ids[pair.first], ids[pair.second]
     mapper.register_initial_image_pair(mapper_options, first, second, pose)
-    for image_id in (first, second):
-        mapper.triangulate_image(triangulation, image_id)
-    mapper.adjust_global_bundle(mapper_options, options.get_global_bundle_adjustment())
-    mapper.filter_points(mapper_options)
-    while True:
+    registered = [first, second]
+    while registered:
+        for image_id in registered:
+            mapper.triangulate_image(triangulation, image_id)
+        mapper.adjust_global_bundle(mapper_options, options.get_global_bundle_adjustment())
+        mapper.filter_points(mapper_options)
         nearest = mapper.find_next_images(mapper_options, False)
-        for image_id in nearest:
-            if mapper.register_next_image(mapper_options, image_id):
-                mapper.triangulate_image(triangulation, image_id)
-                mapper.adjust_global_bundle(mapper_options, options.get_global_bundle_adjustment())
-                mapper.filter_points(mapper_options)
-                break
-        else:
-            break
+        added = next((i for i in nearest if mapper.register_next_image(mapper_options, i)), None)
+        registered = [] if added is None else [added]
     mapper.end_reconstruction(False)
     return reconstruction if reconstruction.num_reg_images() >= 2 and reconstruction.num_points3D() >= 4 else None
 
@@ -285,12 +293,11 @@ def labelled_model(
         image for image in group if ids[image.name] in colmap_images and colmap_images[ids[image.name]].has_pose
     ]
     poses = [rigid_from_colmap(colmap_images[ids[image.name]].cam_from_world()) for image in registered]
-    votes_of_label: dict[Label, dict[int, int]] = {}
+    votes_of_label: dict[Label, Counter[int]] = {}
     for image in registered:
         for k, point in enumerate(colmap_images[ids[image.name]].points2D):
             if point.has_point3D():
-                votes = votes_of_label.setdefault(image.labels[k], {})
-                votes[point.point3D_id] = votes.get(point.point3D_id, 0) + 1
+                votes_of_label.setdefault(image.labels[k], Counter())[point.point3D_id] += 1
     xyz = {
         label: reconstruction.point3D(max(votes, key=votes.__getitem__)).xyz for label, votes in votes_of_label.items()
     }

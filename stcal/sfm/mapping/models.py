@@ -4,6 +4,7 @@ import math
 import os
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -403,10 +404,9 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
                 rows.append((i, k, point.point3D_id))
     if not rows:
         return None, 0
-    votes_of_label: dict[Label, dict[int, int]] = {}
+    votes_of_label: dict[Label, Counter[int]] = {}
     for _, _, point_id in rows:
-        votes = votes_of_label.setdefault(point_label[point_id][1], {})
-        votes[point_id] = votes.get(point_id, 0) + 1
+        votes_of_label.setdefault(point_label[point_id][1], Counter())[point_id] += 1
     chosen = {label: max(sorted(votes), key=votes.__getitem__) for label, votes in votes_of_label.items()}
     labels = sorted(chosen)
     index = {chosen[label]: i for i, label in enumerate(labels)}

@@ -11,13 +11,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from stcal.design import BoardDesign
-from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError
+from stcal.errors import DegenerateError, InputError, MappingError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Rigid, best_rotations
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.patterns import planar_pose
 from stcal.sfm.mapping.database import match_labels
 
 RANSAC_PX = 1.0
@@ -180,9 +181,8 @@ def share_board_alone(a: ImageObservations, b: ImageObservations) -> bool:
 
 def _pose_by_board(xy_a: np.ndarray, xy_b: np.ndarray, xy_mm: np.ndarray) -> Rigid | None:
     """Returns b_from_a with unit translation, from the poses of the board in both images."""
-    try:
-        a, b = (refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy) for xy in (xy_a, xy_b))
-    except (ConvergenceError, DegenerateError):
+    a, b = planar_pose(xy_mm, xy_a), planar_pose(xy_mm, xy_b)
+    if a is None or b is None:
         return None
     b_from_a = b @ a.inverse()
     length = float(np.linalg.norm(b_from_a.translation))

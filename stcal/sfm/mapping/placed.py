@@ -23,7 +23,14 @@ from stcal.sfm.mapping.body import (
     settled_body,
     wrong_sizes,
 )
-from stcal.sfm.mapping.incremental import MAX_REPROJECTION_PX, MIN_RAY_ANGLE_RAD, assemble, complete
+from stcal.sfm.mapping.incremental import (
+    MAX_REPROJECTION_PX,
+    MIN_RAY_ANGLE_RAD,
+    assemble,
+    complete,
+    rays_of,
+    widest_angle_rad,
+)
 from stcal.sfm.mapping.pairs import PairScore
 
 BY_FACES = "faces of known shape, placed together"
@@ -175,22 +182,11 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
         for face in body.faces
         for label, xyz in zip(face.labels(), body.body_from_face[face.id] @ face.places_mm(face.ids), strict=True)
     }
-    rays: dict[Label, list[np.ndarray]] = {}
-    for image in placed:
-        back = body.camera_from_body[image.name].rotation.T
-        for k, label in enumerate(image.labels):
-            if label in designed:
-                ray = back @ np.append(image.centre[k], 1.0)
-                rays.setdefault(label, []).append(ray / np.linalg.norm(ray))
-    xyz = {label: designed[label] for label, seen in rays.items() if _widest(np.array(seen)) > MIN_RAY_ANGLE_RAD}
+    rays = rays_of(placed, body.camera_from_body, designed)
+    xyz = {label: designed[label] for label, (_, ray) in rays.items() if widest_angle_rad(ray) > MIN_RAY_ANGLE_RAD}
     poses = [body.camera_from_body[image.name] for image in placed]
     model = assemble(WorldModel, group[0].group, placed, poses, xyz)
     return complete(model, list(group), camera, MAX_REPROJECTION_PX)
-
-
-def _widest(rays: np.ndarray) -> float:
-    """Returns the largest angle between unit rays (n, 3)."""
-    return float(np.arccos(np.clip(rays @ rays.T, -1, 1)).max())
 
 
 def pair_of_model(model: WorldModel) -> PairScore:

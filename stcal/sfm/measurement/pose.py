@@ -300,25 +300,17 @@ def _answer(
     options: PoseOptions,
 ) -> TargetPose:
     """Decides between the two minima, or the two sides of a valley, and returns the pose."""
-    redundancy = 2 * len(names) - 6
-    common = {
-        "faces": tuple(dict.fromkeys(name.face for name in names)),
-        "labels": tuple(names),
-        "outliers": outliers,
-        "redundancy": redundancy,
-    }
-    delta, second = _second_solution(problem, found, redundancy)
-    alone = second is None and len(common["faces"]) == 1
-    first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
-    common["needed_chi2"] = options.needed(first.chi2 / redundancy)
-    if min(delta, first.other_side) > common["needed_chi2"]:
-        return first.pose("certain", min(delta, first.other_side), common)
+    excess, second = _second_solution(problem, found, 2 * len(names) - 6)
+    alone = second is None and len({name.face for name in names}) == 1
+    first = _solution(problem, found.rows([0]), names, outliers, second, plane if alone else None, options)
+    first = replace(first, delta_chi2=min(excess, first.delta_chi2))
+    if first.delta_chi2 > first.needed_chi2:
+        return first
     if second is None:
-        return first.pose("ambiguous", first.other_side, common)
-    other_solution = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
-    return first.pose(
-        "ambiguous", min(delta, first.other_side), common, other_solution.pose("ambiguous", -delta, common)
-    )
+        return replace(first, status="ambiguous")
+    other = _solution(problem, found.rows([1]), names, outliers, found.poses[[0]], None, options)
+    other = replace(other, status="ambiguous", delta_chi2=-excess, needed_chi2=first.needed_chi2)
+    return replace(first, status="ambiguous", second=other)
 
 
 def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tuple[float, PoseStack | None]:
@@ -337,30 +329,17 @@ def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tu
     return float(weighed.chi2[1] - weighed.chi2[0]), weighed.poses[[1]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solution:
-    """One minimum, weighed by the whole covariance of its centres; fields are as in :class:`TargetPose`."""
-
-    camera_from_target: Rigid
-    covariance: np.ndarray
-    parts: dict[str, np.ndarray]
-    by_circles: np.ndarray
-    by_intrinsics: np.ndarray
-    residuals_px: np.ndarray
-    weights: np.ndarray
-    chi2: float
-    other_side: float  # excess in χ² of the other side of a wide valley, infinite if the minimum is no valley
-
-    def pose(self, status: Status, delta_chi2: float, seen: dict, second: TargetPose | None = None) -> TargetPose:
-        """Returns the pose with the decision. ``seen`` : the fields that do not depend on the minimum."""
-        fields = {name: getattr(self, name) for name in _Solution.__slots__ if name != "other_side"}
-        return TargetPose(**fields, **seen, status=status, delta_chi2=delta_chi2, second=second)
-
-
 def _solution(
-    problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
-) -> _Solution:
-    """Returns a minimum weighed by the whole covariance of its centres in two steps: the first errs by second order."""
+    problem: PoseProblem,
+    minimum: Minima,
+    names: list[CircleLabel],
+    outliers: tuple[Outlier, ...],
+    second: PoseStack | None,
+    plane: Rigid | None,
+    options: PoseOptions,
+) -> TargetPose:
+    """Returns a minimum weighed by the whole covariance of its centres in two steps: the first errs by second order.
+    Its ``delta_chi2`` is that of the other side of a wide valley, infinite if the minimum is no valley."""
     weights = weights_of(minimum.length[0])
     noise = problem.noise / weights[:, None, None]
     residual, image = problem.seen(minimum.poses)
@@ -377,23 +356,30 @@ def _solution(
         "intrinsics": by_intrinsics @ problem.prior @ by_intrinsics.T,
     }
     gaussian = parts["image"] + parts["target"] + parts["intrinsics"]
-    chi2 = float(last.chi2[0])
+    chi2, redundancy = float(last.chi2[0]), 2 * len(names) - 6
+    needed = options.needed(chi2 / redundancy)
     # The samples cover a valley from side to side, so that no margin for wrong σ is needed here.
-    plausible = options.needed(chi2 / (2 * len(weights) - 6)) / options.sigma_margin**2
+    plausible = needed / options.sigma_margin**2
     covariance, other_side = covariance_of_likelihood(
         problem, last.poses, full[0], chi2, gaussian, second, plane, plausible
     )
     parts["curvature"] = covariance - gaussian
-    return _Solution(
+    return TargetPose(
         camera_from_target=last.poses.rigid(0),
         covariance=(covariance + covariance.T) / 2,
         parts=parts,
         by_circles=by_circles,
         by_intrinsics=by_intrinsics,
+        status="certain",
+        faces=tuple(dict.fromkeys(name.face for name in names)),
+        labels=tuple(names),
         residuals_px=problem.in_px(last.residual[0]),
         weights=weights,
+        outliers=outliers,
         chi2=chi2,
-        other_side=other_side,
+        redundancy=redundancy,
+        delta_chi2=other_side,
+        needed_chi2=needed,
     )
 
 

@@ -1,6 +1,7 @@
 """Result file, table and report of measured poses."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -335,19 +336,15 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
     statuses = {image.pose.status for image in result.images}
     colours = legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {})
     summary_lines = summary(result)
-    heads = [
-        "<image",
-        "<faces",
-        "circles",
-        "<status",
-        "x mm",
-        "y mm",
-        "z mm",
-        *["x", "y", "z"] * 2,
-        "RMS px",
-        "χ² / dof",
-    ]
-    over = [("", 4), ("origin of the target", 3), ("σ µm", 3), ("σ mdeg, about", 3), ("residuals", 2 + verdicts)]
+    columns = {
+        "": ["<image", "<faces", "circles", "<status"],
+        "origin of the target": ["x mm", "y mm", "z mm"],
+        "σ µm": ["x", "y", "z"],
+        "σ mdeg, about": ["x", "y", "z"],
+        "residuals": ["RMS px", "χ² / dof", *["<fit"] * verdicts],
+    }
+    heads = [head for heads in columns.values() for head in heads]
+    over = [(name, len(heads)) for name, heads in columns.items()]
     rows = [_row(image, verdicts) for image in result.images]
     outliers = [
         [image.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
@@ -355,6 +352,10 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
         for o in image.pose.outliers
     ]
     contradicting: Block = ShownTable(["<image", "<circle", "residual px", "limit px"], outliers)
+    views = [
+        plot(partial(_view, result, at, 0, j, times), f"path of the target {seen}", seen.capitalize(), "")
+        for j, seen in ((1, "as the camera sees it"), (2, "from above, the camera below"))
+    ]
     if len(outliers) > 20:
         contradicting = fold("Circles left out", contradicting)
     return Document(
@@ -369,20 +370,7 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
                     f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
                     "Lines join the images of a folder by name",
                     colours,
-                    plots(
-                        plot(
-                            lambda: _view(result, at, 0, 1, times),
-                            "path of the target as the camera sees it",
-                            "As the camera sees it",
-                            "",
-                        ),
-                        plot(
-                            lambda: _view(result, at, 0, 2, times),
-                            "path of the target from above, the camera below",
-                            "From above, the camera below",
-                            "",
-                        ),
-                    ),
+                    plots(*views),
                 ],
             ),
             Section(
@@ -396,7 +384,7 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
                     ),
                 ],
             ),
-            Section("Poses", [ShownTable(heads + ["<fit"] * verdicts, rows, over)]),
+            Section("Poses", [ShownTable(heads, rows, over)]),
             Section(
                 "Left out",
                 [

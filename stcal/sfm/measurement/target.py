@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stcal.boards.target import load_body
-from stcal.design import TargetDesign
+from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.plane import fit_plane
@@ -72,6 +72,12 @@ class TargetCircles(Brief):
             planes[face_id] = Rigid(turn, self.xyz[rows].mean(0))
         object.__setattr__(self, "normal", frozen(normal))
         object.__setattr__(self, "target_from_plane", planes)
+
+    def of_face(self, face: FaceDesign) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the circles of a face: centres in the target frame, (k, 3), and in that of its design, (k, 3)."""
+        own = [i for i, label in enumerate(face.labels()) if label in self.place]
+        xyz = self.xyz[[self.place[face.labels()[i]] for i in own]]
+        return xyz, np.column_stack([face.xy_mm[own], np.zeros(len(own))])
 
     @classmethod
     def of(cls, target: CalibratedTarget, design: TargetDesign, sigma_factor: float = 1.0) -> "TargetCircles":
@@ -168,11 +174,9 @@ def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> 
                 "give the target.toml of that run",
             )
     for face in design.faces:
-        own = [i for i, label in enumerate(face.labels()) if label in target.place]
-        if len(own) < 3:
+        xyz, flat = target.of_face(face)
+        if len(xyz) < 3:
             continue
-        flat = np.column_stack([face.xy_mm[own], np.zeros(len(own))])
-        xyz = target.xyz[[target.place[face.labels()[i]] for i in own]]
         rms_mm = float(np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean()))
         if rms_mm > SAME_DESIGN_MM:
             raise InputError(

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import BoardDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -107,7 +107,8 @@ class Tracker:
         self.camera: Camera | None = None
         self.notes: tuple[str, ...] = ()
         self.searched = False
-        self._planes = _target_from_face(target, self.design)
+        planes = [face for face in self.design.faces if face.id in target.target_from_plane]
+        self._planes = {face.id: align_rigid(*target.of_face(face)) for face in planes}
         self._patterns = patterns_of(self.design, None)
         self.recent: tuple[Rigid, ...] = ()
         self._threads = ThreadpoolController()  # looked up once: it takes 2 ms
@@ -222,14 +223,3 @@ class Tracker:
     def _pose(self, seen: ImageObservations, camera: Camera) -> TargetPose | StcalError:
         sharp = correct_defocus([seen], camera, self._patterns)[0][0]
         return measured_pose(sharp, camera, self.target, self.pose_options, self.prior)
-
-
-def _target_from_face(target: TargetCircles, design: TargetDesign) -> dict[str, Rigid]:
-    """Returns target_from_face of each design, by a fit to the calibrated circles."""
-    poses = {}
-    for face in design.faces:
-        if face.id in target.target_from_plane:
-            calibrated = [i for i, label in enumerate(face.labels()) if label in target.place]
-            flat = np.column_stack([face.xy_mm[calibrated], np.zeros(len(calibrated))])
-            poses[face.id] = align_rigid(target.xyz[[target.place[face.labels()[i]] for i in calibrated]], flat)
-    return poses

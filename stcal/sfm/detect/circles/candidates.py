@@ -1,7 +1,7 @@
 """Candidates: blobs whose outline is an ellipse, over a pyramid of scales, and the test that one is a circle."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from stcal.geometry.arrays import frozen, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
 from stcal.io.images import percentiles, shrunk
+from stcal.sfm.data.model import Rows
 
 WINDOWS_PX = (41, 193)
 """Sides of the windows whose mean is the threshold, on every level of the pyramid."""
@@ -69,7 +70,7 @@ class EllipseOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ellipses:
+class Ellipses(Rows):
     """n candidates."""
 
     centre_px: np.ndarray  # (n, 2)
@@ -85,18 +86,9 @@ class Ellipses:
     def __len__(self) -> int:
         return len(self.centre_px)
 
-    @classmethod
-    def concatenate(cls, parts: list["Ellipses"]) -> "Ellipses":
-        """Returns the ellipses of all parts, one part after the other."""
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
-
     def radius_px(self) -> np.ndarray:
         """Returns the radius of the circle of the same area, (n,)."""
         return np.sqrt(np.abs(np.linalg.det(self.shape_px)))
-
-    def select(self, keep: np.ndarray) -> "Ellipses":
-        """Returns the ellipses of the indices or mask ``keep``."""
-        return Ellipses(self.centre_px[keep], self.shape_px[keep], self.contrast[keep])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,12 +1,12 @@
 """Centres to the sub-pixel from blurred ellipses, and their σ from pixel errors."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
-from stcal.sfm.data.model import Centres
+from stcal.sfm.data.model import Centres, Rows
 from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.fits import BAND_PX, CUSP, Fits, boxes, intruders, local_ideal_maps
 
@@ -150,7 +150,7 @@ def measure_centres(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rims:
+class _Rims(Rows):
     """n fitted ellipses, ideal px, covariances for independent pixels; contrast and rim are zero if the fit failed."""
 
     centre: np.ndarray
@@ -163,12 +163,6 @@ class _Rims:
     rim: np.ndarray
     uneven: np.ndarray
     domes: np.ndarray
-
-    @classmethod
-    def joined(cls, parts: list["_Rims"], order: np.ndarray) -> "_Rims":
-        """Returns the concatenated parts with row k at place ``order[k]``."""
-        place = np.argsort(order)
-        return cls(*(np.concatenate([getattr(part, f.name) for part in parts])[place] for f in fields(cls)))
 
 
 def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> _Rims:
@@ -184,7 +178,7 @@ def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: E
         _rims(Fits(image, ellipses.select(own), half[own], to_ideal[own], [masks[i] for i in own]))
         for own in np.split(order, ends)
     ]
-    return _Rims.joined(parts, order)
+    return _Rims.concatenate(parts).select(np.argsort(order))
 
 
 def _rims(fits: Fits) -> _Rims:
