@@ -1,7 +1,6 @@
 """Text, page and result file of an identified robot, and the table of mastering offsets for its controller."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +18,7 @@ from stcal.report.text import NONE, number
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.prior import DIMENSIONS, Placed, dh_values
-from stcal.robot.identification.result import OUTLIER_WEIGHT, Identified
+from stcal.robot.identification.result import OUTLIER_WEIGHT, Gain, Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot
 
@@ -59,13 +58,6 @@ class FixedDimension(Part):
     joint: int
     dimension: str
     reason: str | None
-
-
-class ModelsCompared(Part):
-    rigid_mm: float
-    elastic_mm: float
-    gain_mm: float
-    sigma_mm: float
 
 
 class ElasticJoint(Part):
@@ -140,7 +132,7 @@ class IdentifiedFile(ResultFile):
         "that of most rows; one without a name where there is no column"
     )
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
-    models: ModelsCompared | None = Field(
+    models: Gain | None = Field(
         description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
         "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
@@ -228,7 +220,7 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
         "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)[1],
         "stations": {name: pose.inverse().matrix() for name, pose in result.state.stations.items()},
         "model": result.model,
-        "models": None if result.gain is None else asdict(result.gain),
+        "models": result.gain,
         "elasticity": _elasticity(result),
         "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
         "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
