@@ -24,13 +24,13 @@ from stcal.robot.axes.checks import (
 )
 from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
+from stcal.robot.identification.prior import dh_values
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
 
 TOOL_GROSS = 6.0
 """Distance, in median distances, beyond which a row does not count for a reflector's place on the flange."""
-ROW_VALUES = ("a", "alpha", "d", "theta", "beta")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -170,5 +170,4 @@ def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
 
 def _row_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
     """Returns the values (5 n,) of the rows that these axes give."""
-    robot = robot_from_chain(chain_through(frames, nominal), {}, nominal)
-    return np.array([[getattr(row, key) for key in ROW_VALUES] for row in robot.rows]).ravel()
+    return dh_values(robot_from_chain(chain_through(frames, nominal), {}, nominal)).ravel()

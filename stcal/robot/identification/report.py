@@ -17,7 +17,7 @@ from stcal.report.svg import COLOURS, Axes, Drawing, limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
-from stcal.robot.identification.prior import DIMENSIONS, Placed, dh_values
+from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_values
 from stcal.robot.identification.result import OUTLIER_WEIGHT, Gain, Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot
@@ -194,7 +194,6 @@ class IdentifiedFile(ResultFile):
 
 DH = DIMENSIONS
 UNITS = ("mm", "deg", "mm", "deg", "deg")
-SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
 MDEG = 1000 * 180 / np.pi
 ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
 

@@ -338,7 +338,6 @@ ROUND_MM = 0.01
 
 def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
     """Returns a doubt if the files seem exchanged, or hold the same arm."""
-    lengths = [np.array([[row.a, row.d] for row in robot.rows]) for robot in (identified, nominal)]
     if (identified.rows, identified.elasticity) == (nominal.rows, nominal.elasticity) and _same_tools(
         identified, nominal
     ):
@@ -346,6 +345,7 @@ def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
             f"identified robot {identified.name} and nominal robot {nominal.name} are the same, so that nothing "
             "is compensated: give the file of identify with --robot, and the model in the controller with --nominal",
         )
+    lengths = [np.array([[row.a, row.d] for row in robot.rows]) for robot in (identified, nominal)]
     drawn = [bool((np.abs(each / ROUND_MM - np.round(each / ROUND_MM)) < 1e-6).all()) for each in lengths]
     if drawn == [True, False]:
         return (

@@ -26,7 +26,7 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips_of,
 )
-from stcal.robot.identification.prior import Placed, base_name, tool_name
+from stcal.robot.identification.prior import BASE, Placed, tool_name
 from stcal.robot.identification.report import FoundLeft, PlacedPart
 from stcal.robot.identification.result import position_errors
 from stcal.robot.identification.start import Fit, start
@@ -315,7 +315,7 @@ def _placed(
         sigma = np.full(6, np.nan)
         if "base" in fit:
             sigma, at = np.sqrt(np.diag(covariance)[:6]), 6
-        placed.append(Placed(base_name(), base, sigma))
+        placed.append(Placed(BASE, base, sigma))
     for name, tool in state.tools.items():
         sigma = np.full(6, np.nan)
         if "tool" in fit:

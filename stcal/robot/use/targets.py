@@ -13,6 +13,7 @@ from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.robot.identification.observability import over_ranges
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention
 from stcal.robot.kinematics.forward import forward
@@ -236,14 +237,7 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     to a thousandth of their reach. Raises InputError: they cannot be of one robot."""
     ends = [""] if identified.tree is None else list(identified.tree.carriers)
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
-    rng = np.random.default_rng(0)
-    limits = identified.limits()
-    half = np.where(identified.prismatic, reach_mm(identified, ends[0]), np.pi)
-    low, high = (
-        np.where(np.isfinite(limits[:, 0]), limits[:, 0], -half),
-        np.where(np.isfinite(limits[:, 1]), limits[:, 1], half),
-    )
-    q = rng.uniform(low, high, (SAMPLE, len(half)))
+    q = over_ranges(identified, SAMPLE, ends[0])
     off = [forward(identified, q, end).translation - forward(nominal, q, end).translation for end in ends]
     apart, reach = max(map(_rms, off)), max(reach_mm(each, end) for each in (identified, nominal) for end in ends)
     if apart <= USUAL_SHARE * reach:
