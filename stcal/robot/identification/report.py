@@ -201,7 +201,7 @@ ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a tur
 def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
     """Returns the result for programs (keys: ``data_layout.md``)."""
     values, before = dh_values(result.robot), dh_values(nominal)
-    held_out = result.held_out
+    held_out, predicted, is_pose = result.held_out, result.predicted, result.seen.kind == "pose"
     content = {
         "format": "stcal identified 1",
         "robot": nominal.name,
@@ -216,21 +216,25 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             {"joint": i + 1, "dimension": DIMENSIONS[k], "reason": nominal.joints[i].fixed.get(DIMENSIONS[k])}
             for i, k in np.argwhere(result.adjustment.rows.fixed).tolist()
         ],
-        "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)[1],
+        "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)["rms_mm"],
         "stations": {name: pose.inverse().matrix() for name, pose in result.state.stations.items()},
         "model": result.model,
         "models": result.gain,
         "elasticity": _elasticity(result),
         "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
-        "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
+        "sigma_rad": result.weighting.sigma_rad if is_pose and not result.weighting.given else None,
         "sigma0": result.sigma0,
         "deviations": result.deviations,
-        "errors": {
-            key: _named(_statistics(errors))
-            for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
+        "errors": {"nominal": _statistics(result.nominal_mm), "identified": _statistics(result.fitted_mm)},
+        "held_out": held_out
+        and {
+            "folds": held_out.folds,
+            "repeats": len(held_out.position_mm),
+            **_statistics(held_out.position_mm),
+            "mean_deg": float(np.degrees(np.nanmean(held_out.rotation_rad))) if is_pose else None,
         },
-        "held_out": None,
-        "predicted": None,
+        "predicted": predicted
+        and {"same_rows": _statistics(predicted.here_mm), "ranges": _statistics(predicted.ranges_mm)},
         "observability": result.observability.values(),
         "rows": [
             {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
@@ -248,26 +252,13 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             {"line": _line(result, i), "place": _place(result, i), "error_mm": error} for i, error in result.outliers()
         ],
     }
-    if result.predicted is not None:
-        predictions = {"same_rows": result.predicted.here_mm, "ranges": result.predicted.ranges_mm}
-        content["predicted"] = {name: _named(_statistics(each)) for name, each in predictions.items()}
-    if held_out is not None:
-        mean, rms, largest = _statistics(held_out.position_mm)
-        content["held_out"] = {
-            "folds": held_out.folds,
-            "repeats": len(held_out.position_mm),
-            "mean_mm": mean,
-            "rms_mm": rms,
-            "max_mm": largest,
-            "mean_deg": float(np.degrees(np.nanmean(held_out.rotation_rad))) if result.seen.kind == "pose" else None,
-        }
     return IdentifiedFile.model_validate(content)
 
 
 def identified_report(result: Identified, nominal: Robot) -> Document:
     """Returns the report of ``identify``."""
     kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
-    errors = [[name, *(number(v, 4) for v in _statistics(residuals))] for name, residuals in _errors(result).items()]
+    errors = [[name, *(number(v, 4) for v in _statistics(each).values())] for name, each in _errors(result).items()]
     outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
     sigma = [
         [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
@@ -335,7 +326,7 @@ def _price(result: Identified) -> list[str]:
     message = f"adjusted: base, tools and {int((rows.free & ~rows.fixed).sum())} of {int(rows.free.sum())} dimensions"
     if result.held_out is None or result.all_held_out is None:
         return [message]
-    own, every = (_statistics(each.position_mm)[1] for each in (result.held_out, result.all_held_out))
+    own, every = (_statistics(each.position_mm)["rms_mm"] for each in (result.held_out, result.all_held_out))
     return [f"{message}; rows held out err by {own:.3g} mm RMS, by {every:.3g} were all dimensions adjusted"]
 
 
@@ -471,12 +462,9 @@ def _errors(result: Identified) -> dict[str, np.ndarray]:
     return errors
 
 
-def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
-    return float(np.nanmean(errors)), float(np.sqrt(np.nanmean(errors**2))), float(np.nanmax(errors))
-
-
-def _named(statistics: tuple[float, float, float]) -> dict[str, float]:
-    return dict(zip(("mean_mm", "rms_mm", "max_mm"), statistics, strict=True))
+def _statistics(errors: np.ndarray) -> dict[str, float]:
+    rms = float(np.sqrt(np.nanmean(errors**2)))
+    return {"mean_mm": float(np.nanmean(errors)), "rms_mm": rms, "max_mm": float(np.nanmax(errors))}
 
 
 def _noise(result: Identified) -> str:

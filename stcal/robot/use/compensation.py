@@ -416,21 +416,20 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
     if result.nominal:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
     rows: list[Sequence] = [head]
-    none = [""] * len(columns)
+
+    def joints(inverse: Inverse, i: int) -> list[str]:
+        cells = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
+        return [*cells, inverse.status[i]]
+
+    def errors(mm: float, rad: float) -> list[str]:
+        return [f"{mm:.6f}", f"{np.degrees(rad):.6f}"]
+
     for i, line in enumerate(result.targets.lines):
-        found = result.found
-        row = [
-            *(own[i] for own in names.values()),
-            line,
-            result.targets.tools[i],
-            *(joint_cells(robot, found.q[i]) if found.usable[i] else none),
-        ]
-        row += [found.status[i], f"{found.error_mm[i]:.6f}", f"{np.degrees(found.error_rad[i]):.6f}"]
+        row = [*(own[i] for own in names.values()), line, result.targets.tools[i], *joints(result.found, i)]
+        row += errors(result.found.error_mm[i], result.found.error_rad[i])
         if result.nominal:
-            usable = result.nominal.usable[i]
-            row += joint_cells(robot, result.nominal.q[i]) if usable else none
-            row.append(result.nominal.status[i])
-            row += [f"{result.before_mm[i]:.6f}", f"{np.degrees(result.before_rad[i]):.6f}"] if usable else ["", ""]
+            row += joints(result.nominal, i)
+            row += errors(result.before_mm[i], result.before_rad[i]) if result.nominal.usable[i] else ["", ""]
         rows.append(row)
     return csv_text(rows)
 
