@@ -167,11 +167,6 @@ def _pair_cells(pair: Pair) -> list[str]:
     ]
 
 
-def _spread_cells(result: AxesResult) -> list[list[str]]:
-    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
-    return [[_names(p), number(distance[p.joint], 4), number(normal[p.joint], 4)] for p in result.pairs]
-
-
 def _row_cells(result: AxesResult) -> list[list[str]]:
     values, sigma = dh_values(result.robot) * SHOWN, result.row_sigma * SHOWN
     return [
@@ -254,6 +249,8 @@ def axes_report(result: AxesResult, where: str) -> Document:
         [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
         for name, tool in result.robot.tools.items()
     ]
+    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
+    spreads = [[_names(p), number(distance[p.joint], 4), number(normal[p.joint], 4)] for p in result.pairs]
     axis_heads = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "direction µrad", "place mm")
     pair_heads = ("joints", "angle °", "σ °", "distance mm", "σ mm", "a mm", "σ mm", "foot m", "σ m", "<row")
     return Document(
@@ -303,7 +300,7 @@ def axes_report(result: AxesResult, where: str) -> Document:
                 [
                     f"largest less smallest value when each of {len(result.without_one.lines)} rows (with its "
                     "reflectors) is left out",
-                    Table(("joints", "distance mm", "D-H a mm"), _spread_cells(result)),
+                    Table(("joints", "distance mm", "D-H a mm"), spreads),
                 ],
                 terminal=True,
             ),

@@ -257,6 +257,7 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
 
 def identified_report(result: Identified, nominal: Robot) -> Document:
     """Returns the report of ``identify``."""
+    seen = result.seen
     kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
     errors = [[name, *(number(v, 4) for v in _statistics(each).values())] for name, each in _errors(result).items()]
     outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
@@ -304,8 +305,8 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
     left = [residuals.sentence() for residuals in result.left or ()] or [nothing]
     return Document(
         f"{nominal.name}: identified",
-        f"robot {nominal.name}: {_observations(result)} from {result.seen.data.where}, {result.rank} parameters "
-        "determined",
+        f"robot {nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
+        f"{seen.data.where}, {result.rank} parameters determined",
         [
             Section("Accuracy", accuracy, terminal=True),
             Section("Denavit–Hartenberg rows", rows, terminal=True),
@@ -391,17 +392,13 @@ def _elasticity(result: Identified) -> dict | None:
     return {"gravity": elasticity.gravity.tolist(), "joints": joints(elasticity), "sigma": joints(sigma)}
 
 
-def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
-    """Returns translation, mm, and rotation vector, deg, (6,); and their σ (6,)."""
-    values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
-    return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
-
-
 def placed_table(placed: Iterable[Placed]) -> Table:
     """Returns value ± σ of translation, mm, and rotation vector, deg, of base and tools; no σ where none is known."""
     rows = []
     for each in placed:
-        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True))
+        values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
+        sigma = np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
+        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(values, sigma, strict=True))
         rows.append([each.name.partition(" in the")[0], *cells])
     over = [("", 1), ("translation ± σ", 3), ("rotation vector ± σ about the axes", 3)]
     return Table(["<", "x mm", "y mm", "z mm", "x °", "y °", "z °"], rows, over)
@@ -487,12 +484,6 @@ def _noise(result: Identified) -> str:
 
 def _sigma(value: float) -> str:
     return "" if value == 0 else f"{value:.4f}"
-
-
-def _observations(result: Identified) -> str:
-    """Returns the number and kind of the observations."""
-    seen = result.seen
-    return f"{len(seen)} {seen.kind}s" + (" by their distances" if seen.frameless else "")
 
 
 def _line(result: Identified, row: int) -> int:

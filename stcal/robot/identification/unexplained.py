@@ -17,7 +17,7 @@ from stcal.robot.identification.adjustment import (
     tips_of,
 )
 from stcal.robot.identification.variances import GROSS
-from stcal.robot.kinematics.forward import joint_frames
+from stcal.robot.kinematics.forward import joint_frames, joint_motions
 from stcal.row_order import Change, changes_along
 
 LEVEL = 0.01
@@ -278,13 +278,11 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
         what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
         advice = "name these rows another target (column target), or measure again"
         order.append(_Effect(what, 0, as_seen(state, measured, tip, on_flange), advice=advice))
-    turned, origins = joint_frames(state.chain, data.q, data.conditions)
-    carries = state.chain.carries(data.targets)
-    for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
-        turn, shift = (0 * z, z) if state.chain.prismatic[i] else (z, np.cross(z, tip.translation - origin))
-        motions = np.hstack([turn, shift])[:, :, None] * carries[i, :, None, None]
+    twists = joint_motions(state.chain, data.q, tip, data.conditions)
+    twists = twists * state.chain.carries(data.targets)[:, :, None]
+    for i, (twist, slides) in enumerate(zip(twists, state.chain.prismatic.tolist(), strict=True)):
+        motions = twist[:, :, None]
         what, advice = f"the zero of joint {i + 1} another one", "look whether it slipped, and measure again"
-        slides = bool(state.chain.prismatic[i])
         order.append(_Effect(what, i + 1, as_seen(state, measured, tip, motions), advice=advice, slides=slides))
     return order
 
@@ -354,9 +352,9 @@ def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> lis
             motions = motions * carries[joint - 1, :, None, None]
         candidates.append(_Effect(what, joint, as_seen(state, measured, tip, motions), turns))
 
-    for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
+    twists = joint_motions(chain, data.q, tip, data.conditions)
+    for i, (z, origin, twist) in enumerate(zip(turned[..., 2], origins, twists, strict=True)):
         joint, arm = i + 1, tip.translation - origin
-        twist = np.hstack([np.zeros_like(z), z] if chain.prismatic[i] else [z, np.cross(z, arm)])
         for k in range(len(chain.prismatic)):
             if k != i:
                 what = f"the value of joint {k + 1}, along the motion of joint {joint}"

@@ -338,9 +338,8 @@ ROUND_MM = 0.01
 
 def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
     """Returns a doubt if the files seem exchanged, or hold the same arm."""
-    if (identified.rows, identified.elasticity) == (nominal.rows, nominal.elasticity) and _same_tools(
-        identified, nominal
-    ):
+    one, other = ((robot.rows, robot.elasticity, robot.tools) for robot in (identified, nominal))
+    if one == other:
         return (
             f"identified robot {identified.name} and nominal robot {nominal.name} are the same, so that nothing "
             "is compensated: give the file of identify with --robot, and the model in the controller with --nominal",
@@ -365,12 +364,6 @@ def _in_radians(targets: Targets, sliding: np.ndarray) -> tuple[str, ...]:
         return ()
     return (
         f"joint values are {most:.3g}° at most, as of radians in columns of degrees: if so, call the columns q1_rad …",
-    )
-
-
-def _same_tools(one: Robot, other: Robot) -> bool:
-    return one.tools.keys() == other.tools.keys() and all(
-        np.array_equal(tool.matrix(), other.tools[name].matrix()) for name, tool in one.tools.items()
     )
 
 
