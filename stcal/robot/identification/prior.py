@@ -67,14 +67,12 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
     """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show how heavy the arm
     is."""
     n = len(chain)
+    gears = np.array([PERIODIC] * (4 * n) + [HYSTERESIS] * (n if hysteresis else 0))
     moment, beside = _moments(chain)
     torque = chain.gathered(np.linalg.norm(moment, axis=1) + beside)
-    expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(4 * n)])
-    scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(4 * n)])
-    group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), np.full(4 * n, PERIODIC)])
-    if hysteresis:
-        expected, scale = np.append(expected, np.zeros(n)), np.append(scale, np.ones(n))
-        group = np.append(group, np.full(n, HYSTERESIS))
+    expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(len(gears))])
+    scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(len(gears))])
+    group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), gears])
     return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
 
 

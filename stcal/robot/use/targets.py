@@ -188,13 +188,11 @@ def rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
 def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
     """Returns the pairs of tool and mass at the flange (None: the robot's), each with its rows."""
     mass = targets.conditions.payload_kg
-    if mass is None:
-        return [(name, None, rows) for name, rows in rows_by_tool(targets)]
-    return [
-        (name, value, rows[mass[rows] == value])
-        for name, rows in rows_by_tool(targets)
-        for value in np.unique(mass[rows]).tolist()
-    ]
+    masses = [None] * len(targets) if mass is None else mass.tolist()
+    rows: dict[tuple[str, float | None], list[int]] = {}
+    for row, pair in enumerate(zip(targets.tools, masses, strict=True)):
+        rows.setdefault(pair, []).append(row)
+    return [(*pair, np.array(own)) for pair, own in rows.items()]
 
 
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
