@@ -21,14 +21,15 @@ from stcal.robot.kinematics.dh import robot_between
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import fixed_values, forward
 from stcal.robot.kinematics.model import Convention, DHRow, Joint, Robot
-from stcal.robot.urdf import UrdfJoint, require_near, robot_of
+from stcal.robot.urdf import UrdfJoint, product, require_near, robot_of
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 JOINTS = 6
 NAME = "ur"
 LEAST_OFF_MM = 1e-3
 """A micrometre: what angles of few digits round off."""
-DELTAS = ("theta", "a", "d", "alpha")
+DELTAS = {"theta": 1.0, "a": METRE_MM, "d": METRE_MM, "alpha": 1.0}
+"""Dimensions that a controller corrects, with the factors of their units."""
 _LIST = re.compile(r"^\s*(?P<key>\w+)\s*=\s*\[(?P<values>[^\]]*)\]", re.MULTILINE)
 Number = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 
@@ -94,10 +95,8 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
             pose = Rigid(turned([link.roll, link.pitch, link.yaw]), METRE_MM * np.array([link.x, link.y, link.z]))
             joints.append(UrdfJoint(name, "continuous", parent, name, pose, np.array([0.0, 0.0, 1.0]), None, ""))
         chains.append(joints)
-    product = [Rigid(), Rigid()]
-    for pair in zip(*chains, strict=True):
-        product = [so_far @ joint.parent_from_child for so_far, joint in zip(product, pair, strict=True)]
-    off = float(np.linalg.norm(product[0].translation - product[1].translation))
+    moving, fixed = (product(chain).translation for chain in chains)
+    off = float(np.linalg.norm(moving - fixed))
     return robot_of({"": chains[0]}, NAME, convention), off
 
 
@@ -113,7 +112,7 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     other lengths.
     """
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
-    deltas = np.column_stack([_six(lists, f"delta_{name}", where) for name in DELTAS])
+    deltas = {name: unit * _six(lists, f"delta_{name}", where) for name, unit in DELTAS.items()}
     if all(name in lists for name in ("a", "d", "alpha")):
         a, d, alpha = (_six(lists, name, where) for name in ("a", "d", "alpha"))
         rows = [DHRow(METRE_MM * a[i], alpha[i], METRE_MM * d[i], 0.0) for i in range(JOINTS)]
@@ -133,14 +132,8 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     else:
         rows, base, tools, name = list(nominal.rows), nominal.world_from_base, nominal.tools, nominal.name
     corrected = tuple(
-        replace(
-            row,
-            theta=row.theta + theta,
-            a=row.a + METRE_MM * length,
-            d=row.d + METRE_MM * offset,
-            alpha=row.alpha + twist,
-        )
-        for row, (theta, length, offset, twist) in zip(rows, deltas, strict=True)
+        replace(row, **{name: getattr(row, name) + float(delta[i]) for name, delta in deltas.items()})
+        for i, row in enumerate(rows)
     )
     joints = nominal.joints if nominal is not None else (Joint(),) * JOINTS
     controller = Robot(name, "standard", corrected, joints, tools=tools)

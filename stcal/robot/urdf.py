@@ -3,6 +3,7 @@
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -204,8 +205,8 @@ def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
     back = _z_to(moving[-1].axis).inverse()
     behind = {tool: path[[j.name for j in path].index(moving[-1].name) + 1 :] for tool, path in paths.items()}
     children = [joint.child for joint in behind[""]]
-    flange = back @ _along(behind[""][: children.index(FLANGE) + 1]) if FLANGE in children else Rigid()
-    tools = {tool: flange.inverse() @ back @ _along(path) for tool, path in behind.items()}
+    flange = back @ product(behind[""][: children.index(FLANGE) + 1]) if FLANGE in children else Rigid()
+    tools = {tool: flange.inverse() @ back @ product(path) for tool, path in behind.items()}
     joints = tuple(_limited(joint) for joint in moving)
     rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
     sliding = np.array([joint.type == "prismatic" for joint in joints])
@@ -249,12 +250,9 @@ def _tree_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
     return robot
 
 
-def _along(path: list[UrdfJoint]) -> Rigid:
-    """Returns the product of the transforms of successive fixed joints."""
-    product = Rigid()
-    for joint in path:
-        product = product @ joint.parent_from_child
-    return product
+def product(path: list[UrdfJoint]) -> Rigid:
+    """Returns the product of the transforms of successive joints, all at 0."""
+    return reduce(Rigid.__matmul__, (joint.parent_from_child for joint in path), Rigid())
 
 
 def _limited(joint: UrdfJoint) -> Joint:

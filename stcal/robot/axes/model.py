@@ -24,13 +24,13 @@ from stcal.robot.axes.checks import (
 )
 from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
+from stcal.robot.identification.prior import dh_values
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
 
 TOOL_GROSS = 6.0
 """Distance, in median distances, beyond which a row does not count for a reflector's place on the flange."""
-ROW_VALUES = ("a", "alpha", "d", "theta", "beta")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -129,9 +129,11 @@ def robot_from_sweeps(
     if virtual is None:
         orientation = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
         robot = replace(robot, tools={n: Rigid(orientation[n], t.translation) for n, t in robot.tools.items()})
-    row_sigma = sigma_of(jacobian_by_axes(lambda f: _row_values(f, nominal), frames, nominal), covariance).reshape(
-        -1, 5
-    )
+
+    def row_values(frames: list[Rigid]) -> np.ndarray:
+        return dh_values(robot_from_chain(chain_through(frames, nominal), {}, nominal)).ravel()
+
+    row_sigma = sigma_of(jacobian_by_axes(row_values, frames, nominal), covariance).reshape(-1, 5)
     pairs = pairs_of(frames, covariance, robot)
     notes += [*remarks(data, fits, robot, nominal), *of_order(measured, robot)]
     notes += [
@@ -166,9 +168,3 @@ def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
         tools[name] = Rigid(np.eye(3), place)
         spread[name] = float(np.sqrt(((points[good] - place) ** 2).sum(axis=1).mean()))
     return tools, spread
-
-
-def _row_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
-    """Returns the values (5 n,) of the rows that these axes give."""
-    robot = robot_from_chain(chain_through(frames, nominal), {}, nominal)
-    return np.array([[getattr(row, key) for key in ROW_VALUES] for row in robot.rows]).ravel()

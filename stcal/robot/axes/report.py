@@ -8,22 +8,23 @@ from pydantic import Field
 
 import stcal
 from stcal.geometry.arrays import rms
-from stcal.io.json import ByName, Matrix, Part, Pose, ResultFile, Vector3
+from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector3
 from stcal.report.document import Document, Section, Table, bullets, legend, page_only, plot
 from stcal.report.svg import AXIS_COLOURS, Axes, Drawing, limits
 from stcal.report.text import number
-from stcal.robot.axes.checks import Pair
+from stcal.robot.axes.checks import LeaveOneOut, Pair
 from stcal.robot.axes.fit import AxisFit
-from stcal.robot.axes.model import ROW_VALUES, AxesResult
+from stcal.robot.axes.model import AxesResult
 from stcal.robot.axes.sweeps import called
+from stcal.robot.identification.prior import DIMENSIONS, SHOWN, dh_values
 from stcal.robot.kinematics.file import robot_toml
 
 
 class ArcRow(Part):
     target: str
     points: int
-    radius_mm: float | None
-    height_mm: float | None
+    radius_mm: Finite
+    height_mm: Finite
 
 
 class OffRow(Part):
@@ -78,14 +79,14 @@ class AxisPair(Part):
     foot_mm: float | None
     foot_sigma_mm: float | None
     refused: str
-    leave_one_out_distance_spread_mm: float | None
-    leave_one_out_normal_spread_mm: float | None
+    leave_one_out_distance_spread_mm: Finite
+    leave_one_out_normal_spread_mm: Finite
 
 
 class LeaveOneOutRows(Part):
     lines: list[int]
-    distance_mm: list[list[float | None]]
-    normal_mm: list[list[float | None]]
+    distance_mm: list[list[Finite]]
+    normal_mm: list[list[Finite]]
 
 
 class AxesFile(ResultFile):
@@ -166,27 +167,16 @@ def _pair_cells(pair: Pair) -> list[str]:
     ]
 
 
-def _spread_cells(result: AxesResult) -> list[list[str]]:
-    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
-    return [[_names(p), number(distance[p.joint], 4), number(normal[p.joint], 4)] for p in result.pairs]
-
-
 def _row_cells(result: AxesResult) -> list[list[str]]:
-    rows = []
-    for i, (row, sigma) in enumerate(zip(result.robot.rows, result.row_sigma, strict=True)):
-        cells = [str(i + 1)]
-        for key, deviation in zip(ROW_VALUES, sigma, strict=True):
-            value = getattr(row, key)
-            if key not in ("a", "d"):
-                value, deviation = np.degrees(value), np.degrees(deviation)
-            cells.append(f"{value:.4f}" + (f" ± {deviation:.4f}" if deviation > 0 else ""))
-        rows.append(cells)
-    return rows
+    values, sigma = dh_values(result.robot) * SHOWN, result.row_sigma * SHOWN
+    return [
+        [str(i), *(f"{v:.4f}" + (f" ± {s:.4f}" if s > 0 else "") for v, s in zip(*row, strict=True))]
+        for i, row in enumerate(zip(values, sigma, strict=True), 1)
+    ]
 
 
 def axes_file(result: AxesResult) -> AxesFile:
     """Returns the result as plain values: mm, rad; None where there is no value."""
-    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
     return AxesFile.model_validate(
         {
             "format": "stcal axes 1",
@@ -195,26 +185,19 @@ def axes_file(result: AxesResult) -> AxesFile:
             "axes": [_axis_json(fit, off) for fit, off in zip(result.fits, result.off, strict=True)],
             "covariance": result.covariance,
             "rows": [
-                {f"{key}{_unit(key)}": getattr(row, key) for key in ROW_VALUES}
-                | {f"{key}_sigma{_unit(key)}": float(s) for key, s in zip(ROW_VALUES, sigma, strict=True)}
-                for row, sigma in zip(result.robot.rows, result.row_sigma, strict=True)
+                {f"{key}{_unit(key)}": value for key, value in zip(DIMENSIONS, row, strict=True)}
+                | {f"{key}_sigma{_unit(key)}": value for key, value in zip(DIMENSIONS, sigma, strict=True)}
+                for row, sigma in zip(dh_values(result.robot).tolist(), result.row_sigma.tolist(), strict=True)
             ],
             "targets": {
                 name: {"xyz_flange_mm": tool.translation, "rms_mm": result.tool_spread_mm[name]}
                 for name, tool in result.robot.tools.items()
             },
-            "pairs": [
-                _pair_json(pair)
-                | {
-                    "leave_one_out_distance_spread_mm": _known(distance[pair.joint]),
-                    "leave_one_out_normal_spread_mm": _known(normal[pair.joint]),
-                }
-                for pair in result.pairs
-            ],
+            "pairs": [_pair_json(pair, result.without_one) for pair in result.pairs],
             "leave_one_out": {
                 "lines": list(result.without_one.lines),
-                "distance_mm": [[_known(v) for v in row] for row in result.without_one.distance],
-                "normal_mm": [[_known(v) for v in row] for row in result.without_one.normal],
+                "distance_mm": result.without_one.distance.tolist(),
+                "normal_mm": result.without_one.normal.tolist(),
             },
             "notes": list(result.notes),
         }
@@ -223,10 +206,6 @@ def axes_file(result: AxesResult) -> AxesFile:
 
 def _unit(key: str) -> str:
     return "_mm" if key in ("a", "d") else "_rad"
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _axis_json(fit: AxisFit, off: Mapping[int, float]) -> dict:
@@ -244,26 +223,23 @@ def _axis_json(fit: AxisFit, off: Mapping[int, float]) -> dict:
         "dof": fit.redundancy,
         "span_mm" if len(fit.gain) == 2 else "span_rad": fit.span,
         "arcs": [
-            {"target": arc.target, "points": len(arc.rows), "radius_mm": _known(r), "height_mm": _known(h)}
+            {"target": arc.target, "points": len(arc.rows), "radius_mm": r, "height_mm": h}
             for arc, r, h in zip(fit.arcs, fit.radii, fit.heights, strict=True)
         ],
         "outliers": [{"line": line, "error_mm": size} for line, size in off.items()],
     }
 
 
-def _pair_json(pair: Pair) -> dict:
+def _pair_json(pair: Pair, without_one: LeaveOneOut) -> dict:
+    lengths = ("distance", "distance_sigma", "normal", "normal_sigma", "foot", "foot_sigma")
     return {
         "joints": [pair.joint + 1, pair.joint + 2],
         "angle_rad": pair.angle,
         "angle_sigma_rad": pair.angle_sigma,
         "hayati": pair.parallel,
-        "distance_mm": pair.distance,
-        "distance_sigma_mm": pair.distance_sigma,
-        "normal_mm": pair.normal,
-        "normal_sigma_mm": pair.normal_sigma,
-        "foot_mm": pair.foot,
-        "foot_sigma_mm": pair.foot_sigma,
+        **{f"{name}_mm": getattr(pair, name) for name in lengths},
         "refused": pair.refused,
+        **{f"leave_one_out_{name}_spread_mm": without_one.spread(name)[pair.joint] for name in ("distance", "normal")},
     }
 
 
@@ -273,6 +249,8 @@ def axes_report(result: AxesResult, where: str) -> Document:
         [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
         for name, tool in result.robot.tools.items()
     ]
+    distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
+    spreads = [[_names(p), number(distance[p.joint], 4), number(normal[p.joint], 4)] for p in result.pairs]
     axis_heads = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "direction µrad", "place mm")
     pair_heads = ("joints", "angle °", "σ °", "distance mm", "σ mm", "a mm", "σ mm", "foot m", "σ m", "<row")
     return Document(
@@ -322,7 +300,7 @@ def axes_report(result: AxesResult, where: str) -> Document:
                 [
                     f"largest less smallest value when each of {len(result.without_one.lines)} rows (with its "
                     "reflectors) is left out",
-                    Table(("joints", "distance mm", "D-H a mm"), _spread_cells(result)),
+                    Table(("joints", "distance mm", "D-H a mm"), spreads),
                 ],
                 terminal=True,
             ),

@@ -347,19 +347,6 @@ class Held:
     sigma: np.ndarray
     fixed: np.ndarray
 
-    def conditions(self) -> np.ndarray:
-        """Returns the normal matrix (k, k) of the conditions alone."""
-        own = self.jacobian[self.fixed] / self.sigma[self.fixed, None]
-        return own.T @ own
-
-    def normal(self) -> np.ndarray:
-        """Returns the normal matrix (k, k)."""
-        return (self.jacobian.T / self.sigma**2) @ self.jacobian
-
-    def pull(self) -> np.ndarray:
-        """Returns half the gradient (k,) of the sum of squares."""
-        return (self.jacobian.T / self.sigma**2) @ self.value
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
@@ -406,8 +393,10 @@ def solve(
     held_normal, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
     conditions, count = np.zeros_like(first.normal), 0
     if held is not None:
-        held_normal, pull = held.normal(), held.pull()
-        conditions, count = held.conditions(), int(held.fixed.sum())
+        weighted = held.jacobian.T / held.sigma**2
+        held_normal, pull = weighted @ held.jacobian, weighted @ held.value  # half the gradient of the squares
+        fixed = held.jacobian[held.fixed] / held.sigma[held.fixed, None]
+        conditions, count = fixed.T @ fixed, len(fixed)
     _, directions, determined = replace(first, conditions=conditions).spectrum()
     prior = held_normal + _fixed(first, directions[:, : unseen(measured.kind)])
     hold = held_normal + _fixed(first, directions[:, ~determined])  # along undetermined ones valleys bend, and lead far

@@ -10,7 +10,7 @@ from stcal.report.document import Html, plot
 from stcal.report.svg import COLOURS, INK, SMALL, Axes, Drawing, limits, round_below
 from stcal.robot.identification.adjustment import Observed, State, as_seen, tips_of
 from stcal.robot.identification.unexplained import Finding
-from stcal.robot.kinematics.forward import joint_frames
+from stcal.robot.kinematics.forward import joint_motions
 
 ARROW_SHARE, LONGEST_SHARE = 0.12, 0.3
 """Lengths of a typical residual and of the longest one drawn, as shares of the picture's side."""
@@ -43,17 +43,14 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
     """Returns a figure of good rows' residuals along each joint's motion by its value, with the findings' curves."""
     observations, chain, tip = shown.seen, shown.state.chain, shown.tips()
     data = observations.data
-    turned, origins = joint_frames(chain, data.q, data.conditions)
-    values, n, carries = data.q @ chain.coupling.T, len(chain), chain.carries(data.targets)
+    twists = joint_motions(chain, data.q, tip, data.conditions) * chain.carries(data.targets)[:, :, None]
+    values, n = data.q @ chain.coupling.T, len(chain)
     errors = shown.residuals[:, -3:]
     across = min(n, 3)
     down = -(-n // across)
     turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
     points = []
-    for i in range(n):
-        z, sliding = turned[i][:, :, 2], chain.prismatic[i]
-        twist = [z * 0, z] if sliding else [z, np.cross(z, tip.translation - origins[i])]
-        twist = np.hstack(twist) * carries[i, :, None]
+    for i, (twist, sliding) in enumerate(zip(twists, chain.prismatic, strict=True)):
         motion = as_seen(shown.state, observations, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
         size = np.linalg.norm(motion, axis=1)
         moves = shown.good & (size > LEAST_MOTION * max(size.max(), 1e-300))

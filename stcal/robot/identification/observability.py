@@ -169,18 +169,11 @@ def predicted(state: State, robot: Robot, measured: Observed, covariance: np.nda
     arm."""
     if measured.kind == "distance":
         return None
-    names = list(dict.fromkeys(measured.data.targets))
-    target = max(names, key=measured.data.targets.count)
-
-    here = _sigma(
-        state,
-        measured.data.q,
-        measured.data.targets,
-        measured.kind,
-        covariance,
-        measured.data.conditions,
-    )
-    ranges = _sigma(state, _over_ranges(robot, SAMPLES), (target,) * SAMPLES, measured.kind, covariance)
+    data, kind = measured.data, measured.kind
+    target = max(dict.fromkeys(data.targets), key=data.targets.count)
+    here = _sigma(state, data.q, data.targets, kind, covariance, data.conditions)
+    q = over_ranges(replace(robot, tools={"": Rigid()}), SAMPLES)
+    ranges = _sigma(state, q, (target,) * SAMPLES, kind, covariance)
     return Predicted(here, ranges, covariance)
 
 
@@ -207,10 +200,11 @@ def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targ
     return sigma
 
 
-def _over_ranges(robot: Robot, count: int) -> np.ndarray:
-    """Returns random joint values (count, n), rad or mm."""
+def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
+    """Returns random joint values (count, n), rad or mm; a joint without limits moves by half a turn, or by the reach
+    with ``tool``, to either side."""
     low, high = robot.limits().T
-    half = np.where(robot.prismatic, reach_mm(replace(robot, tools={"": Rigid()})), np.pi)
+    half = np.where(robot.prismatic, reach_mm(robot, tool), np.pi)
     low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
     return np.random.default_rng(SEED).uniform(low, high, (count, len(half)))
 

@@ -67,14 +67,12 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
     """Returns the usual elasticity of an arm of these dimensions; ``carried`` : known loads show how heavy the arm
     is."""
     n = len(chain)
+    gears = np.array([PERIODIC] * (4 * n) + [HYSTERESIS] * (n if hysteresis else 0))
     moment, beside = _moments(chain)
     torque = chain.gathered(np.linalg.norm(moment, axis=1) + beside)
-    expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(4 * n)])
-    scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(4 * n)])
-    group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), np.full(4 * n, PERIODIC)])
-    if hysteresis:
-        expected, scale = np.append(expected, np.zeros(n)), np.append(scale, np.ones(n))
-        group = np.append(group, np.full(n, HYSTERESIS))
+    expected = np.concatenate([np.zeros(2 * n), moment.ravel(), np.zeros(len(gears))])
+    scale = np.concatenate([np.repeat(torque, 2), np.repeat(1 / beside, 3), np.ones(len(gears))])
+    group = np.concatenate([np.tile([AXIS, ACROSS], n), np.full(3 * n, MOMENT), gears])
     return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
 
 
@@ -159,6 +157,8 @@ KEPT: Mapping[Adjusted, tuple[int, ...]] = {
 }
 """Groups of dimensions that stay nominal; base and tools are always adjusted."""
 DIMENSIONS = ("a", "alpha", "d", "theta", "beta")
+SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
+"""Factors from mm and rad to the units, mm and degrees, in which dimensions are shown."""
 
 
 def adjusted(text: str) -> Adjusted:
@@ -193,7 +193,7 @@ class Deviations:
 
 def dh_values(robot: Robot) -> np.ndarray:
     """Returns a, alpha, d, theta, beta of the rows, (n, 5)."""
-    return np.array([[row.a, row.alpha, row.d, row.theta, row.beta] for row in robot.rows], float)
+    return np.array([astuple(row) for row in robot.rows], float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -335,9 +335,8 @@ class Placed:
         return None if np.isnan(self.sigma).all() else [None if np.isnan(s) else float(s) for s in self.sigma]
 
 
-def base_name() -> str:
-    """Returns the name of the base in tables."""
-    return "base in the instrument's frame"
+BASE = "base in the instrument's frame"
+"""Name of the base in tables."""
 
 
 def tool_name(name: str) -> str:
@@ -369,7 +368,7 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
     if kind == "distance":
         sigma[0] = np.nan
     first, *others = state.stations
-    base = f"base in the frame of station {first}" if others else base_name()
+    base = f"base in the frame of station {first}" if others else BASE
     names = [base, *map(tool_name, state.tools), *(f"station {name} in that of {first}" for name in others)]
     if nominal.tree is not None:
         names += [

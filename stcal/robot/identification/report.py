@@ -1,7 +1,6 @@
 """Text, page and result file of an identified robot, and the table of mastering offsets for its controller."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
@@ -18,8 +17,8 @@ from stcal.report.svg import COLOURS, Axes, Drawing, limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
-from stcal.robot.identification.prior import DIMENSIONS, Placed, dh_values
-from stcal.robot.identification.result import OUTLIER_WEIGHT, Identified
+from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_values
+from stcal.robot.identification.result import OUTLIER_WEIGHT, Gain, Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot
 
@@ -59,13 +58,6 @@ class FixedDimension(Part):
     joint: int
     dimension: str
     reason: str | None
-
-
-class ModelsCompared(Part):
-    rigid_mm: float
-    elastic_mm: float
-    gain_mm: float
-    sigma_mm: float
 
 
 class ElasticJoint(Part):
@@ -140,7 +132,7 @@ class IdentifiedFile(ResultFile):
         "that of most rows; one without a name where there is no column"
     )
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
-    models: ModelsCompared | None = Field(
+    models: Gain | None = Field(
         description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
         "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
@@ -202,7 +194,6 @@ class IdentifiedFile(ResultFile):
 
 DH = DIMENSIONS
 UNITS = ("mm", "deg", "mm", "deg", "deg")
-SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
 MDEG = 1000 * 180 / np.pi
 ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
 
@@ -210,7 +201,7 @@ ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a tur
 def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
     """Returns the result for programs (keys: ``data_layout.md``)."""
     values, before = dh_values(result.robot), dh_values(nominal)
-    held_out = result.held_out
+    held_out, predicted, is_pose = result.held_out, result.predicted, result.seen.kind == "pose"
     content = {
         "format": "stcal identified 1",
         "robot": nominal.name,
@@ -225,21 +216,25 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             {"joint": i + 1, "dimension": DIMENSIONS[k], "reason": nominal.joints[i].fixed.get(DIMENSIONS[k])}
             for i, k in np.argwhere(result.adjustment.rows.fixed).tolist()
         ],
-        "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)[1],
+        "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)["rms_mm"],
         "stations": {name: pose.inverse().matrix() for name, pose in result.state.stations.items()},
         "model": result.model,
-        "models": None if result.gain is None else asdict(result.gain),
+        "models": result.gain,
         "elasticity": _elasticity(result),
         "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
-        "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
+        "sigma_rad": result.weighting.sigma_rad if is_pose and not result.weighting.given else None,
         "sigma0": result.sigma0,
         "deviations": result.deviations,
-        "errors": {
-            key: _named(_statistics(errors))
-            for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
+        "errors": {"nominal": _statistics(result.nominal_mm), "identified": _statistics(result.fitted_mm)},
+        "held_out": held_out
+        and {
+            "folds": held_out.folds,
+            "repeats": len(held_out.position_mm),
+            **_statistics(held_out.position_mm),
+            "mean_deg": float(np.degrees(np.nanmean(held_out.rotation_rad))) if is_pose else None,
         },
-        "held_out": None,
-        "predicted": None,
+        "predicted": predicted
+        and {"same_rows": _statistics(predicted.here_mm), "ranges": _statistics(predicted.ranges_mm)},
         "observability": result.observability.values(),
         "rows": [
             {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
@@ -257,26 +252,14 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
             {"line": _line(result, i), "place": _place(result, i), "error_mm": error} for i, error in result.outliers()
         ],
     }
-    if result.predicted is not None:
-        predictions = {"same_rows": result.predicted.here_mm, "ranges": result.predicted.ranges_mm}
-        content["predicted"] = {name: _named(_statistics(each)) for name, each in predictions.items()}
-    if held_out is not None:
-        mean, rms, largest = _statistics(held_out.position_mm)
-        content["held_out"] = {
-            "folds": held_out.folds,
-            "repeats": len(held_out.position_mm),
-            "mean_mm": mean,
-            "rms_mm": rms,
-            "max_mm": largest,
-            "mean_deg": float(np.degrees(np.nanmean(held_out.rotation_rad))) if result.seen.kind == "pose" else None,
-        }
     return IdentifiedFile.model_validate(content)
 
 
 def identified_report(result: Identified, nominal: Robot) -> Document:
     """Returns the report of ``identify``."""
+    seen = result.seen
     kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
-    errors = [[name, *(number(v, 4) for v in _statistics(residuals))] for name, residuals in _errors(result).items()]
+    errors = [[name, *(number(v, 4) for v in _statistics(each).values())] for name, each in _errors(result).items()]
     outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
     sigma = [
         [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
@@ -322,8 +305,8 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
     left = [residuals.sentence() for residuals in result.left or ()] or [nothing]
     return Document(
         f"{nominal.name}: identified",
-        f"robot {nominal.name}: {_observations(result)} from {result.seen.data.where}, {result.rank} parameters "
-        "determined",
+        f"robot {nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
+        f"{seen.data.where}, {result.rank} parameters determined",
         [
             Section("Accuracy", accuracy, terminal=True),
             Section("Denavit–Hartenberg rows", rows, terminal=True),
@@ -344,7 +327,7 @@ def _price(result: Identified) -> list[str]:
     message = f"adjusted: base, tools and {int((rows.free & ~rows.fixed).sum())} of {int(rows.free.sum())} dimensions"
     if result.held_out is None or result.all_held_out is None:
         return [message]
-    own, every = (_statistics(each.position_mm)[1] for each in (result.held_out, result.all_held_out))
+    own, every = (_statistics(each.position_mm)["rms_mm"] for each in (result.held_out, result.all_held_out))
     return [f"{message}; rows held out err by {own:.3g} mm RMS, by {every:.3g} were all dimensions adjusted"]
 
 
@@ -409,17 +392,13 @@ def _elasticity(result: Identified) -> dict | None:
     return {"gravity": elasticity.gravity.tolist(), "joints": joints(elasticity), "sigma": joints(sigma)}
 
 
-def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
-    """Returns translation, mm, and rotation vector, deg, (6,); and their σ (6,)."""
-    values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
-    return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
-
-
 def placed_table(placed: Iterable[Placed]) -> Table:
     """Returns value ± σ of translation, mm, and rotation vector, deg, of base and tools; no σ where none is known."""
     rows = []
     for each in placed:
-        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True))
+        values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
+        sigma = np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
+        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(values, sigma, strict=True))
         rows.append([each.name.partition(" in the")[0], *cells])
     over = [("", 1), ("translation ± σ", 3), ("rotation vector ± σ about the axes", 3)]
     return Table(["<", "x mm", "y mm", "z mm", "x °", "y °", "z °"], rows, over)
@@ -480,12 +459,9 @@ def _errors(result: Identified) -> dict[str, np.ndarray]:
     return errors
 
 
-def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
-    return float(np.nanmean(errors)), float(np.sqrt(np.nanmean(errors**2))), float(np.nanmax(errors))
-
-
-def _named(statistics: tuple[float, float, float]) -> dict[str, float]:
-    return dict(zip(("mean_mm", "rms_mm", "max_mm"), statistics, strict=True))
+def _statistics(errors: np.ndarray) -> dict[str, float]:
+    rms = float(np.sqrt(np.nanmean(errors**2)))
+    return {"mean_mm": float(np.nanmean(errors)), "rms_mm": rms, "max_mm": float(np.nanmax(errors))}
 
 
 def _noise(result: Identified) -> str:
@@ -508,12 +484,6 @@ def _noise(result: Identified) -> str:
 
 def _sigma(value: float) -> str:
     return "" if value == 0 else f"{value:.4f}"
-
-
-def _observations(result: Identified) -> str:
-    """Returns the number and kind of the observations."""
-    seen = result.seen
-    return f"{len(seen)} {seen.kind}s" + (" by their distances" if seen.frameless else "")
 
 
 def _line(result: Identified, row: int) -> int:

@@ -149,22 +149,15 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     rows = NominalRows.about(first, parameter_units(jacobian(first, observations)), robot, options.adjust)
     _enough(observations, first, rows)
     adjusted, held_out, gain = _modelled(robot, first, observations, options, rows)
-    solution = adjusted.solution
-    names = parameter_names(solution.state, observations.kind)
+    solution, state = adjusted.solution, adjusted.solution.state
+    names = parameter_names(state, observations.kind)
     undetermined = _undetermined(solution, names, observations, options.partial)
     full_covariance, rank = _covariance(adjusted, observations), solution.rank() - _place(observations)
     named = slice(len(names))
     covariance = full_covariance[named, named]
-    identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
-    prediction = predicted(solution.state, robot, observations, full_covariance)
-    findings = left(
-        solution.state,
-        identified.world_from_base,
-        observations,
-        adjusted.weighting,
-        jacobian(solution.state, observations),
-        solution.weights,
-    )
+    identified = robot_from_chain(state.chain, state.tools, robot)
+    prediction, slope = predicted(state, robot, observations, full_covariance), jacobian(state, observations)
+    findings = left(state, identified.world_from_base, observations, adjusted.weighting, slope, solution.weights)
     wider, remarks = widened(prediction, findings or ())
     of_arm = any(not each.advice for each in findings or ())
     tested = held_out is not None or options.folds < LEAST_FOLDS
@@ -175,17 +168,17 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         names=tuple(names),
         covariance=covariance,
         rank=rank,
-        ranks=_ranks(solution.state, data),
+        ranks=_ranks(state, data),
         undetermined=undetermined,
         nominal_mm=position_errors(residuals(first, observations)),
         held_out=held_out,
         predicted=wider,
-        placed=placed(solution.state, observations.kind, covariance, solution.units[named], robot),
+        placed=placed(state, observations.kind, covariance, solution.units[named], robot),
         left=findings,
         dh_sigma=adjusted.rows.sigma(identified, covariance),
         observability=_observability(identified, adjusted, observations, rank),
         deviations=adjusted.deviations.of(adjusted.rows.groups),
-        elasticity_sigma=_elasticity_sigma(solution.state, full_covariance),
+        elasticity_sigma=_elasticity_sigma(state, full_covariance),
         gain=gain,
         all_held_out=_with_all(robot, first, observations, options) if rows.fixed.any() else None,
         notes=data.notes
@@ -196,7 +189,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + doubts(prediction, observations, solution.units[named], covariance, names, tested)
         + tuple(each.sentence() for each in findings or ())
         + remarks
-        + ((TRY_ELASTIC,) if remarks and of_arm and not solution.state.elastic else ())
+        + ((TRY_ELASTIC,) if remarks and of_arm and not state.elastic else ())
         + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
     return replace(result, notes=result.notes + misgivings(result, robot))
@@ -257,8 +250,7 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
             raise DegenerateError(
                 "E-IDENTIFY-UNMOVED",
                 f"{data.where}: joint {i} never moved, so that its axis is not determined; measure with other values "
-                "of "
-                f"q{i}, or keep its nominal values with --partial",
+                f"of q{i}, or keep its nominal values with --partial",
             )
 
 
@@ -376,19 +368,19 @@ def _undetermined(solution: Solution, names: list[str], measured: Observed, part
         return ()
     open_directions = directions_named(directions[:, ~determined][:, expected:], names)
     if not partial:
+        where = measured.data.where
         first = ", ".join(open_directions[:4]) + (" …" if len(open_directions) > 4 else "")
         moved = moved_meanwhile(solution.state, measured, MOST_OF_IT)
         if moved is not None and moved.advice:
             raise DegenerateError(
                 "E-IDENTIFY-UNDETERMINED",
-                f"{measured.data.where}: {first} stay open with residuals that no robot leaves; {moved.sentence()}",
+                f"{where}: {first} stay open with residuals that no robot leaves; {moved.sentence()}",
             )
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
-            f"{measured.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
-            "parameters, open are "
-            f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
-            "--partial",
+            f"{where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} parameters, "
+            f"open are {first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these "
+            "with --partial",
         )
     return open_directions
 
@@ -396,15 +388,14 @@ def _undetermined(solution: Solution, names: list[str], measured: Observed, part
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
     """Returns how many parameters each kind of measurement at these joint values would determine."""
     tip = tips_of(state, data)
-    exact = Measurements(
-        data.where,
-        data.lines,
-        data.q,
-        data.targets,
-        tip.translation,
-        tip.rotation,
-        stations=data.stations,
-        conditions=data.conditions,
+    exact = replace(
+        data,
+        positions=tip.translation,
+        rotations=tip.rotation,
+        covariance=None,
+        common=None,
+        distances=None,
+        from_row=None,
     )
     ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
     for kind in get_args(Kind):
@@ -418,11 +409,9 @@ def _observability(robot: Robot, adjusted: Adjustment, measured: Observed, rank:
     scale = parameter_scale(robot, measured.kind, state.tools)
     rows = weighting.whiten(jacobian(state, measured)[:, :, : len(scale)], measured) * scale
     if measured.frameless:  # remove what a motion of all points of a station can produce
-        blocks = []
+        blocks, points = [], measured.data.points()
         for rows_of_station in measured.data.by_station().values():
-            lever = (measured.data.points() - measured.data.points()[rows_of_station].mean(0)) * rows_of_station[
-                :, None
-            ]
+            lever = (points - points[rows_of_station].mean(0)) * rows_of_station[:, None]
             shift = np.eye(3) * rows_of_station[:, None, None]
             blocks.append(np.concatenate([-skew(lever) / np.linalg.norm(lever), shift], axis=2))
         motions = np.concatenate(blocks, axis=2)

@@ -234,20 +234,18 @@ def _base_and_points(
             float(at[2] @ (information * at[2])), np.diag(information), information * at[2]
         )
 
-    if not free.any():
-        return base, points, float(np.sqrt(((base @ (flange @ points[rows]) - positions) ** 2).sum(1).mean()))
-    minimum = minimise(
-        (base, points, np.zeros(len(information))),
-        linearise,
-        lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
-        least_damping=REGULAR,
-        settled=SETTLED,
-        max_steps=ROUNDS,
-    )
-    minimum.required(
-        f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * float(minimum.linear.cost)
-    )
-    base, points, _ = minimum.state
+    if free.any():
+        minimum = minimise(
+            (base, points, np.zeros(len(information))),
+            linearise,
+            lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
+            least_damping=REGULAR,
+            settled=SETTLED,
+            max_steps=ROUNDS,
+        )
+        accepted = NEARLY * float(minimum.linear.cost)
+        minimum.required(f"{where}: base and tools", "check the D-H rows and the joint values", accepted)
+        base, points, _ = minimum.state
     misfit = np.linalg.norm(base @ (flange @ points[rows]) - positions, axis=1)
     return base, points, float(np.sqrt((misfit**2).mean()))
 

@@ -17,7 +17,7 @@ from stcal.robot.identification.adjustment import (
     tips_of,
 )
 from stcal.robot.identification.variances import GROSS
-from stcal.robot.kinematics.forward import joint_frames
+from stcal.robot.kinematics.forward import joint_frames, joint_motions
 from stcal.row_order import Change, changes_along
 
 LEVEL = 0.01
@@ -98,33 +98,47 @@ def left(
     findings: list[Finding] = []
     while len(findings) < MOST:
         moved = _moved_meanwhile(order, errors, explained, weighting, measured, len(candidates) + len(order))
-        found = rest.strongest(len(order))
-        if moved is not None and (found is None or moved.log_p < found[0].log_p):
-            findings.append(moved.finding)
-            explained = np.concatenate([explained, moved.motions], axis=2)
-            rest = _Rest.of(errors, explained, candidates, weighting, measured, moved.good.astype(float))
-        elif found is not None:
-            findings.append(found[0].finding)
-            explained = np.concatenate([explained, found[1].motions], axis=2)
-            rest = found[2]
-        else:
+        beyond_chance = [found for found in (rest.strongest(len(order)), moved) if found is not None]
+        if not beyond_chance:
             break
+        found = min(beyond_chance, key=lambda each: each.log_p)
+        findings.append(found.finding)
+        explained = np.concatenate([explained, found.motions], axis=2)
+        rest = found.rest or _Rest.of(errors, explained, candidates, weighting, measured, found.root)
     return tuple(findings) if findings or rest.freedom >= LEAST_FREEDOM else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Effect:
+    """What may be in the residuals, or may have moved between two rows. ``motions`` : (r, w, c) as observed, in any
+    scale, of what may have moved rad over mm where c is 6; ``advice`` : what to do about a jump; ``slides`` : True for
+    a prismatic joint, whose motion is in mm."""
+
+    what: str
+    joint: int
+    motions: np.ndarray
+    turns: int = 0
+    advice: str = ""
+    slides: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """A finding with the logarithm of its probability by chance."""
+    """A finding with the logarithm of its probability by chance and its ``motions`` (r, w, c). ``root`` : (r,) 1 for
+    rows that are no errors beside it, else 0; ``rest`` : the residuals without it where all of these rows stay."""
 
     finding: Finding
     log_p: float
+    motions: np.ndarray
+    root: np.ndarray
+    rest: "_Rest | None" = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rest:
     """The part of whitened residuals (N,) that ``fitted`` (N, k) does not explain. ``errors`` : (r, w), ``before`` :
-    (N,) whitened; ``square`` : of what remained at first; ``effects`` : candidates with their whitened motions (N,
-    c)."""
+    (N,) whitened; ``square`` : of what remained at first; ``root`` : roots of the weights of all rows, 0 for rows left
+    out; ``effects`` : candidates with their whitened motions (N, c)."""
 
     errors: np.ndarray
     before: np.ndarray
@@ -132,21 +146,20 @@ class _Rest:
     remaining: np.ndarray
     square: float
     freedom: int
-    rows: int
-    effects: list[tuple["_Candidate", np.ndarray]]
+    root: np.ndarray
+    effects: list[tuple[_Effect, np.ndarray]]
 
     @classmethod
     def of(
         cls,
         errors: np.ndarray,
         explained: np.ndarray,
-        candidates: list["_Candidate"],
+        candidates: list[_Effect],
         weighting: Weighting,
         measured: Observed,
         root: np.ndarray,
     ) -> "_Rest":
-        """Returns the unexplained part of ``errors`` (r, w); ``root`` : (r,) roots of the weights, 0 for rows left
-        out."""
+        """Returns the unexplained part of ``errors`` (r, w) after the motions ``explained`` (r, w, k)."""
 
         def white(values: np.ndarray) -> np.ndarray:
             return (root[:, None, None] * weighting.whiten(values, measured)).reshape(errors.size, -1)
@@ -158,7 +171,7 @@ class _Rest:
         freedom = int(good.sum()) * errors.shape[1] - fitted.shape[1]
         effects = [(each, white(each.motions)) for each in candidates] if freedom >= LEAST_FREEDOM else []
         square = float(remaining @ remaining)
-        return cls(errors[good], before, fitted, remaining, square, freedom, int(good.sum()), effects)
+        return cls(errors[good], before, fitted, remaining, square, freedom, root, effects)
 
     def _effect(self, takes: np.ndarray, part: slice) -> float:
         """Returns the RMS of ``takes`` (N,), rad or mm."""
@@ -166,11 +179,10 @@ class _Rest:
         unit, size, taken = (
             float((each.reshape(-1, width)[:, part] ** 2).sum()) for each in (self.errors, self.before, takes)
         )
-        return float(np.sqrt(unit / self.rows / max(size, 1e-300) * taken))
+        return float(np.sqrt(unit / np.count_nonzero(self.root) / max(size, 1e-300) * taken))
 
-    def strongest(self, others: int) -> tuple[_Found, "_Candidate", "_Rest"] | None:
-        """Returns the candidate that explains most beyond chance, and the rest without it; ``others`` : number of
-        further tests."""
+    def strongest(self, others: int) -> _Found | None:
+        """Returns the candidate that explains most beyond chance; ``others`` : number of further tests."""
         tried = [
             (each, test)
             for each, values in self.effects
@@ -193,21 +205,8 @@ class _Rest:
             remaining=self.remaining - best.takes,
             freedom=self.freedom - best.new.shape[1],
         )
-        return (
-            _Found(Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p), log_p),
-            candidate,
-            rest,
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """A candidate. ``motions`` : (r, w, c) of the tool as observed, in any scale."""
-
-    what: str
-    joint: int
-    turns: int
-    motions: np.ndarray
+        finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
+        return _Found(finding, log_p, candidate.motions, self.root, rest)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -257,22 +256,10 @@ def _shared(state: State, measured: Observed) -> np.ndarray:
     return np.concatenate([away * (measured.second == row)[:, None] for row in starts], axis=1)[:, None]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Order:
-    """What may have moved between two rows. ``motions`` : (r, w, c) as observed, rad over mm where c is 6; ``advice`` :
-    what to do about a jump; ``slides`` : True for a prismatic joint, whose motion is in mm."""
-
-    what: str
-    joint: int
-    motions: np.ndarray
-    advice: str
-    slides: bool = False
-
-
 DRIFTS = "let the instrument warm up, and measure a fixed point now and then"
 
 
-def _order(state: State, measured: Observed) -> list[_Order]:
+def _order(state: State, measured: Observed) -> list[_Effect]:
     """Returns what may move during the measurements; none for distances, which no frame enters."""
     if measured.used == "distance":
         return []
@@ -281,7 +268,8 @@ def _order(state: State, measured: Observed) -> list[_Order]:
     frame[:, :3, :3] = frame[:, 3:, 3:] = np.eye(3)
     frame[:, 3:, :3] = -skew(tip.translation - tip.translation.mean(0))
     advice = "name these rows another station (column station), or measure again"
-    order = [_Order("the instrument or the robot's base elsewhere", 0, as_seen(state, measured, tip, frame), advice)]
+    what = "the instrument or the robot's base elsewhere"
+    order = [_Effect(what, 0, as_seen(state, measured, tip, frame), advice=advice)]
     for name in dict.fromkeys(data.targets):
         on_flange = np.zeros((len(tip), 6, 6))
         on_flange[:, :3, :3] = on_flange[:, 3:, 3:] = tip.rotation
@@ -289,34 +277,24 @@ def _order(state: State, measured: Observed) -> list[_Order]:
         on_flange = on_flange if measured.kind == "pose" else on_flange[..., 3:]
         what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
         advice = "name these rows another target (column target), or measure again"
-        order.append(_Order(what, 0, as_seen(state, measured, tip, on_flange), advice))
-    turned, origins = joint_frames(state.chain, data.q, data.conditions)
-    carries = state.chain.carries(data.targets)
-    for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
-        turn, shift = (0 * z, z) if state.chain.prismatic[i] else (z, np.cross(z, tip.translation - origin))
-        motions = np.hstack([turn, shift])[:, :, None] * carries[i, :, None, None]
+        order.append(_Effect(what, 0, as_seen(state, measured, tip, on_flange), advice=advice))
+    twists = joint_motions(state.chain, data.q, tip, data.conditions)
+    twists = twists * state.chain.carries(data.targets)[:, :, None]
+    for i, (twist, slides) in enumerate(zip(twists, state.chain.prismatic.tolist(), strict=True)):
+        motions = twist[:, :, None]
         what, advice = f"the zero of joint {i + 1} another one", "look whether it slipped, and measure again"
-        slides = bool(state.chain.prismatic[i])
-        order.append(_Order(what, i + 1, as_seen(state, measured, tip, motions), advice, slides))
+        order.append(_Effect(what, i + 1, as_seen(state, measured, tip, motions), advice=advice, slides=slides))
     return order
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Moved(_Found):
-    """A finding along the order of rows, with its effects (r, w, c), and a mask (r,) of rows that are no errors."""
-
-    motions: np.ndarray
-    good: np.ndarray
-
-
 def _moved_meanwhile(
-    order: list[_Order],
+    order: list[_Effect],
     errors: np.ndarray,
     explained: np.ndarray,
     weighting: Weighting,
     measured: Observed,
     tests: int,
-) -> _Moved | None:
+) -> _Found | None:
     """Returns the jump or the drift along the order of the rows; None if there is none beyond chance."""
     white = weighting.whiten(errors, measured), weighting.whiten(explained, measured)
     changes = changes_along(*white, [weighting.whiten(each.motions, measured) for each in order])
@@ -338,7 +316,7 @@ def _moved_meanwhile(
         what = f"the order of the rows, {moved.what} from {where} on"
     p = float(np.exp(min(log_p, 0.0)))
     finding = Finding(what, moved.joint, 0, mm, rad, change.share, p, line, advice)
-    return _Moved(finding, log_p, change.moves[:, None, None] * moved.motions, change.good)
+    return _Found(finding, log_p, change.moves[:, None, None] * moved.motions, change.good.astype(float))
 
 
 def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:
@@ -349,7 +327,7 @@ def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Fin
     return found.finding if found is not None and found.finding.share > share else None
 
 
-def _size(moved: _Order, change: Change) -> tuple[float, float]:
+def _size(moved: _Effect, change: Change) -> tuple[float, float]:
     """Returns the size of a change, mm and rad: of frames at the middle of the places, of joints as seen."""
     if moved.motions.shape[2] == 6:
         return float(np.linalg.norm(change.motion[3:])), float(np.linalg.norm(change.motion[:3]))
@@ -359,7 +337,7 @@ def _size(moved: _Order, change: Change) -> tuple[float, float]:
     return float(np.sqrt((as_measured**2).mean())), turned
 
 
-def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> list[_Candidate]:
+def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> list[_Effect]:
     chain, data = state.chain, measured.data
     tip = tips_of(state, data)
     turned, origins = joint_frames(chain, data.q, data.conditions)
@@ -372,11 +350,11 @@ def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> lis
     def add(what: str, motions: np.ndarray, joint: int = 0, turns: int = 0) -> None:
         if joint:
             motions = motions * carries[joint - 1, :, None, None]
-        candidates.append(_Candidate(what, joint, turns, as_seen(state, measured, tip, motions)))
+        candidates.append(_Effect(what, joint, as_seen(state, measured, tip, motions), turns))
 
-    for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
+    twists = joint_motions(chain, data.q, tip, data.conditions)
+    for i, (z, origin, twist) in enumerate(zip(turned[..., 2], origins, twists, strict=True)):
         joint, arm = i + 1, tip.translation - origin
-        twist = np.hstack([np.zeros_like(z), z] if chain.prismatic[i] else [z, np.cross(z, arm)])
         for k in range(len(chain.prismatic)):
             if k != i:
                 what = f"the value of joint {k + 1}, along the motion of joint {joint}"

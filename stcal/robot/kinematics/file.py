@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import require_written, save
-from stcal.io.table import LEVER_MM, pose_values
+from stcal.io.table import LEVER_MM, POSE, pose_values
 from stcal.io.toml import Finite, PoseEntry, Sized, Strict, load_toml, toml_string
 from stcal.lengths import require_millimetres, stated_unusual
 from stcal.robot.kinematics.conditions import MOST_KG
@@ -32,7 +32,6 @@ WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
 OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")
 """Endings of files of robots that are converted first."""
-POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 MOST_JOINTS = 60
 """Largest number of joints, that of a humanoid with hands."""
 WRITTEN_MM = 1e-5
@@ -350,7 +349,7 @@ _KEYS = {"a": "a_mm", "alpha": "alpha_deg", "d": "d_mm", "theta": "theta_deg", "
 
 def _pose_lines(pose: Rigid) -> list[str]:
     values = (*pose.translation, *Poses.of([pose]).quaternions()[0])
-    return [f"{key} = {_number(value)}" for key, value in zip(POSE_KEYS, values, strict=True)]
+    return [f"{key} = {_number(value)}" for key, value in zip(POSE, values, strict=True)]
 
 
 def _number(value: float) -> str:

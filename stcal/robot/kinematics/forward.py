@@ -70,13 +70,17 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     """
     values = _joint_vectors(q, robot)
     chain = _from_base_to_tool(robot, tool)
-    axes, origins = joint_frames(chain, values)
-    z = axes[..., 2]  # (n, m, 3)
-    swept = np.cross(z, flange_poses(chain, values).translation - origins)
-    sliding = chain.prismatic[:, None, None]
-    columns = np.concatenate([np.where(sliding, 0.0, z), np.where(sliding, z, swept)], axis=2)
     path = list(chain.path())
+    columns = joint_motions(chain, values, flange_poses(chain, values))
     return np.moveaxis(columns[path], 0, 2) @ chain.coupling[path]
+
+
+def joint_motions(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
+    """Returns the motion (n, m, 6) of ``tip``, rad over mm in the world's axes, by the value of each joint."""
+    axes, origins = joint_frames(chain, q, conditions)
+    z = axes[..., 2]  # (n, m, 3)
+    swept, sliding = np.cross(z, tip.translation - origins), chain.prismatic[:, None, None]
+    return np.concatenate([np.where(sliding, 0.0, z), np.where(sliding, z, swept)], axis=2)
 
 
 def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> Poses:

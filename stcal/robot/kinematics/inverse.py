@@ -94,9 +94,9 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
         weight[:3] = ORIENTATION_WEIGHT
     rows, goal = np.arange(len(q)), poses
     error = problem.errors(goal, q)
-    damping = np.full(len(q), 1e-2)
+    damping, going = np.full(len(q), 1e-2), np.ones(len(q), bool)
     for _ in range(ROUNDS):
-        going = ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
+        going &= ~((np.abs(error[:, :3]).max(axis=1) <= DONE_RAD) & (np.abs(error[:, 3:]).max(axis=1) <= DONE_MM))
         rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
         if not len(rows):
             break
@@ -110,8 +110,7 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
         error = np.where(better[:, None], new, error)
         damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-12, 1e12)
         stuck = (np.abs(trial - q[rows]).max(axis=1) < 1e-15) & ~better | (gain < 1e-15)
-        keep = ~stuck
-        rows, goal, error, damping = rows[keep], goal[keep], error[keep], damping[keep]
+        going = ~stuck
     return _position_exact(problem, poses, q, bounds) if problem.under_actuated else q
 
 

@@ -79,24 +79,20 @@ class CompensationFile(ResultFile):
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Stayed:
-    """``found`` : solutions in the configuration of their joint values; ``beyond`` : by row the limits that prevent
-    it."""
-
-    found: Inverse
-    beyond: dict[int, str]
-
-
-def stayed(
-    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, inverse: Inverse, rows: np.ndarray
-) -> Stayed:
-    """Checks solutions near ``near`` (m, n) for changes of configuration, solving ``rows`` without limits. A row whose
-    nearest solution is beyond the limits gets status ``limit`` and joint values there."""
-    if not len(rows) or len(robot.rows) > ISOLATED:
-        return Stayed(inverse, {})
-    some = targets[rows]
-    free = joints_of(_between(robot, np.tile([-np.inf, np.inf], (len(robot.rows), 1))), some, poses[rows], near[rows])
+def _stayed(
+    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None, inverse: Inverse, known: np.ndarray
+) -> tuple[Inverse, dict[int, str]]:
+    """Returns solutions in the configuration of the commanding joint values ``near`` (m, n), where these are ``known``
+    (m,), and by row the limits that prevent it. A row whose nearest solution is beyond the limits gets status ``limit``
+    and joint values there."""
+    if near is None or not known.any() or len(robot.rows) > ISOLATED:
+        return inverse, {}
+    away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
+    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in inverse.status])))
+    if not len(rows):
+        return inverse, {}
+    unlimited = _between(robot, np.tile([-np.inf, np.inf], (len(robot.rows), 1)))
+    free = joints_of(unlimited, targets[rows], poses[rows], near[rows])
     q, status = inverse.q.copy(), list(inverse.status)
     error_mm, error_rad = inverse.error_mm.copy(), inverse.error_rad.copy()
     beyond = {}
@@ -112,7 +108,7 @@ def stayed(
             limits = np.column_stack([least, most]).clip(*robot.limits().T[:, :, None])
             at = joints_of(_between(robot, limits), targets[rows[[k]]], poses[[i]], near[[i]])
             q[i], error_mm[i], error_rad[i], status[i] = at.q[0], at.error_mm[0], at.error_rad[0], LIMIT
-    return Stayed(Inverse(q, tuple(status), error_mm, error_rad), beyond)
+    return Inverse(q, tuple(status), error_mm, error_rad), beyond
 
 
 def _between(robot: Robot, limits: np.ndarray) -> Robot:
@@ -299,29 +295,38 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
             f"nominal robot {nominal.name} and identified robot {identified.name}: joints of different number, type or "
             "order; files of the same robot needed",
         )
-    if nominal is None:
-        return _without_nominal(identified, targets)
-    apart, rigid, roles = robots_apart(identified, nominal), _rigid(identified, targets), _roles(identified, nominal)
-    radians = _in_radians(targets, identified.prismatic)
-    identified, nominal, others = _with_one_tool(identified, nominal, targets)
-    confirmed, doubts = on_targets(nominal, targets)
-    poses = poses_of(nominal, targets, targets.joints()) if targets.poses is None else targets.poses
-    before = joints_of(nominal, targets, poses, targets.q)
-    off = poses.difference(poses_of(identified, targets, before.q))
-    found = joints_of(identified, targets, poses, before.q)
-    doubts += () if confirmed else out_of_reach(identified, targets, found)
-    stay = _stayed(identified, targets, poses, before.q, found, before.usable)
+    if nominal is None and targets.poses is None:
+        raise InputError(
+            "E-TARGETS-NO-POSES",
+            f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
+            "give its file with --nominal",
+        )
+    doubts, others, rigid = (), (), _rigid(identified, targets)
+    if nominal is not None:
+        apart = robots_apart(identified, nominal)
+        doubts = ((apart,) if apart else ()) + _roles(identified, nominal) + _in_radians(targets, identified.prismatic)
+        identified, nominal, others = _with_one_tool(identified, nominal, targets)
+    commander = nominal or identified
+    confirmed, of_targets = on_targets(commander, targets)
+    poses = poses_of(commander, targets, targets.joints()) if targets.poses is None else targets.poses
+    before, off, near, known = None, np.zeros((0, 6)), targets.q, np.full(len(targets), confirmed)
+    if nominal is not None:
+        before = joints_of(nominal, targets, poses, targets.q)
+        off, near, known = poses.difference(poses_of(identified, targets, before.q)), before.q, before.usable
+    found = joints_of(identified, targets, poses, near)
+    of_targets += () if confirmed else out_of_reach(identified, targets, found)
+    found, beyond = _stayed(identified, targets, poses, near, found, known)
     return Compensated(
         targets=targets,
         poses=poses,
-        found=stay.found,
+        found=found,
         nominal=before,
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
         sliding=identified.prismatic,
         reach_mm=reach_mm(identified, targets.tools[0]),
-        beyond=stay.beyond,
-        doubts=(*((apart,) if apart else ()), *roles, *radians, *doubts, *others, *rigid),
+        beyond=beyond,
+        doubts=doubts + of_targets + others + rigid,
         controller=nominal,
     )
 
@@ -333,14 +338,13 @@ ROUND_MM = 0.01
 
 def _roles(identified: Robot, nominal: Robot) -> tuple[str, ...]:
     """Returns a doubt if the files seem exchanged, or hold the same arm."""
-    lengths = [np.array([[row.a, row.d] for row in robot.rows]) for robot in (identified, nominal)]
-    if (identified.rows, identified.elasticity) == (nominal.rows, nominal.elasticity) and _same_tools(
-        identified, nominal
-    ):
+    one, other = ((robot.rows, robot.elasticity, robot.tools) for robot in (identified, nominal))
+    if one == other:
         return (
             f"identified robot {identified.name} and nominal robot {nominal.name} are the same, so that nothing "
             "is compensated: give the file of identify with --robot, and the model in the controller with --nominal",
         )
+    lengths = [np.array([[row.a, row.d] for row in robot.rows]) for robot in (identified, nominal)]
     drawn = [bool((np.abs(each / ROUND_MM - np.round(each / ROUND_MM)) < 1e-6).all()) for each in lengths]
     if drawn == [True, False]:
         return (
@@ -363,21 +367,6 @@ def _in_radians(targets: Targets, sliding: np.ndarray) -> tuple[str, ...]:
     )
 
 
-def _same_tools(one: Robot, other: Robot) -> bool:
-    return one.tools.keys() == other.tools.keys() and all(
-        np.array_equal(tool.matrix(), other.tools[name].matrix()) for name, tool in one.tools.items()
-    )
-
-
-def _stayed(
-    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, inverse: Inverse, known: np.ndarray
-) -> Stayed:
-    """Removes changes of configuration in the rows whose commanding joint values ``near`` (m, n) are ``known``."""
-    away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
-    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in inverse.status])))
-    return stayed(robot, targets, poses, near, inverse, rows)
-
-
 def _built(robot: Robot) -> list[tuple[str, int]]:
     """Returns for each joint its type and the joint that carries it."""
     return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
@@ -386,34 +375,6 @@ def _built(robot: Robot) -> list[tuple[str, int]]:
 def _rigid(robot: Robot, targets: Targets) -> tuple[str, ...]:
     """Returns a note if the robot's model has no elasticity, although loads are stated."""
     return targets.conditions.ignored(f"robot {robot.name}") if robot.elasticity is None else ()
-
-
-def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
-    if targets.poses is None:
-        raise InputError(
-            "E-TARGETS-NO-POSES",
-            f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
-            "give its file with --nominal",
-        )
-    confirmed, doubts = on_targets(identified, targets)
-    found, none = joints_of(identified, targets, targets.poses, targets.q), np.zeros(0)
-    doubts += () if confirmed else out_of_reach(identified, targets, found)
-    if confirmed and targets.q is not None:
-        stay = _stayed(identified, targets, targets.poses, targets.q, found, np.ones(len(found), bool))
-    else:
-        stay = Stayed(found, {})
-    return Compensated(
-        targets=targets,
-        poses=targets.poses,
-        found=stay.found,
-        nominal=None,
-        before_mm=none,
-        before_rad=none,
-        sliding=identified.prismatic,
-        reach_mm=reach_mm(identified, targets.tools[0]),
-        beyond=stay.beyond,
-        doubts=doubts + _rigid(identified, targets),
-    )
 
 
 def joint_columns(robot: Robot) -> list[str]:
@@ -448,21 +409,20 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
     if result.nominal:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
     rows: list[Sequence] = [head]
-    none = [""] * len(columns)
+
+    def joints(inverse: Inverse, i: int) -> list[str]:
+        cells = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
+        return [*cells, inverse.status[i]]
+
+    def errors(mm: float, rad: float) -> list[str]:
+        return [f"{mm:.6f}", f"{np.degrees(rad):.6f}"]
+
     for i, line in enumerate(result.targets.lines):
-        found = result.found
-        row = [
-            *(own[i] for own in names.values()),
-            line,
-            result.targets.tools[i],
-            *(joint_cells(robot, found.q[i]) if found.usable[i] else none),
-        ]
-        row += [found.status[i], f"{found.error_mm[i]:.6f}", f"{np.degrees(found.error_rad[i]):.6f}"]
+        row = [*(own[i] for own in names.values()), line, result.targets.tools[i], *joints(result.found, i)]
+        row += errors(result.found.error_mm[i], result.found.error_rad[i])
         if result.nominal:
-            usable = result.nominal.usable[i]
-            row += joint_cells(robot, result.nominal.q[i]) if usable else none
-            row.append(result.nominal.status[i])
-            row += [f"{result.before_mm[i]:.6f}", f"{np.degrees(result.before_rad[i]):.6f}"] if usable else ["", ""]
+            row += joints(result.nominal, i)
+            row += errors(result.before_mm[i], result.before_rad[i]) if result.nominal.usable[i] else ["", ""]
         rows.append(row)
     return csv_text(rows)
 

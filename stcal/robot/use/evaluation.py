@@ -26,7 +26,7 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips_of,
 )
-from stcal.robot.identification.prior import Placed, base_name, tool_name
+from stcal.robot.identification.prior import BASE, Placed, tool_name
 from stcal.robot.identification.report import FoundLeft, PlacedPart
 from stcal.robot.identification.result import position_errors
 from stcal.robot.identification.start import Fit, start
@@ -48,7 +48,10 @@ CHANCE = 0.05
 """Probability of calling one of two equal robots better."""
 
 
-class ErrorFigures(Part):
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Summary of the errors of a number of rows; mm, or rad for orientations."""
+
     rows: int
     mean: float
     median: float
@@ -56,12 +59,17 @@ class ErrorFigures(Part):
     p95: float
     max: float
 
+    @classmethod
+    def of(cls, errors: np.ndarray) -> "Figures":
+        rms, p95 = np.sqrt((errors**2).mean()), np.percentile(errors, 95)
+        return cls(len(errors), *(float(v) for v in (errors.mean(), np.median(errors), rms, p95, errors.max())))
+
 
 class EvaluatedRobot(Part):
     name: str
-    position_mm: ErrorFigures
-    good_mm: ErrorFigures
-    orientation_rad: ErrorFigures | None
+    position_mm: Figures
+    good_mm: Figures
+    orientation_rad: Figures | None
     placed: list[PlacedPart] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
     left: list[FoundLeft] | None = Field(
         description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
@@ -78,12 +86,19 @@ class EvaluatedRobot(Part):
     )
 
 
-class RobotDifference(Part):
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Mean error of ``worse`` minus ``better`` on the same rows; ``p`` : by chance, times the number of comparisons."""
+
     better: str
     worse: str
     mm: float
     sigma_mm: float
     p: float
+
+    @property
+    def real(self) -> bool:
+        return self.p < CHANCE
 
 
 class EvaluationFile(ResultFile):
@@ -101,27 +116,10 @@ class EvaluationFile(ResultFile):
         description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "
         "the wrong ones, `orientation_rad` where measured: `rows`, `mean`, `median`, `rms`, `p95`, `max`"
     )
-    differences: list[RobotDifference] = Field(
+    differences: list[Difference] = Field(
         description="`mm`: mean error of the `worse` robot less that of the `better` on the same rows without the "
         "wrong ones, its `sigma_mm`, and `p` times the number of comparisons"
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """Summary of the errors of a number of rows; mm, or rad for orientations."""
-
-    rows: int
-    mean: float
-    median: float
-    rms: float
-    p95: float
-    max: float
-
-    @classmethod
-    def of(cls, errors: np.ndarray) -> "Figures":
-        rms, p95 = np.sqrt((errors**2).mean()), np.percentile(errors, 95)
-        return cls(len(errors), *(float(v) for v in (errors.mean(), np.median(errors), rms, p95, errors.max())))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,21 +149,6 @@ class Evaluated:
     def errors_mm(self) -> np.ndarray:
         """Lengths (r,) of the position errors, mm."""
         return position_errors(self.residuals)
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """Mean error of ``worse`` minus ``better`` on the same rows; ``p`` : by chance, times the number of comparisons."""
-
-    better: str
-    worse: str
-    mm: float
-    sigma_mm: float
-    p: float
-
-    @property
-    def real(self) -> bool:
-        return self.p < CHANCE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,7 +315,7 @@ def _placed(
         sigma = np.full(6, np.nan)
         if "base" in fit:
             sigma, at = np.sqrt(np.diag(covariance)[:6]), 6
-        placed.append(Placed(base_name(), base, sigma))
+        placed.append(Placed(BASE, base, sigma))
     for name, tool in state.tools.items():
         sigma = np.full(6, np.nan)
         if "tool" in fit:

@@ -1,14 +1,14 @@
 """Text and pages of compensation, verification, evaluation and pose design."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.table import QUATERNION, csv_text, read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
@@ -35,7 +35,8 @@ def verification_figure(result: Verification) -> Drawing:
     box = drawing.panels(top=12 + 14 * -(-len(sizes) // 2))[0]
     x, y = (1, at[-1] + 0.02 * len(at) + 0.5), limits(np.concatenate(sizes), low=0)
     axes = _pose_by_pose(Axes(drawing, box, x, y), "|distance error|, mm")
-    for k, (each, size, colour) in enumerate(zip(result.sets, sizes, _colours(len(sizes)), strict=True)):
+    colours = cycle([COLOURS[1], COLOURS[0], *COLOURS[2:]])  # warm for before, cool for after, then the others
+    for k, (each, size, colour) in enumerate(zip(result.sets, sizes, colours, strict=False)):
         axes.lines([(at, size)], colour, 1.1)
         axes.marks(at, size, "dot", 2.6 if len(at) <= 120 else 1.1, colour)
         axes.level(each.mean_mm, colour, 0.9, DASH)
@@ -150,12 +151,6 @@ def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
     return rows
 
 
-def _colours(count: int) -> list[str]:
-    """Returns the colours: warm for before, cool for after, then the rest of the palette."""
-    order = [COLOURS[1], COLOURS[0], *COLOURS[2:]]
-    return [order[i % len(order)] for i in range(count)]
-
-
 def design_report(result: PoseDesign, robot: Robot) -> Document:
     """Returns the report of ``design``: indices of the chosen poses against random ones, places, joint values."""
     sigma_sentence = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
@@ -208,8 +203,8 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
                 [
                     "Tool in the robot's base (square: its origin); the arrow is the tool's z axis",
                     plots(
-                        plot(lambda: _places(result, 1), "tool positions from above", "From above", ""),
-                        plot(lambda: _places(result, 2), "tool positions from the side", "From the side", ""),
+                        plot(lambda: _tool_figure(result, 1), "tool positions from above", "From above", ""),
+                        plot(lambda: _tool_figure(result, 2), "tool positions from the side", "From the side", ""),
                     ),
                 ],
             ),
@@ -251,7 +246,7 @@ def _index_figure(result: PoseDesign) -> Drawing:
     return drawing
 
 
-def _places(result: PoseDesign, up: int) -> Drawing:
+def _tool_figure(result: PoseDesign, up: int) -> Drawing:
     """Returns a plot of the tool's positions and z axes: x against the coordinate ``up``."""
     at, z = result.poses.translation[:, [0, up]], result.poses.rotation[:, [0, up], 2]
     z = 0.12 * float(np.ptp(result.poses.translation, axis=0).max()) * z
@@ -373,40 +368,41 @@ def evaluated_csv(result: Evaluation) -> str:
     str
         CSV in mm and degrees (form: ``data_layout.md``).
     """
-    data, robots = result.seen.data, result.robots
-    turned, points = len(robots[0].rotation_rad) > 0, data.positions is not None
-    head = ["line", "target", *joint_columns(robots[0].robot)]
-    measured = ("x_mm", "y_mm", "z_mm") if points else ("distance_mm", "from_row")
-    head += [*measured, *(QUATERNION if turned else ()), "wrong"]
-    modelled = []
-    for evaluated in robots:
-        name = re.sub(r"\W+", "_", evaluated.robot.name)
-        place = "commanded" if len(robots) == 1 else name
-        if points:
-            head += [*(f"{place}_{c}_mm" for c in "xyz"), *(f"{name}_residual_{c}_mm" for c in "xyz")]
-        else:
-            head.append(f"{name}_residual_mm")
-        head += [f"{name}_error_mm", *([f"{name}_error_deg"] if turned else [])]
-        modelled.append(tips_of(evaluated.state, data).translation)
-    table: list[Sequence] = [head]
-    turns = Poses(data.rotations, data.points()).quaternions() if data.rotations is not None else None
-    place_of = {int(row): i for i, row in enumerate(result.seen.first)}
-    for row in range(len(data)):
-        at = place_of.get(row)  # none where a distance starts from itself
-        cells: list = [data.lines[row], data.targets[row], *joint_cells(robots[0].robot, data.q[row])]
+    data, robots, seen = result.seen.data, result.robots, result.seen.first
+    turned = data.rotations is not None
+    columns: list[tuple[str, Iterable]] = [("line", data.lines), ("target", data.targets)]
+    joints = (joint_cells(robots[0].robot, q) for q in data.q)
+    columns += zip(joint_columns(robots[0].robot), zip(*joints, strict=True), strict=True)
+    if data.positions is not None:
+        columns += _places("{}_mm", data.positions)
+    else:
+        distances, from_row = data.lengths()
+        columns += [("distance_mm", _cells(distances)), ("from_row", from_row + 1)]
+    if turned:
+        quaternions = [[f"{v:.12f}" for v in column] for column in data.poses().quaternions().T]
+        columns += zip(QUATERNION, quaternions, strict=True)
+    wrong = dict(zip(seen.tolist(), result.wrong.astype(int).tolist(), strict=True))
+    columns.append(("wrong", [wrong.get(row, "") for row in range(len(data))]))  # a distance from itself is not judged
+    for each in robots:
+        name = re.sub(r"\W+", "_", each.robot.name)
+        residuals = np.zeros((len(data), each.residuals.shape[1]))
+        residuals[seen] = each.residuals
         if data.positions is not None:
-            cells += _cells(data.positions[row])
+            place = "commanded" if len(robots) == 1 else name
+            columns += _places(f"{place}_{{}}_mm", tips_of(each.state, data).translation)
+            columns += _places(f"{name}_residual_{{}}_mm", residuals)
         else:
-            distances, from_row = data.lengths()
-            cells += [*_cells(distances[[row]]), from_row[row] + 1]
-        cells += [f"{v:.12f}" for v in turns[row]] if turns is not None else []
-        cells.append("" if at is None else int(result.wrong[at]))
-        for evaluated, there in zip(robots, modelled, strict=True):
-            residual = np.zeros(evaluated.residuals.shape[1]) if at is None else evaluated.residuals[at]
-            cells += [*(_cells(there[row]) if points else ()), *_cells(residual), *_cells([np.linalg.norm(residual)])]
-            cells += _cells(np.degrees(evaluated.rotation_rad[[row]])) if turned else []
-        table.append(cells)
-    return csv_text(table)
+            columns.append((f"{name}_residual_mm", _cells(residuals[:, 0])))
+        columns.append((f"{name}_error_mm", _cells(np.linalg.norm(residuals, axis=1))))
+        if turned:
+            columns.append((f"{name}_error_deg", _cells(np.degrees(each.rotation_rad))))
+    heads, cells = zip(*columns, strict=True)
+    return csv_text([heads, *zip(*cells, strict=True)])
+
+
+def _places(head: str, xyz: np.ndarray) -> list[tuple[str, list[str]]]:
+    """Returns the columns of places (m, 3) with their heads."""
+    return [(head.format(axis), _cells(values)) for axis, values in zip("xyz", xyz.T, strict=True)]
 
 
 def require_evaluated_written(path: str | Path, result: Evaluation) -> None:

@@ -13,6 +13,7 @@ from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
+from stcal.robot.identification.observability import over_ranges
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention
 from stcal.robot.kinematics.forward import forward
@@ -187,13 +188,11 @@ def rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
 def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
     """Returns the pairs of tool and mass at the flange (None: the robot's), each with its rows."""
     mass = targets.conditions.payload_kg
-    if mass is None:
-        return [(name, None, rows) for name, rows in rows_by_tool(targets)]
-    return [
-        (name, value, rows[mass[rows] == value])
-        for name, rows in rows_by_tool(targets)
-        for value in np.unique(mass[rows]).tolist()
-    ]
+    masses = [None] * len(targets) if mass is None else mass.tolist()
+    rows: dict[tuple[str, float | None], list[int]] = {}
+    for row, pair in enumerate(zip(targets.tools, masses, strict=True)):
+        rows.setdefault(pair, []).append(row)
+    return [(*pair, np.array(own)) for pair, own in rows.items()]
 
 
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
@@ -236,14 +235,7 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     to a thousandth of their reach. Raises InputError: they cannot be of one robot."""
     ends = [""] if identified.tree is None else list(identified.tree.carriers)
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
-    rng = np.random.default_rng(0)
-    limits = identified.limits()
-    half = np.where(identified.prismatic, reach_mm(identified, ends[0]), np.pi)
-    low, high = (
-        np.where(np.isfinite(limits[:, 0]), limits[:, 0], -half),
-        np.where(np.isfinite(limits[:, 1]), limits[:, 1], half),
-    )
-    q = rng.uniform(low, high, (SAMPLE, len(half)))
+    q = over_ranges(identified, SAMPLE, ends[0])
     off = [forward(identified, q, end).translation - forward(nominal, q, end).translation for end in ends]
     apart, reach = max(map(_rms, off)), max(reach_mm(each, end) for each in (identified, nominal) for end in ends)
     if apart <= USUAL_SHARE * reach:

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
-from stcal.io.json import Part, ResultFile, Vector
+from stcal.io.json import Finite, Part, ResultFile, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
@@ -48,10 +48,10 @@ BySet = Annotated[str, "set"]
 
 
 class ErrorReduction(Part):
-    mean_percent: float | None
-    std_percent: float | None
-    max_percent: float | None
-    all_pairs_rms_percent: float | None
+    mean_percent: Finite
+    std_percent: Finite
+    max_percent: Finite
+    all_pairs_rms_percent: Finite
 
 
 class MeasuredSet(Part):
@@ -407,24 +407,13 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
 
 def verification_file(result: Verification) -> VerificationFile:
     """Returns the complete result in machine-readable form."""
+    keys = ("mean", "std", "max", "all_pairs_rms")
     sets = []
-    for k, result_of_set in enumerate(result.sets):
-        figures = dict(
-            zip(("mean_mm", "std_mm", "max_mm", "all_pairs_rms_mm"), result_of_set.figures().values(), strict=True)
-        )
-        reduced = dict(zip(figures, result.reduction(k).values(), strict=True)) if k else None
-        reduced = reduced and {
-            key.replace("_mm", "_percent"): v if np.isfinite(v) else None for key, v in reduced.items()
-        }
-        sets.append(
-            {
-                "set": result_of_set.name,
-                **figures,
-                "scale": result_of_set.scale,
-                "reduced": reduced,
-                "error_mm": result_of_set.error_mm,
-            }
-        )
+    for k, each in enumerate(result.sets):
+        figures = {f"{key}_mm": value for key, value in zip(keys, each.figures().values(), strict=True)}
+        reduced = {f"{key}_percent": less for key, less in zip(keys, result.reduction(k).values(), strict=True)}
+        reduced = reduced if k else None
+        sets.append({"set": each.name, **figures, "scale": each.scale, "reduced": reduced, "error_mm": each.error_mm})
     return VerificationFile.model_validate(
         {
             "format": "stcal verification 1",

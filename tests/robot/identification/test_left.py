@@ -10,7 +10,7 @@ from stcal.robot.identification.adjustment import State, Weighting, jacobian, ob
 from stcal.robot.identification.report import identified_file
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.identification.unexplained import _Order, _size, left
+from stcal.robot.identification.unexplained import _Effect, _size, left
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80
@@ -225,5 +225,5 @@ def test_what_is_not_seen_of_base_and_tool_has_no_sigma():
 def test_the_zero_of_a_joint_that_slides_has_no_angle():
     change = Change("jump", 2, 2, 2, np.array([0.5]), np.array([0, 0, 1.0, 1.0]), 0.2, -9.0, np.ones(4, bool))
     for slides, angle in ((True, 0.0), (False, 0.5)):
-        mm, rad = _size(_Order("the zero of joint 1", 1, np.ones((4, 3, 1)), "", slides), change)
+        mm, rad = _size(_Effect("the zero of joint 1", 1, np.ones((4, 3, 1)), slides=slides), change)
         assert (mm, rad) == (pytest.approx(0.5 * np.sqrt(3)), angle)
