@@ -111,7 +111,7 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
     tools = list(tools)
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
     turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
-    return np.where(turning, 1 / max(reach_mm(robot, tool) for tool in tools), 1.0)
+    return np.where(turning, 1 / reach_mm(robot, tools), 1.0)
 
 
 def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
@@ -204,7 +204,7 @@ def over_ranges(robot: Robot, count: int, tool: str = "") -> np.ndarray:
     """Returns random joint values (count, n), rad or mm; a joint without limits moves by half a turn, or by the reach
     with ``tool``, to either side."""
     low, high = robot.limits().T
-    half = np.where(robot.prismatic, reach_mm(robot, tool), np.pi)
+    half = np.where(robot.prismatic, reach_mm(robot, [tool]), np.pi)
     low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
     return np.random.default_rng(SEED).uniform(low, high, (count, len(half)))
 

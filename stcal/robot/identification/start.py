@@ -262,7 +262,7 @@ def _points_of_distances(
     distances, from_row = data.lengths()
     if not fit_points:
         return points, float(np.sqrt((errors(points.ravel()) ** 2).mean()))
-    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    reach = reach_mm(robot, robot.tools)
     around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     # This is a start, converged or not: the adjustment goes on from here, and reports if it does not converge.
     fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]

@@ -1,5 +1,6 @@
 """Inverse kinematics of any serial arm: many poses at once, joint limits, nearest branch."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +43,7 @@ class InverseProblem:
 
     @classmethod
     def of(cls, robot: Robot, tool: str = "") -> "InverseProblem":
-        reach = reach_mm(robot, tool)
+        reach = reach_mm(robot, [tool])
         sliding = robot.prismatic
         unit = np.where(sliding, reach, 1.0)
         bounds = robot.limits() / unit[:, None]
@@ -72,14 +73,17 @@ class InverseProblem:
         return derivative
 
 
-def reach_mm(robot: Robot, tool: str = "") -> float:
-    """Returns an upper bound of the distance from first joint to tool origin, mm: the sum of all links and travels."""
-    whole = robot.chain()
-    chain = whole.branch(whole.carrier(tool))
-    end = chain.last_from_flange @ robot.tool(tool)
-    travel = np.abs(robot.limits()[robot.prismatic])
-    links = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1).sum() + np.linalg.norm(end.translation)
-    return float(max(links + travel[np.isfinite(travel)].sum(), 1.0))
+def reach_mm(robot: Robot, tools: Iterable[str]) -> float:
+    """Returns an upper bound of the distance from first joint to the origin of any of the tools, mm: the sum of all
+    links and travels."""
+    whole, travel = robot.chain(), np.abs(robot.limits()[robot.prismatic])
+    links = []
+    for tool in tools:
+        chain = whole.branch(whole.carrier(tool))
+        end = chain.last_from_flange @ robot.tool(tool)
+        along = np.linalg.norm(chain.translation[list(chain.path()[1:])], axis=1)
+        links.append(along.sum() + np.linalg.norm(end.translation))
+    return float(max(max(links) + travel[np.isfinite(travel)].sum(), 1.0))
 
 
 def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:

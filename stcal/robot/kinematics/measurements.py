@@ -303,7 +303,7 @@ def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
 def _in_reach(data: Measurements, robot: Robot) -> None:
     """Refuses positions farther from the middle one than arm and tool allow."""
     away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
-    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    reach = reach_mm(robot, robot.tools)
     worst = int(away.argmax())
     if (usual := float(np.median(away))) > 2 * reach + LONGEST_TOOL_MM:
         raise InputError(

@@ -324,7 +324,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
         sliding=identified.prismatic,
-        reach_mm=reach_mm(identified, targets.tools[0]),
+        reach_mm=reach_mm(identified, targets.tools[:1]),
         beyond=beyond,
         doubts=doubts + of_targets + others + rigid,
         controller=nominal,

@@ -237,7 +237,7 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
     q = over_ranges(identified, SAMPLE, ends[0])
     off = [forward(identified, q, end).translation - forward(nominal, q, end).translation for end in ends]
-    apart, reach = max(map(_rms, off)), max(reach_mm(each, end) for each in (identified, nominal) for end in ends)
+    apart, reach = max(map(_rms, off)), max(reach_mm(each, ends) for each in (identified, nominal))
     if apart <= USUAL_SHARE * reach:
         return ""
     said = (
@@ -265,7 +265,7 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
         return True, ()
     if targets.q is None:
         return False, _near_base(robot, targets, targets.poses)
-    reached, reach = poses_of(robot, targets, targets.q), reach_mm(robot)
+    reached, reach = poses_of(robot, targets, targets.q), reach_mm(robot, set(targets.tools))
     own = _rms(reached.translation - targets.poses.translation)
     if own <= FITS * reach:
         require_convention(targets.where, targets.tools, reached.rotation, targets.poses.rotation)
@@ -317,7 +317,7 @@ def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Ite
     for names, places in other_axes(poses.translation):
         reason = f"x, y, z were {names}; correct order and signs of the columns of positions"
         yield reason, Poses(poses.rotation, places), reached
-    paired = _paired(targets, poses, reached, reach_mm(robot))
+    paired = _paired(targets, poses, reached, reach_mm(robot, set(targets.tools)))
     if paired is not None:
         yield "joint values stood in other rows; give each pose its own", poses, paired
 
@@ -355,7 +355,7 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
     """Returns a note if all poses are so near the base's origin that metres or inches would also be within reach."""
     far = float(np.linalg.norm(poses.translation, axis=1).max())
     first_joint = replace(robot, world_from_base=Rigid()).chain().translation[0]
-    reach = max(reach_mm(robot, name) for name in set(targets.tools)) + float(np.linalg.norm(first_joint))
+    reach = reach_mm(robot, set(targets.tools)) + float(np.linalg.norm(first_joint))
     fitting = [unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach]
     if not fitting:
         return ()

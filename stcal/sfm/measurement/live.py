@@ -209,7 +209,7 @@ def line_of(content: dict) -> str:
         )
         what = f"faces {content['shown'][0][1].replace(' ', '')}  {place} mm  {turn}°"
     line = f"picture {content['picture']}: {content['status']}: {what}"
-    return f"{line[:82]}{' …' * (len(line) > 82)}  ({content['rate']:.1f} a second)"
+    return f"{line[:80]}{' …' * (len(line) > 80)}  ({content['rate']:.1f} a second)"
 
 
 def drawn(frame: np.ndarray, centres_px: np.ndarray, pose: TargetPose | None, tracker: Tracker) -> np.ndarray:

@@ -135,6 +135,10 @@ def test_every_tool_by_its_name(case):
         own = np.array([n == name for n in names])
         wanted, reached = forward(case.nominal, case.q[own], name), forward(case.real, result.found.q[own], name)
         np.testing.assert_allclose(reached.translation, wanted.translation, atol=1e-8)
+    real, nominal = (replace(robot, tools={"ball": robot.tools["ball"]}) for robot in (case.real, case.nominal))
+    posed = zip(forward(nominal, case.q, "ball"), case.joint_rows(), strict=True)
+    path = case.write(["target", *POSE, *JOINTS], [["ball", *pose_cells(pose), *q] for pose, q in posed])
+    assert "unreachable" not in compensate(real, read_targets(path, real), nominal).found.status
     rows[3][0] = "cube"
     with fails_with("E-ROBOT-NO-TOOL … 5 … 'cube' … MH80 … '', 'ball'"):
         compensate(case.real, read_targets(case.write(["target", *JOINTS], rows), case.real), case.nominal)
