@@ -96,10 +96,25 @@ class PoseFiles:
 
     def read(self, pairs: "Source", timing: "Timing", robot: "Robot | None", progress: "Progress") -> "HandEyeInput":
         """Returns the poses, from :meth:`pairs`."""
-        from stcal.workflows.handeye_inputs import read_input
+        from stcal.workflows.handeye_inputs import read_handeye
 
-        images, said = (self.poses, self.camera, self.board), self.statements()
-        return read_input(pairs, *images, self.workers, progress, self.quaternions, said, timing, robot)
+        return read_handeye(
+            pairs,
+            self.poses,
+            self.camera,
+            self.board,
+            setup=self.setup,
+            rotation=self.rotation or (),
+            length_unit=self.length_unit or (),
+            poses_are=self.poses_are or (),
+            quaternions=self.quaternions,
+            tolerance_s=timing.tolerance_s,
+            image_times=timing.image_times,
+            time_offset=timing.offset,
+            robot=robot,
+            workers=self.workers,
+            progress=progress,
+        )
 
 
 POSE_FILES = PoseFiles()

@@ -160,6 +160,17 @@ def require_written(
 
     Raises ConvergenceError: the file cannot be read again, or gives other values.
     """
+    difference = _difference(path, read, reported)
+    if not difference <= most:
+        raise ConvergenceError(
+            "E-WRITTEN-DIFFERS",
+            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
+            f"{most:g} allowed; do not use the file, and report this with its data",
+        )
+
+
+def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
+    """Returns the largest difference between a file and the reported values; infinite for another shape."""
     import numpy as np
 
     try:
@@ -170,14 +181,9 @@ def require_written(
             f"{path}: written, and cannot be read again: {error}; do not use the file, and report this with its data",
         ) from error
     reported = np.asarray(reported, float)
-    alike = again.shape == reported.shape and (np.isnan(again) == np.isnan(reported)).all()
-    difference = float(np.nanmax(np.abs(again - reported), initial=0.0)) if alike else float("inf")
-    if not difference <= most:
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
-            f"{most:g} allowed; do not use the file, and report this with its data",
-        )
+    if again.shape != reported.shape or (np.isnan(again) != np.isnan(reported)).any():
+        return float("inf")
+    return float(np.nanmax(np.abs(again - reported), initial=0.0))
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -98,8 +97,7 @@ def detect_files(
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options, pictures)
-    detect = partial(detector or detect_image, camera=camera, target=target, board=board, options=options)
-    jobs = [(file, camera, size_from, detect, settings, pictures) for file in files]
+    jobs = [(file, camera, size_from, target, board, options, settings, detector, pictures) for file in files]
     outcomes: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
@@ -192,8 +190,11 @@ def _detect_file(
     file: ImageFile,
     camera: Camera,
     size_from: str,
-    detect: Callable[[np.ndarray], ImageDetection],
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
     settings: str,
+    detector: Detector | None,
     pictures: bool,
 ) -> tuple[str, bytes] | Skipped:
     """Detects circles in one file; returns the key of the result and its content for the cache."""
@@ -202,7 +203,7 @@ def _detect_file(
         return loaded
     data, image = loaded
     try:
-        detection = detect(image)
+        detection = (detector or detect_image)(image, camera, target, board, options)
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
@@ -344,8 +345,12 @@ def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
     try:
-        image = decode(file.read(), file.name, (camera.width, camera.height))
-    except (InputError, OSError):
+        data = file.read()
+    except OSError:
+        return None
+    try:
+        image = decode(data, file.name, (camera.width, camera.height))
+    except InputError:
         return None
     return measure_predicted(image, camera, predicted, options)
 

@@ -376,7 +376,7 @@ def test_an_interrupted_run_keeps_what_it_has_detected(small_set, stcal_sfm, mon
 def test_a_run_that_is_killed_leaves_nothing_that_looks_complete(small_set, stcal_sfm):
     """With a word, as by Ctrl-C: the test above, and tests/sfm/test_signals.py."""
     small = small_set("12", detected=False)
-    running = subprocess.Popen(command(*small.arguments(*CHAIN)), start_new_session=True)
+    running = subprocess.Popen(command(*small.arguments(*CHAIN)), start_new_session=True, stderr=subprocess.DEVNULL)
     cache = small.out / ".stcal/cache"
     until = time.monotonic() + 60
     while not (cache.is_dir() and any(cache.glob("*.npz"))) and time.monotonic() < until:
