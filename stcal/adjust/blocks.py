@@ -1,12 +1,14 @@
 """What a problem of least squares is stated by: blocks of unknowns, losses, factors and prior knowledge."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
 
+from stcal.adjust.components import Equations
 from stcal.geometry.least_squares import PoseStack as PoseStack
+from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.robust import huber_cost, huber_weights
 
 STEP = 1e-6
@@ -198,3 +200,98 @@ class Prior:
 def numbers(members: np.ndarray | None, slope: np.ndarray) -> np.ndarray:
     """Return the member (r,) on which each row depends."""
     return np.zeros(len(slope), int) if members is None else members
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Rows of a factor about a state: ``slopes`` (r, w, dim) by block and ``residual`` (r, w), over σ and weighted;
+    ``length`` and ``weight`` (r,)."""
+
+    factor: Factor
+    places: tuple[slice | None, ...]
+    slopes: list[np.ndarray]
+    residual: np.ndarray
+    length: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    def of(
+        cls, factor: Factor, values: Mapping[str, Any], sigma: Mapping[str, float], kept: Mapping[str, slice]
+    ) -> "Rows":
+        """Return the rows of a factor about a state; ``kept`` : places of the kept blocks among the unknowns."""
+        white = factor.white(values, sigma)
+        length = np.sqrt((white**2).sum(1))
+        weight = factor.loss.weight(length)
+        root = np.sqrt(weight)
+        slopes = [each * root[:, None, None] for each in factor.slopes(values, sigma)]
+        for (block, members), slope in zip(factor.on, slopes, strict=True):
+            if block.fixed.any():
+                slope[block.fixed[numbers(members, slope)]] = 0.0
+        places = tuple(kept.get(block.name) for block, _ in factor.on)
+        return cls(factor, places, slopes, white * root[:, None], length, weight)
+
+    def of_kinds(self, kinds: Collection[str]) -> "Rows | None":
+        """Return the residuals of some kinds."""
+        own = [i for i, kind in enumerate(self.factor.kinds) if kind in kinds]
+        if isinstance(self.factor.kind, str) or not own:
+            return self if own else None
+        return replace(self, slopes=[each[:, own] for each in self.slopes], residual=self.residual[:, own])
+
+    def total(self, ways: Mapping[str, np.ndarray], part: slice = slice(None)) -> np.ndarray:
+        """Return the derivatives (r, w, q) of a part of the rows by changes of all blocks (n, dim, q), by name."""
+        total: Any = 0.0
+        for (block, index), slope in zip(self.factor.on, self.slopes, strict=True):
+            way = ways[block.name]
+            total = total + slope[part] @ (way[0] if index is None else way[index[part]])
+        return total
+
+    def add(self, sums: Equations) -> None:
+        """Add the rows to the matrices and right sides of equations."""
+        normal, mixed = sums.normal, sums.cross.reshape(-1, sums.cross.shape[2])
+        ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
+        for i, ((own, members), place, slope) in enumerate(ends):
+            square, pull = blocks_of(slope, -self.residual, numbers(members, slope), len(own.start))
+            if place is None:
+                sums.block[:] += square
+                sums.block_right[:] += pull
+            else:
+                at = _unknowns(place, np.arange(len(own.start)), slope)
+                normal[at[:, :, None], at[:, None]] += square
+                sums.right[place] += pull.ravel()
+            for j, (_, other_place, other) in enumerate(ends[:i]):
+                pairs, products = self._products(i, j)
+                one, two = (
+                    _unknowns(which, number, each)
+                    for which, number, each in zip((place, other_place), pairs, (slope, other), strict=True)
+                )
+                back = np.swapaxes(products, 1, 2)
+                if place is None:
+                    mixed[one[:, :, None], two[:, None]] += products
+                elif other_place is None:
+                    mixed[two[:, :, None], one[:, None]] += back
+                else:
+                    normal[one[:, :, None], two[:, None]] += products
+                    normal[two[:, :, None], one[:, None]] += back
+
+    def _products(self, i: int, j: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+        """Return the pairs of members that rows tie, and the sums (u, a, b) of the products of their derivatives."""
+        one, two = self.slopes[i], self.slopes[j]
+        members, others = (self.factor.on[k][1] for k in (i, j))
+        if members is None and others is None:
+            none = np.zeros(1, int)
+            return (none, none), np.tensordot(one, two, ((0, 1), (0, 1)))[None]
+        if (i, j) not in self.factor.order:
+            first, second = numbers(members, one), numbers(others, two)
+            pair = first * (second.max(initial=0) + 1) + second
+            order = np.argsort(pair, kind="stable")
+            starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
+            self.factor.order[i, j] = order, starts, (first[order[starts]], second[order[starts]])
+        order, starts, pairs = self.factor.order[i, j]
+        products = np.swapaxes(one, 1, 2) @ two
+        return pairs, np.add.reduceat(products[order], starts, axis=0) if len(order) else products
+
+
+def _unknowns(place: slice | None, members: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return the numbers (u, dim) of the unknowns of members (u,)."""
+    width = slope.shape[2]
+    return (place.start if place else 0) + width * members[:, None] + np.arange(width)

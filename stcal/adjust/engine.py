@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Values, numbers
+from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Rows, Values, numbers
 from stcal.adjust.components import Components, Equations
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
@@ -218,9 +218,9 @@ class Solution:
         return next((block for block in self.problem.blocks if block.eliminate), None)
 
     @cached_property
-    def rows(self) -> "list[Rows]":
+    def rows(self) -> list[Rows]:
         """Whitened and weighted rows of all factors."""
-        return [Rows.of(factor, self) for factor in self.problem.factors]
+        return [Rows.of(factor, self.values, self.problem.sigma, self.places) for factor in self.problem.factors]
 
     def equations(self, kinds: Collection[str] | None = None) -> Equations:
         """Return the equations of the residuals of some kinds, or of all, without prior knowledge."""
@@ -232,7 +232,7 @@ class Solution:
             square, count = square + float((rows.residual**2).sum()), count + rows.residual.size
         return replace(sums, square=square, count=count)
 
-    def _of(self, kinds: Collection[str] | None) -> "list[Rows]":
+    def _of(self, kinds: Collection[str] | None) -> list[Rows]:
         """Return the residuals of some kinds, or all."""
         return self.rows if kinds is None else [own for rows in self.rows if (own := rows.of_kinds(kinds))]
 
@@ -317,7 +317,7 @@ class Solution:
         normal, along = _alone(self.normal, self.places[block.name])
         return _by_clusters(normal, self.told(along))
 
-    def effects(self, along: np.ndarray) -> "Iterator[tuple[Rows, slice, np.ndarray]]":
+    def effects(self, along: np.ndarray) -> Iterator[tuple[Rows, slice, np.ndarray]]:
         """Yield by batches the rows of each factor, the part of them that it is, and the derivatives (r, w, q) of this
         part by changes ``along`` (k, q) of the kept unknowns."""
         ways = self._ways(along)
@@ -563,97 +563,3 @@ class JoinedSolution:
         each = zip(self.parts, self.reductions, strict=True)
         ways = [(part, np.concatenate([along, -own.from_kept[0] @ along])) for part, own in each]
         return _by_clusters(normal, (told for part, way in ways for told in part.told(way)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rows:
-    """Rows of a factor about a state: ``slopes`` (r, w, dim) by block and ``residual`` (r, w), over σ and weighted;
-    ``length`` and ``weight`` (r,)."""
-
-    factor: Factor
-    places: tuple[slice | None, ...]
-    slopes: list[np.ndarray]
-    residual: np.ndarray
-    length: np.ndarray
-    weight: np.ndarray
-
-    @classmethod
-    def of(cls, factor: Factor, solution: Solution) -> "Rows":
-        """Return the rows of a factor."""
-        sigma = solution.problem.sigma
-        white = factor.white(solution.values, sigma)
-        length = np.sqrt((white**2).sum(1))
-        weight = factor.loss.weight(length)
-        root = np.sqrt(weight)
-        slopes = [each * root[:, None, None] for each in factor.slopes(solution.values, sigma)]
-        for (block, members), slope in zip(factor.on, slopes, strict=True):
-            if block.fixed.any():
-                slope[block.fixed[numbers(members, slope)]] = 0.0
-        places = tuple(solution.places.get(block.name) for block, _ in factor.on)
-        return cls(factor, places, slopes, white * root[:, None], length, weight)
-
-    def of_kinds(self, kinds: Collection[str]) -> "Rows | None":
-        """Return the residuals of some kinds."""
-        own = [i for i, kind in enumerate(self.factor.kinds) if kind in kinds]
-        if isinstance(self.factor.kind, str) or not own:
-            return self if own else None
-        return replace(self, slopes=[each[:, own] for each in self.slopes], residual=self.residual[:, own])
-
-    def total(self, ways: Mapping[str, np.ndarray], part: slice = slice(None)) -> np.ndarray:
-        """Return the derivatives (r, w, q) of a part of the rows by changes of all blocks (n, dim, q), by name."""
-        total: Any = 0.0
-        for (block, index), slope in zip(self.factor.on, self.slopes, strict=True):
-            way = ways[block.name]
-            total = total + slope[part] @ (way[0] if index is None else way[index[part]])
-        return total
-
-    def add(self, sums: Equations) -> None:
-        """Add the rows to the matrices and right sides of equations."""
-        normal, mixed = sums.normal, sums.cross.reshape(-1, sums.cross.shape[2])
-        ends = list(zip(self.factor.on, self.places, self.slopes, strict=True))
-        for i, ((own, members), place, slope) in enumerate(ends):
-            square, pull = blocks_of(slope, -self.residual, numbers(members, slope), len(own.start))
-            if place is None:
-                sums.block[:] += square
-                sums.block_right[:] += pull
-            else:
-                at = _unknowns(place, np.arange(len(own.start)), slope)
-                normal[at[:, :, None], at[:, None]] += square
-                sums.right[place] += pull.ravel()
-            for j, (_, other_place, other) in enumerate(ends[:i]):
-                pairs, products = self._products(i, j)
-                one, two = (
-                    _unknowns(which, number, each)
-                    for which, number, each in zip((place, other_place), pairs, (slope, other), strict=True)
-                )
-                back = np.swapaxes(products, 1, 2)
-                if place is None:
-                    mixed[one[:, :, None], two[:, None]] += products
-                elif other_place is None:
-                    mixed[two[:, :, None], one[:, None]] += back
-                else:
-                    normal[one[:, :, None], two[:, None]] += products
-                    normal[two[:, :, None], one[:, None]] += back
-
-    def _products(self, i: int, j: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """Return the pairs of members that rows tie, and the sums (u, a, b) of the products of their derivatives."""
-        one, two = self.slopes[i], self.slopes[j]
-        members, others = (self.factor.on[k][1] for k in (i, j))
-        if members is None and others is None:
-            none = np.zeros(1, int)
-            return (none, none), np.tensordot(one, two, ((0, 1), (0, 1)))[None]
-        if (i, j) not in self.factor.order:
-            first, second = numbers(members, one), numbers(others, two)
-            pair = first * (second.max(initial=0) + 1) + second
-            order = np.argsort(pair, kind="stable")
-            starts = np.flatnonzero(np.diff(pair[order], prepend=-1))
-            self.factor.order[i, j] = order, starts, (first[order[starts]], second[order[starts]])
-        order, starts, pairs = self.factor.order[i, j]
-        products = np.swapaxes(one, 1, 2) @ two
-        return pairs, np.add.reduceat(products[order], starts, axis=0) if len(order) else products
-
-
-def _unknowns(place: slice | None, members: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """Return the numbers (u, dim) of the unknowns of members (u,)."""
-    width = slope.shape[2]
-    return (place.start if place else 0) + width * members[:, None] + np.arange(width)

@@ -19,7 +19,7 @@ from stcal.handeye.judge.mistakes import Guess, check_conventions, flip_note, fl
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.bundle import ArmModel
+from stcal.handeye.methods.bundle import ROBOT, ArmModel
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, convex, solve_closed_form
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.joint import Adjusted, adjust_views, in_common, of_poses
@@ -52,7 +52,6 @@ ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
 chance may exceed the ratio that is required."""
 REST_WORSE = 1.2
 """Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
-ROBOT = ("robot_rad", "robot_mm")
 AT_ONE_PLACE = "the robot stood several times at one place: its errors there count once in σ"
 IN_COMMON = "σ contain the errors that the board's poses have in common (columns common…)"
 HELD_MM = 1e-6
@@ -316,7 +315,7 @@ def _by_poses(task: _Task) -> Solved:
     if task.views is not None and options.camera is not None:
         error = of_poses(task.loop, solution, task.views, options.camera)
         covariance = covariance + error.covariance(inverse) - inverse
-    stated = {name: getattr(noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
+    stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
     result = HandEye(
         method="pose",
         setup=task.setup,

@@ -36,7 +36,7 @@ def test_each_kind_has_the_variance_of_the_analysis(eliminate):
     between = EACH * ((middle - values.mean()) ** 2).sum() / (GROUPS - 1)
     wanted = [within, (between - within) / EACH]
     assert (np.array(list(present.values())) * np.exp(best)) ** 2 == pytest.approx(wanted, rel=1e-4)
-    assert likelihood.at(best)[2][0] == pytest.approx(values.mean(), rel=1e-8)
+    assert likelihood.at(best)[2][0] == pytest.approx(values.mean(), rel=1e-8)  # a share of 1e-10 is held
 
 
 def test_what_is_eliminated_changes_neither_density_nor_gradient():
@@ -50,7 +50,7 @@ def test_what_is_eliminated_changes_neither_density_nor_gradient():
     assert value == pytest.approx(again, rel=1e-8)
     assert slope == pytest.approx(same, rel=1e-8)
     ahead, behind = ([both[0].at(x + sign * step)[0] for step in small] for sign in (1, -1))
-    assert slope == pytest.approx((np.array(ahead) - behind) / 2e-5, rel=1e-5)
+    assert slope == pytest.approx((np.array(ahead) - behind) / 2e-5, rel=1e-6)
 
 
 def test_kinds_tell_together_what_all_do():

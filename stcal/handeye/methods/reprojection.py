@@ -13,7 +13,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, resect
-from stcal.handeye.methods.bundle import Bundle, Corners, LinearArm
+from stcal.handeye.methods.bundle import ROBOT, Bundle, Corners, LinearArm
 from stcal.handeye.methods.noise import Noise
 from stcal.io.cameras.model import CameraPrior
 
@@ -110,13 +110,13 @@ def problem(
     seen = np.round(np.concatenate([view.xyz_board for view in views.views]), SAME_DIGITS)
     designed, corner = np.unique(seen, axis=0, return_inverse=True)
     sigma, free = {}, []
-    for name in ("corner_px", "robot_rad", "robot_mm", "board_mm"):
+    for name in ("corner_px", *ROBOT, "board_mm"):
         value = getattr(noise, name)
         if value is None:
             free.append(name)
         sigma[name] = first[name] if value is None else value
     if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of them only: tiny σ there
-        sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ("robot_rad", "robot_mm")}
+        sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ROBOT}
     robot = None
     if loop.robot_covariance is not None:
         robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))

@@ -219,7 +219,7 @@ def _base_and_points(
         ) from error
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    information = 1 / np.array([*[USELESS_MM / spread] * 3, *[USELESS_MM] * (3 + points.size)]) ** 2
+    information = (np.array([spread] * 3 + [1.0] * (3 + points.size)) / USELESS_MM) ** 2
 
     def linearise(at: tuple[Rigid, np.ndarray, np.ndarray]) -> NormalEquations:
         points_base = flange @ at[1][rows]

@@ -26,19 +26,18 @@ ROW_SHAPES = {
 """Shape of a circle's value in each field of measured circles that is not one number."""
 
 
-class Rows:
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleRows:
     """Base of dataclasses whose fields are arrays with a row for each circle."""
-
-    __slots__ = ()
 
     def select(self, keep: np.ndarray) -> Self:
         """Returns the circles of the indices or mask ``keep``."""
-        return type(self)(*(getattr(self, f.name)[keep] for f in fields(self)))  # type: ignore[arg-type]
+        return type(self)(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """Returns the circles of all parts, one part after the other."""
-        names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+        names = [f.name for f in fields(cls)]
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -112,7 +111,7 @@ def detections_csv(observations: list[ImageObservations]) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Centres(Rows, Measured):
+class Centres(CircleRows, Measured):
     """n measured ellipses."""
 
     centre_px: np.ndarray  # (n, 2) of the ideal ellipse, distorted into the original image (OpenCV pixel origin)

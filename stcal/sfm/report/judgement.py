@@ -336,8 +336,8 @@ def _gaps(report: dict) -> list[str]:
             shown = "1 image" if len(images) == 1 else f"{len(images)} images"
             words.append(f"face {face} was read in {shown} and left out")
         elif _has_circles(report, face):
-            lost = f" without {join(_lost_groups(report))}" if _lost_groups(report) else ""
-            words.append(f"face {face} is not in it, though circles of it were seen: they do not hold its frame{lost}")
+            those = "those in the images that were used" if _some_unused(report) else "they"
+            words.append(f"face {face} is not in it, though circles of it were seen: {those} do not hold its frame")
         else:
             never.append(face)
     if never:

@@ -228,13 +228,13 @@ def test_sigma_hold_where_errors_of_a_photograph_are_alike():
 
 @pytest.mark.slow
 def test_a_loud_photograph_hardly_counts():
-    """Errors of eight times the noise in one of fourteen: with it the answer and its σ are those of the others."""
+    """It moves the answer by 2.5 σ where it counts; else by 0.3 to 0.6 σ, and σ by −7 to +26 %, in four draws."""
     rng = np.random.default_rng(3)
     views = views_of(rng, 14)
     loud = with_a_field(views[3:4], rng, 8 * 0.02)
     sound, all_of_them = calibrated([*views[:3], *views[4:]]), calibrated([*views[:3], *loud, *views[4:]])
-    apart = model_parameters(all_of_them.camera, "OPENCV") - model_parameters(sound.camera, "OPENCV")
-    assert np.abs(apart / sound.sigma()).max() < 1
+    apart = [model_parameters(each.camera, "OPENCV") for each in (all_of_them, sound)]
+    assert np.abs(np.subtract(*apart) / sound.sigma()).max() < 1
     assert all_of_them.sigma() / sound.sigma() == pytest.approx(1, abs=0.25)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
-from stcal.sfm.data.model import Centres, Rows
+from stcal.sfm.data.model import Centres, CircleRows
 from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.fits import BAND_PX, CUSP, Fits, boxes, intruders, local_ideal_maps
 
@@ -150,7 +150,7 @@ def measure_centres(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rims(Rows):
+class _Rims(CircleRows):
     """n fitted ellipses, ideal px, covariances for independent pixels; contrast and rim are zero if the fit failed."""
 
     centre: np.ndarray
