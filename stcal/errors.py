@@ -109,6 +109,16 @@ class ChecksFailed(StcalError):
     exit_code = 4
 
 
+@contextmanager
+def named(where: str, instead: str = "") -> Iterator[None]:
+    """Lets messages of errors begin with ``where``, what they are about; ``instead`` : their beginning so far."""
+    try:
+        yield
+    except StcalError as error:
+        error.args = error.code, f"{where}: {error.args[1].removeprefix(f'{instead}: ')}"
+        raise
+
+
 NO_MEMORY = "not enough memory"
 USED_UP = (
     "allocate",

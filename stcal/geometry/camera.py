@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stcal.errors import ConvergenceError, InputError
+from stcal.errors import ConvergenceError, InputError, named
 from stcal.geometry.arrays import Array, ByValue, freeze, frozen, require_arguments, require_fields
 
 MAX_NEWTON_STEPS = 50
@@ -117,7 +117,8 @@ class Camera(ByValue):
         if self.covariance is not None:
             count = len(COLMAP_LAYOUT[self.colmap_model])
             freeze(self, "covariance", (count, count), "camera's covariance")
-        require_lens(self.parameters(), self.width, self.height, "camera")
+        with named("camera"):
+            require_lens(self.parameters(), self.width, self.height)
 
     @classmethod
     def of(cls, camera: "Camera", colmap_model: str, covariance: np.ndarray | None = None) -> "Camera":
@@ -156,7 +157,8 @@ class Camera(ByValue):
                 f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed; skew is not supported",
             )
         given = frozen(np.ravel(distortion), None, "distortion")
-        flat, model = opencv_lens(given, fisheye, "camera")
+        with named("camera"):
+            flat, model = opencv_lens(given, fisheye)
         return cls(int(size[0]), int(size[1]), k[[0, 1], [0, 1]], k[:2, 2], flat, fisheye, model)
 
     def to_opencv(self) -> tuple[np.ndarray, np.ndarray]:
@@ -409,7 +411,7 @@ def _equidistant_jacobian(xy: np.ndarray) -> np.ndarray:
     return share[..., None, None] * np.eye(2) + along[..., None, None] * xy[..., :, None] * xy[..., None, :]
 
 
-def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool = False) -> tuple[np.ndarray, str]:
+def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> tuple[np.ndarray, str]:
     """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly.
 
     ``fisheye`` : k1 to k4 of an equidistant lens, or with ``tangential`` k1, k2, p1, p2, k3, k4.
@@ -419,52 +421,46 @@ def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool =
         if len(given) not in ((6,) if tangential else (0, 4)):
             raise InputError(
                 "E-CAMERA-COEFFICIENTS",
-                f"{where}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed",
+                f"{len(given)} coefficients of an equidistant lens; k1 to k4 needed",
             )
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         return distortion, "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
     if given[8:].any():
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS", f"{where}: {len(given)} distortion coefficients, at most 8 are supported"
-        )
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} distortion coefficients, at most 8 are supported")
     if len(given) not in DISTORTION_COUNTS:
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
-            f"{where}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
+            f"{len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
             "(k1, k2, p1, p2, k3 …)",
         )
     distortion[: min(len(given), 8)] = given[:8]
     return distortion, "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
 
 
-def require_lens(flat: np.ndarray, width: float | None, height: float | None, where: str) -> None:
+def require_lens(flat: np.ndarray, width: float | None, height: float | None) -> None:
     """Refuse parameters (16,), see :data:`PARAMETER_NAMES`, and sizes that no camera has; None: not stated."""
     if not np.isfinite(flat).all():
-        raise InputError("E-CAMERA-NOT-FINITE", f"{where}: a camera parameter is not a finite number; correct it")
+        raise InputError("E-CAMERA-NOT-FINITE", "a camera parameter is not a finite number; correct it")
     if (far := np.abs(flat).max()) > FARTHEST:
         raise InputError(
             "E-CAMERA-TOO-FAR",
-            f"{where}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
+            f"a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
         )
     if (flat[:2] <= 0).any():
-        raise InputError(
-            "E-CAMERA-FOCAL", f"{where}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed"
-        )
+        raise InputError("E-CAMERA-FOCAL", f"focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"{where}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
+            f"focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
             "times apart needed, pixels are nearly square",
         )
     for side in (width, height):
         if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
-            raise InputError(
-                "E-CAMERA-SIZE", f"{where}: image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed"
-            )
+            raise InputError("E-CAMERA-SIZE", f"image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed")
     if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"{where}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
+            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
             f"of {width:g}×{height:g} px; pixels needed; check that they are not mm, or shares of a side",
         )
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import ConvergenceError, DegenerateError, InputError, named
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -246,7 +246,8 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     width, height = lens.width or across, lens.height or up
     if isinstance(lens, CameraModel) or not (width and height):
         return LoadedLens(sized_camera(lens, path, (width, height)))
-    return LoadedLens(SizedLens(lens, width, height, fit_lens(lens, width, height)))
+    with named(f"camera file {path}"):
+        return LoadedLens(SizedLens(lens, width, height, fit_lens(lens, width, height)))
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
@@ -305,8 +306,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
             pixels.append(pixels_of_azimuth[np.unique(np.minimum(at, count - 1))])
     if sum(map(len, rays)) < AZIMUTHS:
         raise InputError(
-            "E-CAMERA-NO-FIELD",
-            f"camera file {lens.source}: {lens.called} projects almost no point into {width}×{height} px; check it",
+            "E-CAMERA-NO-FIELD", f"{lens.called} projects almost no point into {width}×{height} px; check it"
         )
     return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
 

@@ -69,7 +69,7 @@ def is_mrcal(text: str) -> bool:
     return "lensmodel" in text and "imagersize" in text
 
 
-def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
+def from_mrcal(text: str, _: str) -> CameraModel | ForeignLens:
     """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined."""
     try:
         values = ast.literal_eval(text.strip())
@@ -77,22 +77,20 @@ def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
         width, height = (float(v) for v in values["imagersize"])
     except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal"
-        ) from error
-    region = _region(values.get("valid_intrinsics_region"), source)
+        raise InputError("E-CAMERA-UNREADABLE", f"not mrcal's form ({reason}); write it anew with mrcal") from error
+    region = _region(values.get("valid_intrinsics_region"))
     taken = ("lensmodel", "intrinsics", "imagersize", "valid_intrinsics_region")
-    require_known({key: value for key, value in values.items() if key not in taken}, source, MRCAL_HARMLESS)
+    require_known({key: value for key, value in values.items() if key not in taken}, MRCAL_HARMLESS)
     if str(lens).startswith("LENSMODEL_SPLINED"):
-        made = of_splines(lens, numbers, width, height, source)
+        made = of_splines(lens, numbers, width, height)
     elif lens == "LENSMODEL_CAHVOR":
-        made = of_cahvor(numbers, width, height, source)
+        made = of_cahvor(numbers, width, height)
     elif lens in MRCAL and len(numbers) == 4 + MRCAL[lens]:
-        made = of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
+        made = of_opencv(numbers[:4], np.array(numbers[4:]), width, height)
     else:
         raise InputError(
             "E-CAMERA-MODEL",
-            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
+            f"{lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
             "ones are read: mrcal-convert-lensmodel makes one of another",
         )
     if isinstance(made, ForeignLens):
@@ -101,7 +99,7 @@ def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
     return made
 
 
-def _region(stated: object, source: str) -> np.ndarray | None:
+def _region(stated: object) -> np.ndarray | None:
     """Return mrcal's polygon (n, 2), px, in which the intrinsics are valid; None if the file states none."""
     try:
         region = None if stated is None else np.array(stated, float)
@@ -110,9 +108,7 @@ def _region(stated: object, source: str) -> np.ndarray | None:
     if region is not None and not region.size:
         return None
     if region is not None and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
-        raise InputError(
-            "E-CAMERA-CONTENT", f"camera file {source}: valid_intrinsics_region is no list of pixels; remove it"
-        )
+        raise InputError("E-CAMERA-CONTENT", "valid_intrinsics_region is no list of pixels; remove it")
     return region
 
 
@@ -124,7 +120,7 @@ def is_colmap_binary(content: bytes) -> bool:
     return count <= (len(content) - 8) // LEAST_CAMERA_BYTES
 
 
-def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
+def from_colmap_binary(content: bytes, choice: str) -> CameraModel | ForeignLens:
     """Return the camera of ``cameras.bin``, or the one of number ``choice``."""
     try:
         (count,) = struct.unpack_from("<Q", content, 0)
@@ -136,15 +132,11 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel 
             cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
             at += 24 + 8 * length
     except (struct.error, KeyError) as error:
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor a cameras.bin of known models; check it"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", "neither text nor a cameras.bin of known models; check it") from error
     if at != len(content) or not cameras:
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor COLMAP's cameras.bin; check it"
-        )
-    model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), source)]
-    return of_colmap(model, width, height, params, source)
+        raise InputError("E-CAMERA-UNREADABLE", "neither text nor COLMAP's cameras.bin; check it")
+    model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice))]
+    return of_colmap(model, width, height, params)
 
 
 def name_to_write(name: str) -> str:

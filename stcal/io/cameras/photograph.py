@@ -87,7 +87,7 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
         source += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
     centre = [(width - 1) / 2, (height - 1) / 2]
-    camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height, path).sized(width, height)
+    camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height).sized(width, height)
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
