@@ -33,7 +33,7 @@ DOTS_SIGMA_MM = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FaceDesign(ByValue, Brief):
+class FaceDesign(Brief):
     """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
     Parameters
@@ -132,7 +132,7 @@ class KnownDistance:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class TargetDesign(ByValue, Brief):
+class TargetDesign(Brief):
     """Target: its faces, and whether its circles are brighter or darker than their surroundings.
 
     Parameters

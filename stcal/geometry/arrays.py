@@ -55,28 +55,34 @@ class ByValue:
     __slots__ = ()
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (_value(self) == _value(other) if type(other) is type(self) else NotImplemented)
+        return _same(self, other) if type(other) is type(self) else NotImplemented
 
     def __hash__(self) -> int:
         values = [getattr(self, entry.name) for entry in fields(self)]  # type: ignore[arg-type]
-        numbers = [float(part.sum()) if isinstance(part, np.ndarray) else part for part in values]
-        return hash((type(self).__name__, *(part for part in numbers if isinstance(part, str | int | float))))
+        numbers = [float(np.nansum(part)) if isinstance(part, np.ndarray) else part for part in values]
+        known = (part for part in numbers if isinstance(part, str | int | float) and part == part)
+        return hash((type(self).__name__, *known))
 
 
-def _value(part: Any) -> Any:
-    if isinstance(part, np.ndarray):
-        return part.tolist()
-    if isinstance(part, list | tuple):
-        return [_value(each) for each in part]
-    if isinstance(part, dict):
-        return {name: _value(each) for name, each in part.items()}
-    if is_dataclass(part):
-        return type(part), [_value(getattr(part, entry.name)) for entry in fields(part)]
-    return part
+def _same(one: Any, two: Any) -> bool:
+    """Return True if two values are equal, arrays by their values; NaN, which stands for what is not known, is NaN."""
+    if one is two:
+        return True
+    if isinstance(one, np.ndarray) or isinstance(two, np.ndarray):
+        return np.array_equal(one, two, equal_nan=np.asarray(one).dtype.kind == "f")
+    if type(one) is not type(two):
+        return one == two
+    if isinstance(one, list | tuple):
+        return len(one) == len(two) and all(map(_same, one, two))
+    if isinstance(one, dict):
+        return one.keys() == two.keys() and all(_same(each, two[name]) for name, each in one.items())
+    if is_dataclass(one):
+        return all(_same(getattr(one, entry.name), getattr(two, entry.name)) for entry in fields(one))
+    return bool(one == two or (one != one and two != two))
 
 
-class Brief:
-    """Base of results with many values, made with ``@dataclass(repr=False)``.
+class Brief(ByValue):
+    """Base of results with many values, made with ``@dataclass(eq=False, repr=False)``.
 
     Their ``repr`` is one line with plain values, notes, and the size of everything else.
     """

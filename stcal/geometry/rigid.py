@@ -226,7 +226,7 @@ class Similarity(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Poses(ByValue, Brief):
+class Poses(Brief):
     """A stack of m transforms a_from_b.
 
     Parameters

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import ByValue, require_arguments
 from stcal.geometry.rigid import Order
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
 
@@ -17,7 +17,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joined:
+class Joined(ByValue):
     """Two tables in one.
 
     Parameters

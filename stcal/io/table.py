@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import ByValue
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
@@ -30,7 +31,7 @@ POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Table:
+class Table(ByValue):
     """The rows of a table, as of :func:`stcal.load_table`.
 
     Parameters
