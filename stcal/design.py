@@ -28,6 +28,8 @@ class Printed(Protocol):
         ...
 
 
+MIN_SINE = 0.02
+"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
 DOTS_SIGMA_MM = 0.005
 """σ of the places of a board's dots where its file states none, mm per axis."""
 
@@ -93,11 +95,49 @@ class FaceDesign(Brief):
         require_fields(self, f"face {self.id}", sigma_mm=0, size_sigma=0)
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
-        require_face(self.ids, self.xy_mm, self.radius_mm, (self.origin, self.x, self.y), f"face {self.id}")
+        self._require_possible()
         if self.outline_mm is not None:
             freeze(self, "outline_mm", (None, 2), f"face {self.id}: outline")
         if self.rim_mm is not None:
             freeze(self, "rim_mm", (len(self.ids),), f"face {self.id}: rims")
+
+    def _require_possible(self) -> None:
+        """Refuses circles that occur twice or overlap, and frame circles that give no frame."""
+        where, ids, xy, radius = f"face {self.id}", self.ids, self.xy_mm, self.radius_mm
+        frame = self.origin, self.x, self.y
+        _require_different(ids, f"{where}: circle id")
+        for key, circle in zip(("origin", "x", "y"), frame, strict=True):
+            if circle not in ids:
+                raise InputError(
+                    "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
+                )
+        if radius.min() <= 0:
+            raise InputError(
+                "E-TARGET-RADIUS",
+                f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
+            )
+        gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
+        np.fill_diagonal(gap, np.inf)
+        if gap.min() <= 0:
+            i, j = np.unravel_index(gap.argmin(), gap.shape)
+            raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
+        origin, x, y = (xy[ids.index(circle)] for circle in frame)
+        length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
+        named = ", ".join(frame)
+        if min(length_x, length_y) == 0:
+            raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named}; three different ones needed")
+        axis = (x - origin) / length_x
+        sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
+        if abs(sine) < MIN_SINE:
+            raise InputError(
+                "E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line"
+            )
+        if sine < 0:
+            raise InputError(
+                "E-TARGET-FRAME",
+                f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside; swap x and y, "
+                "or give positions as seen from outside with y up",
+            )
 
     def labels(self) -> list[CircleLabel]:
         """Returns the label ``face:circle`` of every circle, in order."""
@@ -163,7 +203,10 @@ class TargetDesign(Brief):
     def __post_init__(self):
         where = f"target {self.name}"
         require_fields(self, where)
-        require_ids([face.id for face in self.faces], where)
+        ids = [face.id for face in self.faces]
+        _require_different(ids, f"{where}: face id")
+        if BOARD in ids:
+            raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
         circles = [face for face in self.faces if face.printed is None]
         sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
         radii = [radius(f"radius_mm of circle {label}", float(mm)) for label, mm in sizes]
@@ -307,8 +350,27 @@ class BoardDesign(ByValue):
         if not (np.isfinite(self.sigma_mm) and self.sigma_mm >= 0):
             raise InputError("E-SIGMA-VALUE", f"board: sigma_mm {self.sigma_mm:g}; 0 or a positive number needed")
         require_millimetres(board_lengths(self.pitch_mm, self.radius_mm), self.unusual_size, "board")
-        size = self.rows, self.columns, self.pitch_mm, self.radius_mm
-        require_board(*size, self.corner, self.corner_radius_mm, "board")
+        size, corner = (self.rows, self.columns), self.corner
+        if min(size) < 1:
+            raise InputError("E-BOARD-SIZE", "board: {} rows and {} columns; 1 or more of each needed".format(*size))
+        if not 0 < 2 * self.radius_mm < self.pitch_mm:
+            raise InputError(
+                "E-BOARD-RADIUS",
+                f"board: radius {self.radius_mm:g} mm, under half the pitch {self.pitch_mm:g} mm needed",
+            )
+        if corner is None:
+            return
+        if any(place not in (0, count - 1) for place, count in zip(corner, size, strict=True)):
+            raise InputError(
+                "E-BOARD-CORNER",
+                f"board: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
+            )
+        least, most = 1.15 * self.radius_mm, self.pitch_mm - self.radius_mm
+        if self.corner_radius_mm is None or not least <= self.corner_radius_mm < most:
+            raise InputError(
+                "E-BOARD-CORNER",
+                f"board: corner radius {self.corner_radius_mm} mm; at least {least:g} mm and under {most:g} mm needed",
+            )
 
     def scaled(self, factor: float) -> "BoardDesign":
         """Returns the board printed larger by a factor."""
@@ -357,54 +419,6 @@ class BoardDesign(ByValue):
         return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
 
 
-MIN_SINE = 0.02
-"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
-
-
-def require_face(
-    ids: Sequence[str], xy: np.ndarray, radius: np.ndarray, frame: tuple[str, str, str], where: str
-) -> None:
-    """Refuses circles of a face that occur twice or overlap, and frame circles (origin, x, y) that give no frame."""
-    _require_different(ids, f"{where}: circle id")
-    for key, circle in zip(("origin", "x", "y"), frame, strict=True):
-        if circle not in ids:
-            raise InputError(
-                "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
-            )
-    if radius.min() <= 0:
-        raise InputError(
-            "E-TARGET-RADIUS",
-            f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
-        )
-    gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() <= 0:
-        i, j = np.unravel_index(gap.argmin(), gap.shape)
-        raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
-    origin, x, y = (xy[ids.index(circle)] for circle in frame)
-    length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
-    named = ", ".join(frame)
-    if min(length_x, length_y) == 0:
-        raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named}; three different ones needed")
-    axis = (x - origin) / length_x
-    sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
-    if abs(sine) < MIN_SINE:
-        raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line")
-    if sine < 0:
-        raise InputError(
-            "E-TARGET-FRAME",
-            f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside; swap x and y, or "
-            "give positions as seen from outside with y up",
-        )
-
-
-def require_ids(ids: Sequence[str], where: str) -> None:
-    """Refuses ids of faces that occur twice, or that are the board's."""
-    _require_different(ids, f"{where}: face id")
-    if BOARD in ids:
-        raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
-
-
 def _require_different(ids: Sequence[str], what: str) -> None:
     for i, value in enumerate(ids):
         if value in ids[:i]:
@@ -447,36 +461,6 @@ def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, sa
 def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
     """Returns the lengths of a board of dots by which its unit is judged."""
     return [side("pitch_mm", pitch_mm), radius("radius_mm", radius_mm)]
-
-
-def require_board(
-    rows: int,
-    columns: int,
-    pitch_mm: float,
-    radius_mm: float,
-    corner: tuple[int, int] | None,
-    corner_radius_mm: float | None,
-    where: str,
-) -> None:
-    """Refuses a grid with too few or overlapping dots, and a larger dot that is not larger or not at a corner."""
-    if min(rows, columns) < 1:
-        raise InputError("E-BOARD-SIZE", f"{where}: {rows} rows and {columns} columns; 1 or more of each needed")
-    if not 0 < 2 * radius_mm < pitch_mm:
-        raise InputError(
-            "E-BOARD-RADIUS", f"{where}: radius {radius_mm:g} mm, under half the pitch {pitch_mm:g} mm needed"
-        )
-    if corner is None:
-        return
-    if corner[0] not in (0, rows - 1) or corner[1] not in (0, columns - 1):
-        raise InputError(
-            "E-BOARD-CORNER", f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed"
-        )
-    if corner_radius_mm is None or not 1.15 * radius_mm <= corner_radius_mm < pitch_mm - radius_mm:
-        raise InputError(
-            "E-BOARD-CORNER",
-            f"{where}: corner radius {corner_radius_mm} mm; at least {1.15 * radius_mm:g} mm and under "
-            f"{pitch_mm - radius_mm:g} mm needed",
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -186,6 +186,15 @@ def homography_jacobian(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
     return (homography[..., :2, :2] - mapped[..., :2, None] / w * homography[..., 2:, :2]) / w
 
 
+def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return which points (n, 2) lie in a polygon (k, 2), (n,) bool."""
+    side = np.roll(polygon, -1, axis=0) - polygon
+    above = polygon[:, 1] > points[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = polygon[:, 0] + (points[:, 1:] - polygon[:, 1]) * side[:, 0] / side[:, 1]
+    return ((above != np.roll(above, -1, axis=1)) & (points[:, :1] < crossing)).sum(1) % 2 == 1
+
+
 def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
     """Return the pose of a plane with a metric frame from its homography into normalised image coordinates.
 

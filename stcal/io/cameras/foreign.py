@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, opencv_lens
+from stcal.geometry.plane import inside
 from stcal.io.cameras.keys import pass_over
 from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
@@ -61,14 +62,7 @@ class ForeignLens:
 
     def determined(self, pixels: np.ndarray) -> np.ndarray:
         """Return which pixels (n, 2) lie in the region, (n,) bool; all of them if the file states none."""
-        if self.region is None:
-            return np.ones(len(pixels), bool)
-        inside = np.zeros(len(pixels), bool)
-        for (x0, y0), (x1, y1) in zip(self.region, np.roll(self.region, -1, axis=0), strict=True):
-            crosses = (pixels[:, 1] < y0) != (pixels[:, 1] < y1)
-            if y0 != y1:
-                inside ^= crosses & (pixels[:, 0] < x0 + (pixels[:, 1] - y0) * (x1 - x0) / (y1 - y0))
-        return inside
+        return np.ones(len(pixels), bool) if self.region is None else inside(self.region, pixels)
 
 
 def of_colmap(model: str, width: float, height: float, params) -> CameraModel | ForeignLens:
