@@ -156,10 +156,8 @@ class FaceDesign(Brief):
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """A measured distance between two points of the target, mm, with its σ: a scale bar.
-
-    ``drawn`` : True if it is that of the drawing, and defines the unit of a target of which no size is known.
-    """
+    """A measured distance between two points of the target, mm, with its σ: a scale bar; ``drawn`` : True if it is that
+    of the drawing, and defines the unit of a target of which no size is known."""
 
     first: CircleLabel
     second: CircleLabel
@@ -465,10 +463,8 @@ def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleReference(BoardDesign):
-    """All that a run takes its scale from: the board if there is one, faces of known shape, known distances.
-
-    Without a board it has no dots: ``rows`` and ``columns`` are 0.
-    """
+    """All that a run takes its scale from: the board, of no rows and columns if there is none, faces of known shape,
+    and known distances."""
 
     faces: tuple[FaceDesign, ...] = ()
     distances: tuple[KnownDistance, ...] = ()
@@ -508,10 +504,8 @@ DRAWN_SIGMA = 1e-7
 
 
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
-    """Returns the design with one drawn distance as the unit: the longest on a face that most images see whole.
-
-    ``images`` : labels seen in each image.
-    """
+    """Returns the design with one drawn distance as the unit: the longest on a face that most images, by their labels,
+    see whole."""
     views = [set(labels) for labels in images]
     best: tuple[int, float, KnownDistance] | None = None
     for face in target.faces:

@@ -132,10 +132,7 @@ USED_UP = (
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """True if the error, or one of its causes, says that memory or processes are used up.
-
-    Python, the loader of libraries, and the libraries themselves report this in different ways.
-    """
+    """True if the error, or one of its causes, says in one of many ways that memory or processes are used up."""
     chain: list[BaseException] = [error]
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 class Opt:
     """An option: what its help text and its parameter do not state.
 
-    ``name`` : its names, such as ``--a``, or ``--robust/--least-squares``; ``--held-out`` for ``held_out`` if not
-    given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is written; ``metavar``,
-    ``envvar`` : word for the value in the help text, and variable of the environment that sets it.
+    ``name`` : its names, ``--held-out`` for ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes``
+    : whether a file of this name is written; ``metavar``, ``envvar`` : word for the value in the help text, and
+    variable that sets it.
     """
 
     name: str = ""
@@ -272,10 +272,8 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
 
 
 def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None, verdict: str = "") -> None:
-    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given.
-
-    Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, what failed.
-    """
+    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given; otherwise a quiet
+    command writes ``verdict``, the sentence of a verdict that is not good, or what failed."""
     if strict and failed:
         others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
         where = f"; see {report}" if report else ""
@@ -290,11 +288,9 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
 def require_usable(
     strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "", but: str = "do not use them"
 ) -> None:
-    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given.
-
-    Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, the reasons.
-    ``but`` : what is to be said of the results that are written all the same.
-    """
+    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given;
+    otherwise a quiet command writes ``verdict``, or the reasons. ``but`` : ends what is said of the results, which are
+    written."""
     if strict and reasons:
         where = f"; see {page}" if page else ""
         raise ChecksFailed(
@@ -334,9 +330,8 @@ def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
 def protect_outputs(application: typer.Typer) -> None:
     """Prevents the commands of an application from overwriting their inputs, or other files without a request.
 
-    Every path among the parameters is an input, except those whose option is ``writable``. Existing files are replaced
-    only with ``--overwrite``, an option that is added to each command that writes a file. ``--quiet`` and ``--verbose``
-    are added to all commands. Only ``--json -`` may use standard output. Each option gets its panel of the help text.
+    Every path among the parameters is an input unless its option ``writes``. Commands that write get ``--overwrite``,
+    all of them ``--quiet`` and ``--verbose``; only ``--json -`` may use standard output.
     """
     for command in application.registered_commands:
         if command.callback is not None:

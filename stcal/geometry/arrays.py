@@ -82,10 +82,8 @@ def _same(one: Any, two: Any) -> bool:
 
 
 class Brief(ByValue):
-    """Base of results with many values, made with ``@dataclass(eq=False, repr=False)``.
-
-    Their ``repr`` is one line with plain values, notes, and the size of everything else.
-    """
+    """Base of results with many values, made with ``@dataclass(eq=False, repr=False)``, that show themselves in one
+    line: with plain values, notes, and the size of everything else."""
 
     __slots__ = ()
 
@@ -188,8 +186,7 @@ def _rules(kind: type) -> dict[str, tuple[Rule, bool]]:
 def require_fields(instance: object, what: str, **least: float) -> None:
     """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``.
 
-    Numbers must be finite, words in fields of a Literal type must be among those that it lists. Arrays are left to
-    :func:`freeze`. ``least`` : lowest value of a number, by field.
+    Numbers must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`.
     """
     for name, ((admits, words), is_choice) in _rules(type(instance)).items():
         value = getattr(instance, name)
@@ -238,11 +235,8 @@ def frozen(
     dtype: DTypeLike = float,
     finite: bool = True,
 ) -> np.ndarray:
-    """Return a read-only copy of values.
-
-    ``shape`` : the required one, if any; ``None`` in it admits any length; ``what`` : name of the values in messages;
-    ``finite`` : whether floats must be finite; if not, NaN stands for values that are not known.
-    """
+    """Return a read-only copy of values of a shape, in which ``None`` admits any length; ``what`` : their name in
+    messages; ``finite`` : whether NaN is refused, which else stands for what is not known."""
     if type(values) is np.ndarray and values.dtype == dtype:
         array = values if values.base is None and not values.flags.writeable else values.copy()
     else:

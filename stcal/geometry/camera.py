@@ -412,10 +412,8 @@ def _equidistant_jacobian(xy: np.ndarray) -> np.ndarray:
 
 
 def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> tuple[np.ndarray, str]:
-    """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly.
-
-    ``fisheye`` : k1 to k4 of an equidistant lens, or with ``tangential`` k1, k2, p1, p2, k3, k4.
-    """
+    """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly; of a
+    fisheye k1 to k4, or if ``tangential`` k1, k2, p1, p2, k3, k4."""
     distortion = np.zeros(COEFFICIENTS)
     if fisheye:
         if len(given) not in ((6,) if tangential else (0, 4)):

@@ -241,13 +241,7 @@ def load_target(path: str | Path, printed: PrintedReader | None = None) -> Targe
     """Read ``target.toml`` (form: ``data_layout.md``).
 
     ``printed`` : reads faces with a board or tags, which :func:`stcal.boards.target.load_body` does; they are refused
-    if it is None.
-
-    Raises
-    ------
-    InputError
-        Unknown or missing keys, duplicate ids, overlapping circles, frame circles that are missing, collinear,
-        or left-handed, faces that look the same; the message names the file and the place.
+    if it is None. The message of an InputError names the file and the place.
     """
     data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
@@ -405,10 +399,8 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
 
 
 def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
-    """Return the text of a ``target.toml`` for ``target``, with comments.
-
-    ``printed`` : returns the lines of the board or tags of a face, needed if the target has such faces.
-    """
+    """Return the text of a ``target.toml`` for ``target``, with comments; ``printed`` : returns the lines of the board
+    or tags of a face, needed if the target has such faces."""
     round_ = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",

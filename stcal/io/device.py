@@ -151,14 +151,10 @@ def png(image: np.ndarray) -> bytes:
 
 @contextmanager
 def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
-    """Open a camera, a stream, a video file or a folder of images, and return its pictures, grey.
+    """Open a camera by number, a stream by URL, a video file or a folder of images, and return its pictures, grey.
 
-    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is.
-
-    ``source`` : number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), a video file, or a
-    folder, whose images come in order of name.
-
-    Raises InputError: it cannot be opened or gives no picture; in between, if no picture comes for ``PATIENCE_S``.
+    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is. Raises
+    InputError: it cannot be opened or gives no picture, or none for ``PATIENCE_S`` in between.
     """
     if isinstance(source, str) and Path(source).is_dir():
         paths = [file.path for file in find_images(source)[0]]

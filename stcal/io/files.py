@@ -32,10 +32,7 @@ MODEL_BYTES = 1000 * MB
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
-    """Return the whole content of a file.
-
-    Raises OSError: it cannot be read, or is larger than ``most`` bytes.
-    """
+    """Return the whole content of a file; raise OSError if it cannot be read, or is larger than ``most`` bytes."""
     chunks, remaining = [], most + 1
     with open(path, "rb") as stream:
         step = max(os.fstat(stream.fileno()).st_size + 1, MB)  # `read` allocates as much memory as it is asked for
@@ -48,20 +45,14 @@ def read_bytes(path: str | Path, most: int) -> bytes:
 
 
 def text_of(content: bytes) -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
-
-    Raises UnicodeDecodeError: it is neither.
-    """
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed."""
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = content.decode("utf-16" if wide else "utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def require_size(path: str | Path, most: int) -> None:
-    """Refuse a file that is too large; for files that another program's library reads.
-
-    Raises OSError: the file is larger than ``most`` bytes.
-    """
+    """Raise OSError for a file of more than ``most`` bytes, which another program's library is to read."""
     if Path(path).stat().st_size > most:
         raise _too_large(path, most)
 
@@ -148,17 +139,10 @@ def require_new_folder(out: Path, images: Path) -> None:
 def require_written(
     path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike", most: float, unit: str
 ) -> None:
-    """Read a written file again, and require that it gives the values that were reported.
+    """Read a written file with the reader of later commands, and require that it gives the values that were reported.
 
-    Parameters
-    ----------
-    path : the file, for the message
-    read : reads the file with the reader of later commands, and returns what it predicts
-    reported : the same quantity from the result in memory; nan where there is none
-    most : largest difference of one value: rounding by the decimals of the file
-    unit : unit of the values
-
-    Raises ConvergenceError: the file cannot be read again, or gives other values.
+    ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest difference,
+    rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError.
     """
     difference = _difference(path, read, reported)
     if not difference <= most:
@@ -221,10 +205,7 @@ def own_digest(content: dict) -> str:
 
 
 def require_unchanged(path: str | Path) -> None:
-    """Refuses a file of a run's folder that is not as the run left it, by the hash that the run's marker holds.
-
-    Files elsewhere, and those of runs without hashes, pass.
-    """
+    """Refuses a file of a run's folder that is not as the run left it, by the hash in the run's marker; others pass."""
     path = Path(path)
     run = path.parent if (path.parent / RUN_MARKER).is_file() else path.parent.parent
     name = path.relative_to(run).as_posix()
@@ -284,10 +265,8 @@ def _key(key) -> str:
 
 
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
-    """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
-
-    ``outputs``, ``inputs`` : (option, path); an input may be a folder.
-    """
+    """Refuse, before the work, outputs (option, path) that would replace an input, a file in an input folder, or each
+    other."""
     places: dict[Path, str] = {}
     for option, path in outputs:
         place = real_place(path)

@@ -244,18 +244,13 @@ class Table(ByValue):
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or
-    ``%`` with a space are ignored.
+    """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or ``%`` with a space are
+    ignored.
 
-    Commas, semicolons, tabs or spaces separate columns, as in the header. Without commas between columns, numbers may
+    Commas, semicolons, tabs or spaces separate columns, as in the header; without commas between columns, numbers may
     have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header. Units in
-    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``.
-
-    ``path`` : a :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if the quaternion columns hold x, y,
-    z, w in this order, whatever their names.
-
-    Raises InputError: the file is unreadable, not UTF-8, has no header or no rows, a column name occurs twice, a row
-    has another length than the header, or its commas may be of decimals or of thousands.
+    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``. A :class:`Table` is
+    returned unchanged; ``quaternions`` : ``xyzw`` if their columns hold x, y, z, w in this order, whatever their names.
     """
     if isinstance(path, Table):
         return path
@@ -409,10 +404,8 @@ def csv_rows(text: str) -> Iterator[dict[str, Any]]:
 
 
 def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
-    """Return the names of columns as the package writes them, where they differ in the case or form of the unit alone.
-
-    In ``euler_ZYX_1_deg`` the case means turned axes: such names stay. ``comments`` : lines; one of them may state the
-    unit of columns x, y, z without one.
+    """Return the names of columns as the package writes them, where they differ in the case or form of the unit alone;
+    one of the ``comments`` may state the unit of x, y, z. In ``euler_ZYX_1_deg`` the case means turned axes: it stays.
     """
     said = [match[1].lower() for line in comments for match in _UNIT_SAID.finditer(line)]
     units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _LONG[u]))) for word in said}
@@ -459,9 +452,7 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
     """Return the columns with decimal points in place of decimal commas, and whether there were such.
 
     Semicolons stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must
-    show that its comma is not of thousands.
-
-    Raises InputError: there are decimal points, too, or no number shows what the commas are.
+    show that its comma is not of thousands; decimal points beside it are refused.
     """
     numeric = {name: cells for name, cells in columns.items() if all(re.fullmatch(_COMMA_NUMBER, c) for c in cells)}
     with_comma = {name: cells for name, cells in numeric.items() if any("," in cell for cell in cells)}
@@ -580,10 +571,8 @@ def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> 
 
 
 def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, remedy: str) -> None:
-    """Refuse quaternions (m, 4) that are not of unit length.
-
-    ``place`` : returns the place of row i in ``where``; ``remedy`` : end of the message.
-    """
+    """Refuse quaternions (m, 4) that are not of unit length; ``place`` : returns that of row i; ``remedy`` : ends the
+    message."""
     with np.errstate(over="ignore"):  # quaternions that are refused
         length = np.linalg.norm(wxyz, axis=1)
     bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))

@@ -110,10 +110,10 @@ def wrapped(line: str, width: int = WIDTH) -> list[str]:
 
 
 def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: int = 2) -> list[str]:
-    """Return the lines of a table without rules or colours; it is the same on any terminal, and no cell is wrapped.
+    """Return the lines of a table without rules or colours, alike on any terminal; no cell is wrapped.
 
-    ``rows`` : cells; the first row holds the heads, and a ``<`` before a head aligns its column to the left; ``least``
-    : smallest width of each column, characters; no limit if empty; ``gap`` : number of characters between columns.
+    ``rows`` : cells, the heads first; ``<`` before one aligns its column to the left; ``least`` : smallest width of
+    each column; ``gap`` : between columns, in characters.
     """
     from rich.console import Console
     from rich.table import Table

@@ -27,11 +27,8 @@ LEAST_POINTS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraDifference:
-    """The difference between two cameras over the image.
-
-    ``pixels`` : (r, c, 2) of the first camera; ``apart`` : (r, c, 2) px, offsets of the second camera's pixels for the
-    same rays, nan where one of the cameras has no ray; ``second_from_first`` : the best rotation.
-    """
+    """The difference between two cameras over the image: ``pixels`` (r, c, 2) of the first one; for the same rays,
+    offsets ``apart`` (r, c, 2) px of the second one's, nan where one has none; and the best rotation between them."""
 
     pixels: np.ndarray
     apart: np.ndarray
@@ -44,10 +41,8 @@ class CameraDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizedLens:
-    """A lens of an unsupported model over an image, by its own projection.
-
-    ``lens`` ; ``width``, ``height`` : px; ``near`` : the model that was fitted to it, from which its rays are sought.
-    """
+    """A lens of an unsupported model over an image, by its own projection; ``near`` : the model that was fitted to it,
+    from which its rays are sought."""
 
     lens: ForeignLens
     width: int
@@ -178,11 +173,10 @@ SMALL = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLens:
-    """Result of fitting a lens.
+    """The camera that was fitted to a lens, and its RMS and largest residual where the lens was determined.
 
-    ``camera`` : the fitted camera; ``rms_px``, ``most_px`` : RMS and largest residual over the image, or over the
-    region in which the lens was determined; ``share`` : share of the azimuths in which the image, or the region, ends
-    within 89° of the axis; ``camera_from_lens`` : the rotation of the camera's axes, the identity unless it helps much.
+    ``share`` : of the azimuths in which that ends within 89° of the axis; ``camera_from_lens`` : the rotation of the
+    camera's axes, the identity unless it helps much.
     """
 
     camera: Camera
@@ -194,11 +188,8 @@ class FittedLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedLens:
-    """The lens of a file.
-
-    ``lens`` : the camera, or a lens of another model over its image, as :func:`compare_cameras` takes it; ``told`` :
-    what a photograph's EXIF says of it, empty for a camera file.
-    """
+    """The lens of a file: the camera, or another model's lens over its image; ``told`` : what a photograph's EXIF says
+    of it."""
 
     lens: Camera | SizedLens
     told: str = ""
@@ -251,10 +242,7 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
-    """Return the supported camera model that is nearest to a lens over the image.
-
-    ``lens`` : lens to approximate; ``width``, ``height`` : image size, px.
-    """
+    """Return the supported camera model that is nearest to a lens over an image of this size, px."""
     rays, pixels, share = _rays(lens, width, height)
     straight = _best(lens, rays, pixels, share, (width, height), False)
     if straight.most_px <= GOOD_PX:

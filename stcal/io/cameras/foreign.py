@@ -47,11 +47,11 @@ MARGIN = {2: 1, 3: 2}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignLens:
-    """A lens that is known by its projection only.
+    """A lens that is known by its projection only, of a model that is ``called`` so.
 
-    ``called`` : name of its model; ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel
-    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``region`` : polygon
-    (n, 2), px, within which the lens was determined, or None if the file states none.
+    ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0); ``width``,
+    ``height`` : px, or None if the file states none; ``region`` : polygon (n, 2), px, within which it was determined,
+    or None.
     """
 
     called: str
@@ -68,13 +68,6 @@ class ForeignLens:
 def of_colmap(model: str, width: float, height: float, params) -> CameraModel | ForeignLens:
     """Return the camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
 
-    Raises
-    ------
-    InputError
-        The model is unknown, the number of parameters is wrong, or values are impossible.
-
-    References
-    ----------
     COLMAP 4, ``sensor/models.h``. A. Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens
     distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE).
     """
@@ -180,10 +173,8 @@ def require_finite(numbers) -> None:
 
 
 def of_opencv(lens, given: np.ndarray, width: float, height: float, skew: float = 0.0) -> CameraModel | ForeignLens:
-    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
-
-    ``skew`` : px, u = fx x + skew y + cx.
-    """
+    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor;
+    with ``skew``, px, u = fx x + skew y + cx."""
     if not abs(skew) <= SQUARE * abs(lens[0]):
         return of_parts(lens, skew, given, "perspective", width, height)
     if len(given) not in (12, 14) or not given[8:].any():
@@ -204,16 +195,11 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, skew: float 
 def of_parts(
     lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, xi: float = 0.0
 ) -> ForeignLens:
-    """Return a lens of a projection, OpenCV's distortion, and a matrix with skew.
+    """Return a lens of a projection, OpenCV's distortion (k,), and a matrix of fx, fy, cx, cy with skew as of
+    :func:`of_opencv`.
 
-    Parameters
-    ----------
-    lens : fx, fy, cx, cy, px
-    skew : px, u = fx x + skew y + cx
-    given : (k,) coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens
-    kind : perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
-        camodocal's MEI
-    width, height : image size, px; 0 if the file states none
+    ``kind`` : perspective, equidistant (k1 to k4), or unified: Mei's projection with ``xi``, of OpenCV's omnidir,
+    Kalibr's omni and camodocal's MEI; sides of 0 px if the file states none.
     """
     camera = camera_from_opencv(lens, given, kind == "equidistant", width, height)
     if not abs(skew) < abs(camera.focal[0]):
@@ -236,13 +222,6 @@ def of_parts(
 def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size) -> ForeignLens:
     """Return the lens of Kalibr's models omni, eucm, ds or pinhole with radtan, equidistant, fov or no distortion.
 
-    Raises
-    ------
-    InputError
-        Numbers are missing or impossible.
-
-    References
-    ----------
     C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B. Khomutenko
     et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera Model", 3DV 2018.
     F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications 13, 2001.
@@ -335,19 +314,11 @@ def refused(camera: Camera, form: str, why: str) -> InputError:
 
 
 def of_cahvor(numbers, width: float, height: float) -> CameraModel | ForeignLens:
-    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2.
+    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2; a
+    supported model if both angles are zero.
 
-    If both angles are zero, it is a supported model.
-
-    Raises
-    ------
-    InputError
-        The number of parameters is wrong, or values are impossible.
-
-    References
-    ----------
-    D. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006: a ray P is bent to
-    P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ².
+    A ray P is bent to P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ² (D. Gennery,
+    "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006).
     """
     if len(numbers) != 9:
         raise InputError("E-CAMERA-COEFFICIENTS", f"{len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed")

@@ -140,10 +140,8 @@ def from_colmap_binary(content: bytes, choice: str) -> CameraModel | ForeignLens
 
 
 def name_to_write(name: str) -> str:
-    """Return a name that every form can hold, of the name that chose a camera: ``Cam B (35mm)`` gives ``Cam_B_35mm``.
-
-    A number gets ``cam`` in front; without a name it is ``cam0``.
-    """
+    """Return a name that every form can hold, of the name that chose a camera: ``Cam_B_35mm`` of ``Cam B (35mm)``,
+    ``cam1`` of 1, ``cam0`` of none."""
     word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
     if not word:
         return "cam0"
@@ -151,13 +149,8 @@ def name_to_write(name: str) -> str:
 
 
 def written(camera: Camera, form: str, name: str) -> Written:
-    """Return the file of a camera.
-
-    ``camera`` : camera to write; ``form`` : one of :data:`WRITERS`; ``name`` : name of the camera, for forms that have
-    a place for it.
-
-    Raises InputError: the form cannot hold the lens (the message names one that can), or the name is no word.
-    """
+    """Return the file of a camera in one of :data:`WRITERS`, with its name where the form has a place for it; refuse a
+    lens that the form cannot hold, and a name that is no word."""
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(
             "E-CAMERA-NAME", f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0"

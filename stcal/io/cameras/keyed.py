@@ -23,11 +23,8 @@ TAB = 4
 
 
 def values_of(text: str) -> dict:
-    """Return the keys and values of a text in JSON, XML or YAML.
-
-    Raises ValueError, yaml.YAMLError, ElementTree.ParseError: the text is none of these, or holds several documents
-    that differ.
-    """
+    """Return the keys and values of a text in JSON, XML or YAML; raise ValueError, YAMLError or ParseError if it is
+    none of these, or holds several documents that differ."""
     if text.lstrip().startswith("<"):
         return _xml_values(ElementTree.fromstring(text))
     try:
@@ -82,10 +79,8 @@ def is_ini(text: str) -> bool:
 
 
 def ini_cameras(text: str) -> dict[str, dict]:
-    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``.
-
-    A key has a line of its own; the lines of its numbers follow. Raises ValueError: a line is neither.
-    """
+    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``. A key
+    has a line of its own; the lines of its numbers follow."""
     sections: dict[str, dict] = {}
     section, numbers = {}, []
     for line in (line.split("#")[0].strip() for line in text.splitlines()):
@@ -126,11 +121,7 @@ Lens = CameraModel | ForeignLens
 
 
 def from_keys(values: dict, choice: str) -> Lens:
-    """Return a camera of keys and values; ``choice`` : its name or number if there are several.
-
-    Raises InputError: there is no camera, several and no choice, an unsupported lens, a key that may change the
-    projection, or a value is impossible.
-    """
+    """Return a camera of keys and values; ``choice`` : its name or number if there are several."""
     for cameras_of, read in FORMATS:
         if cameras := cameras_of(values):
             names = list(cameras)

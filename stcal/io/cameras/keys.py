@@ -141,14 +141,11 @@ def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
 
 
 def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: bool = False) -> None:
-    """Report the keys of a camera file that its reader did not use. Harmless keys are ignored silently, others with an
-    :class:`InputNote`.
+    """Report the keys that a reader did not use: harmless ones are ignored silently, others with an :class:`InputNote`;
+    one that may change the projection is refused unless its value is 0 or empty.
 
-    ``unread`` : keys and values; values may hold further keys; ``harmless`` : further harmless keys of the format, or
-    beginnings of them that end in ``*``; as :func:`plain` writes them; ``undistorted`` : True if no distortion was
-    found, so that an unknown list of coefficients may be it.
-
-    Raises InputError: a key may change the projection, and its value is not 0 or empty.
+    ``harmless`` : further harmless keys of the format, as :func:`plain` writes them, or beginnings of them that end in
+    ``*``; ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it.
     """
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []
@@ -219,10 +216,7 @@ class Keys:
         return next(iter(found.values()), None)
 
     def numbers(self, *names: str) -> np.ndarray | None:
-        """Return the numbers of a key, flat; None if there is no such key.
-
-        Raises ValueError: a word is no number.
-        """
+        """Return the numbers of a key, flat; None if there is no such key; ValueError if a word is no number."""
         if not self.has(*names):
             return None
         value = self.take(*names)

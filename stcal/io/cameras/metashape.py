@@ -34,10 +34,7 @@ OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy",
 
 
 def is_metashape(text: str) -> bool:
-    """Return True if a text is XML with an element of Metashape around it.
-
-    Raises ElementTree.ParseError: it is broken XML.
-    """
+    """Return True if a text is XML with an element of Metashape around it; ParseError if it is broken XML."""
     return text.lstrip().startswith("<") and ElementTree.fromstring(text).tag in ("calibration", *ROOTS)
 
 
@@ -48,10 +45,8 @@ def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:
 
 
 def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
-    """Return the camera of a ``<calibration>`` with frame or fisheye projection.
-
-    With ``b2``, ``p3`` or ``p4``, and a frame camera with ``k4``, it is a foreign lens.
-    """
+    """Return the camera of a ``<calibration>``; a foreign lens with ``b2``, ``p3``, ``p4``, or a frame camera with
+    ``k4``."""
     texts: dict[str, str] = {}
     for child in root:
         if child.tag in texts:
@@ -181,13 +176,7 @@ def _values(camera: Camera, form: str) -> dict[str, float]:
 
 
 def calibration(camera: Camera) -> str:
-    """Return the text of a ``<calibration>`` : the lens only.
-
-    Raises
-    ------
-    InputError
-        Metashape has no model for the lens.
-    """
+    """Return the text of a ``<calibration>`` : the lens only; refuse one that Metashape has no model for."""
     root = ElementTree.Element("calibration")
     parts = {"projection": _kind(camera), "width": camera.width, "height": camera.height}
     for tag, value in (parts | _values(camera, "metashape")).items():

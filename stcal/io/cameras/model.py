@@ -40,12 +40,9 @@ OF_IMAGES = "the images"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel(ByValue):
-    """A camera as its file states it.
+    """A camera as its file states it: a :class:`Camera`, but ``width`` and ``height`` are None if the file states none.
 
-    ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, with OpenCV's pixel origin;
-    ``colmap_model`` : the COLMAP model that represents the camera exactly;
-    ``width``, ``height`` : px, or None if the file states none (see :meth:`sized`);
-    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None if the file states none.
+    ``colmap_model`` : the COLMAP model that represents it exactly; ``covariance`` : (q, q) of that model's parameters.
     """
 
     focal: np.ndarray
@@ -68,11 +65,8 @@ class CameraModel(ByValue):
         return replace(self.sized(width, height), covariance=self.covariance)
 
     def of_video(self, width: int, height: int) -> "CameraModel":
-        """Return the camera of pictures of this size.
-
-        It is the camera itself, unless only the last row or column of an odd number is missing: most formats of video
-        have even numbers alone, and their writers drop it. An :class:`InputNote` says so.
-        """
+        """Return the camera of pictures of this size: itself, unless the last row or column of an odd number is
+        missing, which writers of videos drop; an :class:`InputNote` says so."""
         stated = self.width or width, self.height or height
         if (width, height) == stated or (width, height) != tuple(side // 2 * 2 for side in stated):
             return self
@@ -155,11 +149,7 @@ def camera_prior(camera: Camera) -> CameraPrior:
 
 
 def refinable(camera: Camera) -> Camera:
-    """Return the camera with the model to refine.
-
-    A camera without distortion and without covariance is refined as OPENCV, starting from zero distortion: its file
-    says nothing of the lens's distortion.
-    """
+    """Return the camera with the model to refine: OPENCV where its file says nothing of distortion."""
     if camera.covariance is None and camera.colmap_model in WITHOUT_DISTORTION:
         return replace(camera, colmap_model="OPENCV")
     return camera
@@ -235,10 +225,7 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
 def camera_from_opencv(
     lens, given: np.ndarray, fisheye: bool, width: float, height: float, tangential: bool = False
 ) -> CameraModel:
-    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients.
-
-    ``given`` : (k,) k1, k2, p1, p2, k3 …; of an equidistant lens, ``fisheye``, k1 to k4, or with ``tangential`` k1, k2,
-    p1, p2, k3, k4; ``width``, ``height`` : image size, px, 0 if the file states none.
-    """
+    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients (k,) as of :func:`opencv_lens`; sides of 0 px
+    if the file states none."""
     distortion, kind = opencv_lens(given, fisheye, tangential)
     return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None)

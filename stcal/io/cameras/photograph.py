@@ -30,11 +30,8 @@ SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photograph:
-    """The camera of a photograph.
-
-    ``camera`` : OPENCV model without distortion, with a covariance for what EXIF leaves open; ``told`` : the EXIF
-    entries that were used, in words.
-    """
+    """The camera of a photograph, OPENCV without distortion and with a covariance for what EXIF leaves open, and
+    ``told``, the EXIF entries that were used, in words."""
 
     camera: Camera
     told: str
@@ -51,10 +48,7 @@ def is_photograph(path: str | Path) -> bool:
 
 
 def camera_of_photograph(path: str | Path) -> Photograph:
-    """Return the camera that a photograph's EXIF describes.
-
-    ``path`` : JPEG, TIFF or PNG file.
-    """
+    """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes."""
     try:
         data = read_bytes(path, IMAGE_BYTES)
         if is_heic(data):

@@ -45,11 +45,7 @@ def camera_chosen(name: str) -> Iterator[None]:
 
 
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
-    """Read a camera file of any supported kind, which is recognised by the content.
-
-    ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of the camera in a file
-    of several.
-    """
+    """Read a camera file of any kind (``data_layout.md``), recognised by its content; ``name`` : chooses of several."""
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
         return lens

@@ -41,11 +41,8 @@ _EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """Rotations that were read from a table.
-
-    ``rotation`` : (m, 3, 3); ``words`` : the convention; ``columns`` : names of the columns; ``stated`` : True if the
-    columns alone define the convention, without an option.
-    """
+    """Rotations (m, 3, 3) of a table's columns, and the convention in words; ``stated`` : True if the columns alone
+    define it, without an option."""
 
     rotation: np.ndarray
     words: str
@@ -68,10 +65,8 @@ def find_column(table: Table, prefix: str, name: str) -> str | None:
 
 
 def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) -> Turned | None:
-    """Return the rotations in the columns that begin with a prefix; None if there are none.
-
-    ``rotation`` : name of the convention, from ``--rotation``, for angles whose columns leave it open.
-    """
+    """Return the rotations in the columns that begin with a prefix; None if there are none. ``rotation`` : name of the
+    convention, from ``--rotation``, for angles whose columns leave it open."""
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:
         table.has_rotation(prefix)

@@ -96,10 +96,8 @@ def static_of_joint(joint: ElementTree.Element) -> Static:
 
 
 def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a shell script with a call of ``ros2 run tf2_ros static_transform_publisher`` for each transform.
-
-    All calls but the last one continue in the background. ``said`` : lines of a comment.
-    """
+    """Return a shell script, with lines of a comment, that calls ``ros2 run tf2_ros static_transform_publisher`` for
+    each transform, all but the last one in the background."""
     calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
     head = ["#!/bin/sh", *(f"# {line}" for line in said)]
     return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
@@ -186,9 +184,7 @@ METRE_MM = 1000.0
 def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
     """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order.
 
-    At a pitch of ±90° only the sum or difference of roll and yaw is determined. Roll is therefore computed from the
-    rotation that remains after pitch and yaw. This keeps full precision at and near ±90°, where angles computed from
-    single matrix elements lose half of their digits.
+    Roll is computed from what remains after pitch and yaw, which keeps full precision at a pitch of ±90°.
     """
     r = pose.rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
@@ -216,11 +212,8 @@ POINT_CELLS = 3
 
 @dataclass(frozen=True, slots=True)
 class ImageLine:
-    """The first line of an image.
-
-    ``number`` : of the line; ``pose`` : qw, qx, qy, qz, tx, ty, tz; ``name`` : of the image; ``followed`` : whether its
-    second line is there. Programs that remove empty lines also remove those.
-    """
+    """The first line of an image: its number; qw, qx, qy, qz, tx, ty, tz; the image's name; and whether its second line
+    is there, which programs that remove empty lines remove."""
 
     number: int
     pose: list[float]
