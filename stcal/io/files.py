@@ -9,7 +9,6 @@ import stat
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -224,44 +223,15 @@ def require_unchanged(path: str | Path) -> None:
 def json_text(content) -> str:
     """Return the text of a JSON file in the package's form; ``content`` : dict or ``stcal.io.json.ResultFile``."""
     plain = content if isinstance(content, dict) else content.content()
-    text = _indented(plain, "\n")
-    text = (text if len(text) < COMPACT_FROM else _encode(plain)) + "\n"
+    text = json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    if len(text) > COMPACT_FROM:
+        text = json.dumps(plain, separators=(",", ":"), ensure_ascii=False, allow_nan=False) + "\n"
     if len(text) > TABLE_BYTES:
         raise InputError(
             "E-OUTPUT-SIZE",
             f"a result would have {len(text) / MB:.0f} MB, at most {TABLE_BYTES // MB} MB are read; give fewer rows",
         )
     return text
-
-
-_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
-PLAIN = {float, int, bool, type(None)}
-"""Types whose text holds neither a comma nor a bracket."""
-
-
-def _indented(value, line: str) -> str:
-    """Return ``json.dumps`` with ``indent=1``, faster: lists of numbers at once; ``line`` : break and indent."""
-    inner = line + " "
-    if isinstance(value, dict):
-        items = [f"{_key(key)}: {_indented(item, inner)}" for key, item in value.items()]
-        return f"{{{inner}{f',{inner}'.join(items)}{line}}}" if items else "{}"
-    if not isinstance(value, list | tuple):
-        return _encode(value)
-    if not value:
-        return "[]"
-    kinds = set(map(type, value))
-    if kinds <= PLAIN:
-        return f"[{inner}{_encode(value)[1:-1].replace(',', f',{inner}')}{line}]"
-    if kinds == {list} and all(value) and set(map(type, chain.from_iterable(value))) <= PLAIN:
-        ends, between = f"{inner}]", f"{inner} "
-        rows = _encode(value)[2:-2].replace(",", f",{between}").replace(f"],{between}[", f"{ends},{inner}[{between}")
-        return f"[{inner}[{between}{rows}{ends}{line}]"
-    return f"[{inner}{f',{inner}'.join([_indented(item, inner) for item in value])}{line}]"
-
-
-def _key(key) -> str:
-    """Return a key as ``json.dumps`` writes it: numbers in quotes."""
-    return _encode(key) if isinstance(key, str) else _encode({key: 0})[1:-3]
 
 
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
