@@ -71,26 +71,18 @@ class Arg:
         return typer.Argument(metavar=self.metavar, help=text, min=self.min, max=self.max, writable=self.writes)
 
 
-@dataclass(frozen=True, slots=True)
-class Declared:
-    """``annotation`` : of a parameter, for Typer; ``word`` : its name in messages; ``writes`` : whether its value is a
-    path that is written."""
-
-    annotation: Any
-    word: str
-    writes: bool
-
-
-def declared(parameter: str, annotation: Any) -> Declared:
-    """Returns Typer's form of a parameter."""
-    kind, text, *rest = get_args(annotation)
+def declared(parameter: inspect.Parameter) -> inspect.Parameter:
+    """Returns a parameter with Typer's form of its annotation."""
+    kind, text, *rest = get_args(parameter.annotation)
     [given] = rest or [Opt()]
-    info = given.info(parameter, text)
-    is_path = "Path" in str(kind)
-    info.rich_help_panel = panel_of(parameter, is_path, given.writes)
-    # With Annotated, Typer takes an option's first name for its default.
-    word = info.default if isinstance(given, Opt) else parameter
-    return Declared(Annotated[kind, info], word, given.writes)
+    info = given.info(parameter.name, text)
+    info.rich_help_panel = panel_of(parameter.name, "Path" in str(kind), given.writes)
+    return parameter.replace(annotation=Annotated[kind, info])
+
+
+def info_of(parameter: inspect.Parameter) -> Any:
+    """Returns what Typer knows of a parameter that :func:`declared` returns."""
+    return get_args(parameter.annotation)[1]
 
 
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
@@ -242,17 +234,14 @@ def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, 
     """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
     from stcal.io.poses.programs import require_form
 
+    exports = []
     for word in words:
         form, _, path = word.partition("=")
         require_form(form, forms)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
-    return _exports(words)
-
-
-def _exports(words: Sequence[str]) -> list[tuple[str, Path]]:
-    parts = [word.partition("=") for word in words]
-    return [(form, Path(path)) for form, _, path in parts if path]
+        exports.append((form, Path(path)))
+    return exports
 
 
 def name_of(source: "Path | Table") -> str:
@@ -274,15 +263,9 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
 def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None, verdict: str = "") -> None:
     """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given; otherwise a quiet
     command writes ``verdict``, the sentence of a verdict that is not good, or what failed."""
-    if strict and failed:
-        others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
-        where = f"; see {report}" if report else ""
-        raise ChecksFailed(
-            "E-CHECKS-FAILED",
-            f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them{where}",
-        )
-    if verdict or failed:
-        warn_if_quiet(verdict or f"failed: {', '.join(failed)}")
+    others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
+    said = f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them"
+    _require(strict, said, report, bool(failed), verdict or f"failed: {', '.join(failed)}" * bool(failed))
 
 
 def require_usable(
@@ -291,14 +274,15 @@ def require_usable(
     """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given;
     otherwise a quiet command writes ``verdict``, or the reasons. ``but`` : ends what is said of the results, which are
     written."""
-    if strict and reasons:
-        where = f"; see {page}" if page else ""
-        raise ChecksFailed(
-            "E-CHECKS-FAILED",
-            f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0{where}",
-        )
-    if verdict or reasons:
-        warn_if_quiet(verdict or "; ".join(reasons))
+    said = f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0"
+    _require(strict, said, page, bool(reasons), verdict or "; ".join(reasons))
+
+
+def _require(strict: bool, said: str, page: Path | None, failed: bool, verdict: str) -> None:
+    if strict and failed:
+        raise ChecksFailed("E-CHECKS-FAILED", said + (f"; see {page}" if page else ""))
+    if verdict:
+        warn_if_quiet(verdict)
 
 
 def load_ahead(workers: int | None) -> None:
@@ -378,9 +362,12 @@ def _protected(command: Callable) -> Callable:
         return command
     command = _grouped(command)
     signature = inspect.signature(command, eval_str=True)
-    parameters = {name: declared(name, each.annotation) for name, each in signature.parameters.items()}
-    words = {name: each.word for name, each in parameters.items()}
-    outputs = {name for name, each in parameters.items() if each.writes}
+    every = [*map(declared, signature.parameters.values())]
+    # With Annotated, Typer takes an option's first name for its default.
+    words = {
+        each.name: info_of(each).default if isinstance(info_of(each).default, str) else each.name for each in every
+    }
+    outputs = {each.name for each in every if info_of(each).writable}
 
     @wraps(command)
     def checked(
@@ -399,7 +386,8 @@ def _protected(command: Callable) -> Callable:
         written, read = (
             [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
         )
-        written += [("--export", path) for _, path in _exports(given.get("export") or ())]
+        exports = (word.partition("=")[2] for word in given.get("export") or ())
+        written += [("--export", Path(path)) for path in exports if path]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in to_stdout:
             if option != "--json":
@@ -419,8 +407,13 @@ def _protected(command: Callable) -> Callable:
         try:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
-            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes():
-                return command(**given) if not camera_name else _with(camera_name, command, given)
+            choice: AbstractContextManager[None] = nullcontext()
+            if camera_name:
+                from stcal.io.cameras.read import camera_chosen
+
+                choice = camera_chosen(camera_name)
+            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes(), choice:
+                return command(**given)
         finally:
             _replacing.reset(token)
 
@@ -428,22 +421,15 @@ def _protected(command: Callable) -> Callable:
     further: dict[str, tuple[Any, Any]] = {"camera_name": (CameraName, "")} if CAMERA in words.values() else {}
     further |= {"overwrite": (Overwrite, False)} if outputs and command.__name__ not in ALWAYS_NEW else {}
     further |= {"quiet": (Quiet, False), "verbose": (Verbose, False)}
-    every = [each.replace(annotation=parameters[name].annotation) for name, each in signature.parameters.items()]
-    for name, (annotation, default) in further.items():
-        kind = declared(name, annotation).annotation
-        every.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind))
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    every += [
+        declared(inspect.Parameter(name, keyword, default=default, annotation=annotation))
+        for name, (annotation, default) in further.items()
+    ]
     # Typer reads both.
     checked.__signature__ = signature.replace(parameters=every)  # type: ignore[attr-defined]
     checked.__annotations__ = {each.name: each.annotation for each in every} | {"return": None}
     return checked
-
-
-def _with(camera_name: str, command: Callable, given: dict):
-    """Run a command with the camera of this name if a camera file has several."""
-    from stcal.io.cameras.read import camera_chosen
-
-    with camera_chosen(camera_name):
-        return command(**given)
 
 
 @contextmanager
@@ -471,13 +457,19 @@ def designs_told(
     """Prints which reference designs are assumed (unless switched off), and which faces are nearly alike; errors within
     the context name the designs."""
     from stcal.boards.target import body_of
+    from stcal.design import reference_board, reference_target
     from stcal.sfm.detect.sightings import likeness_notes
 
+    assumed = []
     if target is not None:
         design = body_of(target)
         print_each("note", likeness_notes(design))
         with_board = with_board and not design.has_scale
-    assumed = assumed_designs(target is None and with_target, board is None and with_board)
+    elif with_target:
+        faces = reference_target().faces
+        assumed.append(f"the reference target, {len(faces)} faces of {len(faces[0].ids)} circles (no --target)")
+    if board is None and with_board:
+        assumed.append(f"the reference board, {board_in_words(reference_board())} (no --board)")
     for design in assumed:
         say(f"assumed: {design}")
     try:
@@ -486,20 +478,6 @@ def designs_told(
         if assumed and not isinstance(error, InputError):
             error.append(f"; assumed: {' and '.join(assumed)}")
         raise
-
-
-def assumed_designs(target: bool, board: bool) -> list[str]:
-    """Returns short descriptions of the reference target and board, with the options that name others."""
-    from stcal.design import reference_board, reference_target
-
-    reference, dots, words = reference_target(), reference_board(), []
-    if target:
-        words.append(
-            f"the reference target, {len(reference.faces)} faces of {len(reference.faces[0].ids)} circles (no --target)"
-        )
-    if board:
-        words.append(f"the reference board, {board_in_words(dots)} (no --board)")
-    return words
 
 
 def board_in_words(board: "BoardDesign") -> str:

@@ -162,13 +162,8 @@ class Camera(ByValue):
         return cls(int(size[0]), int(size[1]), k[[0, 1], [0, 1]], k[:2, 2], flat, fisheye, model)
 
     def to_opencv(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four.
-
-        Raises
-        ------
-        InputError
-            An equidistant lens with tangential terms or prisms, which ``cv2.fisheye`` does not have.
-        """
+        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four, without
+        prisms."""
         matrix = np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]])
         if not self.fisheye:
             count = next(n for n in (4, 5, 8, 12) if not self.distortion[n:].any())
@@ -228,18 +223,7 @@ class Camera(ByValue):
         return jacobian
 
     def distort(self, xy: ArrayLike) -> np.ndarray:
-        """Apply the lens distortion to ideal normalised coordinates.
-
-        Parameters
-        ----------
-        xy : (..., 2) array
-            Ideal normalised coordinates.
-
-        Returns
-        -------
-        (..., 2) array
-            Distorted normalised coordinates.
-        """
+        """Return distorted normalised coordinates (..., 2) of ideal ones (..., 2)."""
         xy = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(xy)
@@ -249,20 +233,7 @@ class Camera(ByValue):
         return np.stack(self._moved(x, y, r2, top / bottom), axis=-1)
 
     def distort_jacobian(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Apply the lens distortion and return its derivative, too.
-
-        Parameters
-        ----------
-        xy : (..., 2) array
-            Ideal normalised coordinates.
-
-        Returns
-        -------
-        distorted : (..., 2) array
-            Result of :meth:`distort`.
-        jacobian : (..., 2, 2) array
-            Derivative of the distorted by the ideal coordinates.
-        """
+        """Return :meth:`distort` of ideal coordinates (..., 2), and its derivative (..., 2, 2)."""
         xy = ideal = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(ideal)
@@ -321,13 +292,8 @@ class Camera(ByValue):
         return moved_x, moved_y
 
     def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
-        """Invert :meth:`distort` by Newton's method to 1e-12.
-
-        Raises
-        ------
-        ConvergenceError
-            Where the distortion model folds over, so that no inverse exists, or for coordinates that are not finite.
-        """
+        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the distortion folds the image
+        over."""
         target = np.asarray(xy_distorted, float)
         if not self.distortion.any():
             return self._perspective(target.copy(), target)

@@ -126,11 +126,8 @@ class Rigid(ByValue):
 
     @classmethod
     def exp(cls, twist: ArrayLike) -> "Rigid":
-        """Return the transform of a rotation vector (rad) and a translation (mm), (6,).
-
-        It is not the SE(3) exponential of the twist, but the product perturbation ``(exp(w), t)`` in which the package
-        states pose covariances.
-        """
+        """Return the transform of a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential, but
+        the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
         motion = np.asarray(twist, float)
         return cls(Rotation.from_rotvec(motion[:3]).as_matrix(), motion[3:])
 
@@ -261,13 +258,8 @@ class Poses(Brief):
 
     @classmethod
     def from_matrices(cls, matrices: ArrayLike) -> "Poses":
-        """Return the transforms of homogeneous matrices (m, 4, 4), mm; rotations are projected onto SO(3).
-
-        Raises
-        ------
-        InputError
-            Another shape; or a matrix that is not finite, left-handed, scaled or transposed, named by its number.
-        """
+        """Return the transforms of homogeneous matrices (m, 4, 4), mm, with rotations projected onto SO(3); of one that
+        is not finite, left-handed, scaled or transposed the number is named."""
         rigid = []
         for number, matrix in enumerate(frozen(matrices, (None, None, None), "poses", finite=False), 1):
             try:

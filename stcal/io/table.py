@@ -170,10 +170,8 @@ class Table(ByValue):
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
-        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`; None if there are no such columns.
-
-        Raises InputError: only some of the columns exist, or a matrix is not positive definite.
-        """
+        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`, positive definite; None if there are
+        none."""
         names = [prefix + name for name in COVARIANCE]
         if not any(name in self for name in names):
             return None
@@ -185,10 +183,8 @@ class Table(ByValue):
         return full
 
     def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
-        """Refuse covariances (m, n, n) of the rows unless all are positive definite.
-
-        Raises InputError: the message names the first bad line and its fault.
-        """
+        """Refuse covariances (m, n, n) of the rows unless all are positive definite, by the first bad line and its
+        fault."""
         fault = first_fault(full, rows, definite=True)
         if fault is not None:
             raise InputError(
@@ -199,9 +195,7 @@ class Table(ByValue):
     def common_errors(self, covariance: np.ndarray | None, prefix: str = "") -> np.ndarray | None:
         """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
 
-        ``prefix`` : text with which the names of these columns begin.
-
-        Raises InputError: only some of the columns exist, or they exceed the covariance (m, 6, 6), which includes them.
+        ``prefix`` : of these columns' names. The covariance (m, 6, 6) must include them.
         """
         stems = (name.removeprefix(prefix) for name in self.columns if name.startswith(prefix))
         count = len({stem.split("_")[0] for stem in stems if COMMON.fullmatch(stem)})
