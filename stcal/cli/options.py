@@ -80,11 +80,6 @@ def declared(parameter: inspect.Parameter) -> inspect.Parameter:
     return parameter.replace(annotation=Annotated[kind, info])
 
 
-def info_of(parameter: inspect.Parameter) -> Any:
-    """Returns what Typer knows of a parameter that :func:`declared` returns."""
-    return get_args(parameter.annotation)[1]
-
-
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
 Run = Annotated[Path, "Read the finished run in this folder.", Arg("RUN")]
 CameraFile = Annotated[
@@ -363,11 +358,10 @@ def _protected(command: Callable) -> Callable:
     command = _grouped(command)
     signature = inspect.signature(command, eval_str=True)
     every = [*map(declared, signature.parameters.values())]
+    infos = {each.name: get_args(each.annotation)[1] for each in every}
     # With Annotated, Typer takes an option's first name for its default.
-    words = {
-        each.name: info_of(each).default if isinstance(info_of(each).default, str) else each.name for each in every
-    }
-    outputs = {each.name for each in every if info_of(each).writable}
+    words = {name: info.default if isinstance(info.default, str) else name for name, info in infos.items()}
+    outputs = {name for name, info in infos.items() if info.writable}
 
     @wraps(command)
     def checked(

@@ -295,16 +295,16 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
     numbers = [i for i, _ in used[1:]]
     rows = [line for _, line in used[1:]]
-    if between != ",":
-        return _other_form(names, used[1:], between, where, quaternions)
+    if between == ",":
+        try:
+            fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
+            if fast.shape == (len(rows), len(names)):
+                return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions, rows)
+        except ValueError:
+            pass  # there is text among the numbers: parse row by row
     try:
-        fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
-        if fast.shape == (len(rows), len(names)):
-            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions, rows)
-    except ValueError:
-        pass  # there is text among the numbers: parse row by row
-    try:
-        cells = [[plain(cell) for cell in row] for row in csv.reader(rows)]
+        split = map(str.split, rows) if between == " " else csv.reader(rows, delimiter=between)
+        cells = [[plain(cell.strip()) for cell in row] for row in split]
     except csv.Error:  # an unclosed cell, longer than any may be
         cells = []
     if len(cells) != len(rows):
@@ -318,7 +318,12 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
             raise InputError(
                 "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
             )
-    return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers, quaternions)
+    columns = {name: [row[k] for row in cells] for k, name in enumerate(names)}
+    if between == ",":
+        return Table(where, dict(columns), numbers, quaternions)
+    columns, commas = decimal_points(columns, between, where)
+    form = SEPARATORS[between] + (", decimal commas" if commas else "")
+    return Table(where, dict(columns), numbers, quaternions, form=form)
 
 
 SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "spaces between columns"}
@@ -476,26 +481,6 @@ def _separator(lines: Sequence[str]) -> str:
         return "\t"
     count = len(header.split())
     return " " if count > 1 and len(lines) > 1 and all(len(line.split()) == count for line in lines[1:]) else ","
-
-
-def _other_form(
-    names: list[str], used: Sequence[tuple[int, str]], between: str, where: str, quaternions: Order
-) -> Table:
-    """Return a table whose columns are not separated by commas."""
-    rows = []
-    for line, text in used:
-        try:
-            row = cells_of(text, between)
-        except csv.Error as error:
-            raise InputError("E-TABLE-CELLS", f"{where}: line {line}: {error}; correct it") from error
-        if len(row) != len(names):
-            raise InputError(
-                "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
-            )
-        rows.append(row)
-    columns, commas = decimal_points({name: [row[k] for row in rows] for k, name in enumerate(names)}, between, where)
-    form = SEPARATORS[between] + (", decimal commas" if commas else "")
-    return Table(where, dict(columns), [line for line, _ in used], quaternions, form=form)
 
 
 def _points_of_analyzer(

@@ -54,7 +54,7 @@ class Convention:
 
     @property
     def count(self) -> int:
-        """The count of numbers that state a rotation, and mistakes in the order of quaternions."""
+        """The count of numbers that state a rotation."""
         return 4 if self.order in QUATERNIONS else 3
 
     def words(self) -> str:
@@ -103,6 +103,9 @@ def rotations(
 ) -> tuple[np.ndarray, str]:
     """Return matrices (m, 3, 3) of Euler angles or rotation vectors (m, 3), and the convention used, in words;
     ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations."""
+    if convention.order in QUATERNIONS:
+        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
+        return of_quaternions(values[:, order], places, where), convention.words()
     require_finite(values, places, where)
     unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
     if not unit:
@@ -133,11 +136,7 @@ def turned_values(
     values: np.ndarray, rotation: str | None, what: str, places: tuple[str, ...], where: str
 ) -> tuple[np.ndarray, str]:
     """Return rotations (m, 3, 3) of numbers (m, 3) or (m, 4) in the user's convention, and the convention in words."""
-    convention = said_convention(rotation, what, where, values.shape[1])
-    if convention.order in QUATERNIONS:
-        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
-        return of_quaternions(values[:, order], places, where), convention.words()
-    return rotations(values, convention, places, where)
+    return rotations(values, said_convention(rotation, what, where, values.shape[1]), places, where)
 
 
 def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
