@@ -393,8 +393,7 @@ def _protected(command: Callable) -> Callable:
             if option == "--report" and path.suffix.lower() == ".pdf":
                 also = ", and --pdf for the PDF" if "pdf" in given else "; a browser prints it as PDF"
                 raise InputError(
-                    "E-OUTPUT-SUFFIX",
-                    f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}",
+                    "E-OUTPUT-SUFFIX", f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}"
                 )
         keep_apart(written, read)
         token = _replacing.set(overwrite)

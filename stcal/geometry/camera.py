@@ -384,8 +384,7 @@ def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> t
     if fisheye:
         if len(given) not in ((6,) if tangential else (0, 4)):
             raise InputError(
-                "E-CAMERA-COEFFICIENTS",
-                f"{len(given)} coefficients of an equidistant lens; k1 to k4 needed",
+                "E-CAMERA-COEFFICIENTS", f"{len(given)} coefficients of an equidistant lens; k1 to k4 needed"
             )
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         return distortion, "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
@@ -406,10 +405,7 @@ def require_lens(flat: np.ndarray, width: float | None, height: float | None) ->
     if not np.isfinite(flat).all():
         raise InputError("E-CAMERA-NOT-FINITE", "a camera parameter is not a finite number; correct it")
     if (far := np.abs(flat).max()) > FARTHEST:
-        raise InputError(
-            "E-CAMERA-TOO-FAR",
-            f"a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
-        )
+        raise InputError("E-CAMERA-TOO-FAR", f"a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it")
     if (flat[:2] <= 0).any():
         raise InputError("E-CAMERA-FOCAL", f"focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):

@@ -287,10 +287,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
                 "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
             )
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
-        raise InputError(
-            "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is no header of the rows below it; remove it",
-        )
+        raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]} is no header of the rows below it; remove it")
     if len(used) == 1:
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
     numbers = [i for i, _ in used[1:]]
