@@ -43,7 +43,7 @@ class FaceDesign(Brief):
     id : str
         Name of the face.
     ids : tuple of str
-        Names of its n circles.
+        Names of its n circles, which neither occur twice nor overlap.
     xy_mm : (n, 2) array
         Centres, face frame, mm.
     radius_mm : (n,) array
@@ -51,13 +51,11 @@ class FaceDesign(Brief):
     origin, x, y : str
         Circles that define the frame.
     rough_target_from_face : Rigid, optional
-        Approximate pose of the face in a frame that all faces share. Plans and simulations use it, a calibration does
-        not.
+        Approximate pose in a frame that all faces share, for plans and simulations; a calibration does not use it.
     outline_mm : (k, 2) array, optional
         Corners of its plate in order, face frame, for drawings.
     rim_mm : (n,) array, optional
-        Heights of the rims in front of the circles, negative for discs that stand out; if None, the circles lie in the
-        surface of the plate.
+        Heights of the rims in front of the circles, negative for discs that stand out; None if they lie in the surface.
     printed : Printed, optional
         The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose frame
         is the face frame, Z into the body; None for a face of circles.
@@ -68,11 +66,6 @@ class FaceDesign(Brief):
         Relative σ of the printed size, and the share of its variance that is due to the edges of tags.
     of_tags : bool
         Whether the corners are those of tags, four by four, whose edges light and ink move.
-
-    Raises
-    ------
-    InputError
-        Arrays of other shapes; circles that overlap or occur twice; frame circles that give no frame.
     """
 
     id: str
@@ -171,7 +164,7 @@ class KnownDistance:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class TargetDesign(Brief):
-    """Target: its faces, and whether its circles are brighter or darker than their surroundings.
+    """Target: its faces, which differ, and whether its circles are brighter or darker than their surroundings.
 
     Parameters
     ----------
@@ -185,11 +178,6 @@ class TargetDesign(Brief):
         True if unusually large or small radii are not a mistake of units.
     distances : tuple of KnownDistance
         Known distances between its points.
-
-    Raises
-    ------
-    InputError
-        Another polarity, ids that occur twice, faces that look alike, lengths that are not mm.
     """
 
     name: str
@@ -538,11 +526,7 @@ def _dot_labels(rows: int, columns: int) -> tuple[DotLabel, ...]:
 def reference_target() -> TargetDesign:
     """Returns the reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1).
 
-    Returns
-    -------
-    TargetDesign
-        Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) as far as that is
-        consistent.
+    Rough poses are in the frame of face 1, close to table 2 of that paper as far as it is consistent.
     """
     common = {"1": (0, 0), "2": (40, 0), "3": (80, 0), "4": (0, 40), "5": (0, 80), "6": (40, 40), "7": (80, 80)}
     small = {"a": (20, 0), "b": (0, 20)}
@@ -566,11 +550,5 @@ def reference_target() -> TargetDesign:
 
 
 def reference_board() -> BoardDesign:
-    """Returns the reference board.
-
-    Returns
-    -------
-    BoardDesign
-        9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm.
-    """
+    """Returns the reference board: 9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm."""
     return BoardDesign(7, 9, 30.0, 7.5, "bright", DOTS_SIGMA_MM)

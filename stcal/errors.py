@@ -47,13 +47,7 @@ def in_python(message: str) -> str:
 
 
 class StcalError(Exception):
-    """Base of every error that stcal raises on purpose.
-
-    Parameters
-    ----------
-    code : kind of the mistake, like ``E-CAMERA-MODEL``
-    message : one line for people
-    """
+    """Base of every error that stcal raises on purpose: ``code``, its kind, and ``message``, one line."""
 
     exit_code = 3
 

@@ -53,22 +53,19 @@ LEAST_SHARE_OF_SIDE = 0.015
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera(ByValue):
-    """A central camera with OpenCV's lens model and perspective or equidistant projection.
+    """A central camera with OpenCV's lens model and perspective or equidistant projection, before the camera.
 
     Perspective: the ideal point (x, y) = (X, Y) / Z is distorted by OpenCV's rational model with thin prisms (its first
     twelve coefficients; COLMAP's FULL_OPENCV without prisms). Equidistant: the point is moved to the radius θ, its
-    angle from the axis: (x, y) θ / r. It is then distorted by 1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸, p1, p2, s1 and s3
-    (Kannala & Brandt 2006; OpenCV's fisheye; COLMAP's THIN_PRISM_FISHEYE). Only points at less than 90° from the axis
-    are seen.
+    angle from the axis, and then distorted by 1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸, p1, p2, s1 and s3 (Kannala & Brandt
+    2006; OpenCV's fisheye; COLMAP's THIN_PRISM_FISHEYE).
 
     Parameters
     ----------
     width, height : int
         Image size, px.
-    focal : (2,) array
-        fx, fy, px.
-    centre : (2,) array
-        cx, cy, px, centre of the top-left pixel at (0, 0).
+    focal, centre : (2,) array
+        fx, fy and cx, cy, px, centre of the top-left pixel at (0, 0).
     distortion : (12,) array
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in OpenCV's order; or the first eight.
     fisheye : bool
@@ -77,11 +74,6 @@ class Camera(ByValue):
         The COLMAP model that represents the camera exactly; the most general one of its projection if not given.
     covariance : (q, q) array, optional
         Covariance of the parameters of ``colmap_model``, in its order; None if unknown.
-
-    Raises
-    ------
-    InputError
-        Numbers that no camera has, an unknown ``colmap_model`` or one of another projection, arrays of other shapes.
     """
 
     width: int
@@ -139,16 +131,9 @@ class Camera(ByValue):
             ``cameraMatrix``: fx, fy, cx, cy, px; without skew.
         distortion : (k,) array
             k1, k2, p1, p2, k3, k4, k5, k6, all or the first 4 or 5; none for a lens without distortion. With
-            ``fisheye`` k1, k2, k3, k4 of ``cv2.fisheye``.
+            ``fisheye``, the equidistant projection of ``cv2.fisheye``, its k1, k2, k3, k4.
         size : (int, int)
             Width and height of the images, px.
-        fisheye : bool
-            Equidistant projection, as of ``cv2.fisheye``.
-
-        Raises
-        ------
-        InputError
-            A matrix of another form, numbers of coefficients that OpenCV does not know, a size that is none.
         """
         k = frozen(matrix, (3, 3), "camera matrix")
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:

@@ -230,11 +230,6 @@ class Poses(Brief):
         Proper rotations, to 1e-6.
     translation : (m, 3) array
         Origins of b in a, mm.
-
-    Raises
-    ------
-    InputError
-        Arrays of other shapes, or matrices that are no rotations.
     """
 
     rotation: Array

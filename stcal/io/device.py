@@ -55,11 +55,6 @@ class OpenCVSource:
         Its number, or a path such as ``/dev/video0``.
     gain : float, optional
         Gain in the driver's unit; unchanged if None.
-
-    Raises
-    ------
-    InputError
-        There is no such camera, or its driver accepts no gain.
     """
 
     def __init__(self, device: str, gain: float | None = None):
@@ -110,16 +105,10 @@ class SimulatedSource:
     Parameters
     ----------
     image : str or Path
-        The image.
     gain : float, optional
         Factor on the brightness; 1 if None.
     seed : int
         Seed of the noise.
-
-    Raises
-    ------
-    InputError
-        The image cannot be read.
     """
 
     def __init__(self, image: str | Path, gain: float | None = None, seed: int = 0):

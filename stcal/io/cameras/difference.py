@@ -85,18 +85,7 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     one, two : Camera
         Cameras of the same image size. Of a lens with a region only this is compared.
 
-    Returns
-    -------
-    CameraDifference
-        ``pixels`` (r, c, 2) of the first camera and offsets ``apart`` (r, c, 2) of the second, px;
-        ``second_from_first``, the turn.
-
-    Raises
-    ------
-    InputError
-        The image sizes differ.
-    DegenerateError
-        Too few pixels have a ray in both cameras.
+    Raises DegenerateError: too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
@@ -218,17 +207,8 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     size : (int, int), optional
         Width and height of the images, px, for a file that does not state them.
 
-    Returns
-    -------
-    LoadedLens
-        ``camera``, with the residuals ``fitted`` of a lens of another model, px.
-
-    Raises
-    ------
-    InputError
-        The file is missing or malformed, holds more than one camera, or no size is known.
-    ConvergenceError, DegenerateError
-        No supported model comes near the lens.
+    Raises InputError: the file is missing or malformed, holds more than one camera, or no size is known.
+    Raises ConvergenceError, DegenerateError: no supported model comes near the lens.
     """
     if is_photograph(path):
         found = camera_of_photograph(path)

@@ -127,17 +127,12 @@ PRIOR_TANGENTIAL = 1e-3
 
 
 def camera_prior(camera: Camera) -> CameraPrior:
-    """Return a prior of the intrinsics, with the covariance of the camera or else of an old calibration.
+    """Return a prior of the intrinsics, for hand-eye: the camera's covariance, or that of an old calibration.
 
     Parameters
     ----------
     camera : Camera
-        The camera, from :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
-
-    Returns
-    -------
-    CameraPrior
-        Prior for :class:`stcal.handeye.HandEyeOptions`.
+        From :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
     """
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)

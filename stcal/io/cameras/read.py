@@ -70,7 +70,7 @@ def camera_model(camera: str | Path | Camera | CameraModel) -> CameraModel:
 
 @require_arguments
 def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> Camera:
-    """Load a camera from a file of any supported kind, which is recognised by the content.
+    """Load a camera from a file of any supported kind, which is recognised by the content, with any covariance.
 
     Parameters
     ----------
@@ -82,15 +82,7 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
     size : (int, int), optional
         Width and height of the images, px, for a file that does not state them.
 
-    Returns
-    -------
-    Camera
-        With its covariance if the file states one.
-
-    Raises
-    ------
-    InputError
-        The file is missing or malformed, holds more than one camera, a lens of an unsupported model, or no size.
+    Raises InputError: no such file, a malformed one, one of several cameras or an unsupported lens, or no size.
     """
     return sized_camera(read_camera(path, name), path, size)
 
@@ -211,12 +203,12 @@ ACROSS = 9
 
 @require_arguments
 def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None, name: str = "") -> tuple[str, ...]:
-    """Save a camera to a file of this or another program, and require that it is read as the same camera.
+    """Save a camera in a form of this or another program, and return what it has no place for, such as σ.
 
     Parameters
     ----------
     path : str or Path
-        File to write.
+        File to write; it is required to be read as the same camera.
     camera : Camera
         Camera to save, with its covariance if it has one.
     form : str, optional
@@ -225,15 +217,7 @@ def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None
     name : str
         Name of the camera, for forms that have a place for it.
 
-    Returns
-    -------
-    tuple of str
-        What the form has no place for, such as σ; nothing for ``colmap``.
-
-    Raises
-    ------
-    InputError
-        No form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
+    Raises InputError: no form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
     """
     converted = written(camera, form_of(path, form), name_to_write(name))
     save(Path(path), converted.content)
