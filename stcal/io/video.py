@@ -107,17 +107,6 @@ def _move(first: _Frame, second: _Frame) -> float:
     return float(np.percentile(np.linalg.norm(flow, axis=2), MOVING)) / SMALL_PX
 
 
-def _emptied(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("frame_*.png"):
-            old.unlink()
-    except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"folder {folder}: {error.strerror or error}; give a writable folder"
-        ) from error
-
-
 def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO) -> list[Path]:
     """Write the chosen frames of a video into a folder, as ``frame_<number>.png``; those of an earlier call go.
 
@@ -127,7 +116,14 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
     video, folder, every = Path(video), Path(folder), checked_every(every)
     written: list[tuple[Path, int, float]] = []
     with frames_of(video) as frames:
-        _emptied(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for old in folder.glob("frame_*.png"):
+                old.unlink()
+        except OSError as error:
+            raise InputError(
+                "E-OUTPUT-UNWRITABLE", f"folder {folder}: {error.strerror or error}; give a writable folder"
+            ) from error
         for frame in chosen_frames(frames, every):
             path = folder / f"frame_{frame.number:06d}.png"
             save(path, png(frame.grey))

@@ -49,7 +49,18 @@ def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
 
 def messages(statics: Iterable[Static]) -> str:
     """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
-    return "---\n".join(yaml.safe_dump(_message(static), sort_keys=False, allow_unicode=True) for static in statics)
+    documents = [
+        {
+            "header": {"frame_id": each.parent},
+            "child_frame_id": each.child,
+            "transform": {
+                "translation": dict(zip("xyz", metres(each.pose), strict=True)),
+                "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
+            },
+        }
+        for each in statics
+    ]
+    return "---\n".join(yaml.safe_dump(each, sort_keys=False, allow_unicode=True) for each in documents)
 
 
 def read_messages(text: str) -> list[Static]:
@@ -60,17 +71,6 @@ def read_messages(text: str) -> list[Static]:
         pose = pose_of_metres([transform["translation"][c] for c in "xyz"], [transform["rotation"][c] for c in "xyzw"])
         statics.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
     return statics
-
-
-def _message(each: Static) -> dict:
-    return {
-        "header": {"frame_id": each.parent},
-        "child_frame_id": each.child,
-        "transform": {
-            "translation": dict(zip("xyz", metres(each.pose), strict=True)),
-            "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
-        },
-    }
 
 
 def fixed_joint(each: Static) -> str:
