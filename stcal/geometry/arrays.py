@@ -224,7 +224,6 @@ def _require_unmasked(value: object, what: str) -> None:
 
 
 def _holds_text(values: object) -> bool:
-    """Return True if a text is among the values of nested lists."""
     return isinstance(values, str) or (isinstance(values, list | tuple) and any(map(_holds_text, values)))
 
 
@@ -253,7 +252,6 @@ def frozen(
 
 
 def _as_array(values: ArrayLike, shape: Shape | None, what: str, dtype: DTypeLike) -> np.ndarray:
-    """Return a copy of values of any type."""
     _require_unmasked(values, what)
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")

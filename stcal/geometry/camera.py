@@ -355,7 +355,6 @@ def _angle_share(r2: np.ndarray) -> np.ndarray:
 
 
 def _equidistant_jacobian(xy: np.ndarray) -> np.ndarray:
-    """Return the derivative (..., 2, 2) of :func:`_equidistant`."""
     r2 = (xy**2).sum(-1)
     share, near = _angle_share(r2), r2 <= NEAR_AXIS
     along = np.where(near, -2 / 3 + 4 / 5 * r2, (1 / (1 + r2) - share) / np.where(near, 1.0, r2))

@@ -154,7 +154,6 @@ def apply_homography(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
 
 
 def _mapped(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Return the homogeneous images (..., 3) of points."""
     constant = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
     return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + constant
 

@@ -103,8 +103,6 @@ def _kind_of_face(face: Any) -> str:
 
 
 class _ScaleFile(Strict):
-    """A known distance between two points."""
-
     first: str = Field(alias="from")
     second: str = Field(alias="to")
     mm: Positive
@@ -446,7 +444,6 @@ def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]]
 
 
 def _rims(face: FaceDesign) -> list[str]:
-    """Returns the key of each circle's rim, empty where the design states none."""
     if face.rim_mm is None:
         return [""] * len(face.ids)
     return [f", rim_mm = {_number(height)}" for height in face.rim_mm]

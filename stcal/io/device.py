@@ -217,7 +217,6 @@ def _grey(frame: np.ndarray) -> np.ndarray:
 
 
 def _every(device: cv2.VideoCapture) -> Generator[np.ndarray, None, None]:
-    """Yield each picture of a video file."""
     while (read := device.read())[0]:
         yield _grey(read[1])
 

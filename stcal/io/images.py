@@ -329,7 +329,6 @@ def _turn(data: bytes) -> int | None:
 
 
 def _tag(data: bytes, tag: int) -> object:
-    """Return a tag of a TIFF or of EXIF; None if there is none."""
     try:
         with Image.open(BytesIO(data)) as image:
             return image.getexif().get(tag)

@@ -425,7 +425,6 @@ RTDE |= {f"actual_q_{i}": f"q{i + 1}_rad" for i in range(6)}
 
 
 def _short(unit: str) -> str:
-    """Return a unit as the package writes it."""
     word = unit.lower().replace("µ", "u").replace("°", "deg")
     return next((short for short, long in _LONG.items() if word.startswith(long)), word)
 

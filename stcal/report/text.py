@@ -58,7 +58,6 @@ def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
 
 
 def _alike(lists: Sequence[Sequence[str]]) -> int:
-    """Return the number of entries at the beginning that all lists share."""
     return (
         sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False))) if len(lists) > 1 else 0
     )

@@ -101,18 +101,15 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
             "E-CAMERA-NO-RAYS", f"{good.sum()} of {len(flat)} pixels have a ray in both cameras, {LEAST_POINTS} needed"
         )
     unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (first[good], second[good])]
-    turn = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
-    for _ in range(STEPS):
-        offset = two.project(turn @ first[good]) - flat[good]
-        rotations = [Rigid.exp([*step, 0, 0, 0]) @ turn for step in STEP_RAD * np.eye(3)]
-        slope = (
-            np.stack([two.project(rotated @ first[good]) - flat[good] - offset for rotated in rotations], axis=2)
-            / STEP_RAD
-        )
-        step = -np.linalg.lstsq(slope.reshape(-1, 3), offset.ravel())[0]
-        turn = Rigid.exp([*step, 0, 0, 0]) @ turn
-        if np.abs(step).max() < STEP_RAD**2:
-            break
+    near = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
+
+    def turned(step: np.ndarray) -> Rigid:
+        return Rigid.exp([*step, 0, 0, 0]) @ near
+
+    def off(step: np.ndarray) -> np.ndarray:
+        return (two.project(turned(step) @ first[good]) - flat[good]).ravel()
+
+    turn = turned(least_squares(off, np.zeros(3), diff_step=STEP_RAD, method="lm", xtol=SETTLED, ftol=SETTLED).x)
     apart = np.full(flat.shape, np.nan)
     seen = two.project(turn @ first[good])
     if isinstance(two, SizedLens):

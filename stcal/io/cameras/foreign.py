@@ -273,7 +273,6 @@ def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
 
 
 def _of_fov(xy: np.ndarray, omega: float) -> np.ndarray:
-    """Return normalised coordinates (n, 2) with the radial distortion of the model fov."""
     r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius the model is linear
     return xy * (np.arctan(2 * r * np.tan(omega / 2)) / (omega * r))[:, None]
 

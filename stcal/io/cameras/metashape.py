@@ -128,12 +128,7 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element) -> Camera
     if "b2" in names:
         raise InputError("E-CAMERA-MODEL", "b2 was adjusted, but OpenCV's model does not have it; fit without it")
     camera = replace(camera, colmap_model=_model(camera.colmap_model, names))
-    by_theirs = np.zeros((len(PARAMETER_NAMES), len(names)))
-    for column, name in enumerate(names):
-        if name in OWN:
-            by_theirs[PARAMETER_NAMES.index(OWN[name]), column] = 1
-        if name in ("f", "b1"):
-            by_theirs[PARAMETER_NAMES.index("fx"), column] = 1
+    by_theirs = np.linalg.pinv(_theirs_by_ours())[:, [NAMES.index(name) for name in names]]
     basis = intrinsic_basis(camera.colmap_model)
     to_model = np.linalg.pinv(basis)
     covariance = to_model @ by_theirs @ matrix @ by_theirs.T @ to_model.T
@@ -146,13 +141,19 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element) -> Camera
 
 
 def _model(colmap_model: str, names: list[str]) -> str:
-    """Return the COLMAP model that has these parameters of Metashape, and those of ``colmap_model``."""
     if FISHEYE in colmap_model:
         return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & set(names) else colmap_model
     if "k3" in names or "k4" in names:
         return "FULL_OPENCV"
     distorted = {"k1", "k2", "p1", "p2"} & set(names)
     return "OPENCV" if distorted and colmap_model != "FULL_OPENCV" else colmap_model
+
+
+def _theirs_by_ours() -> np.ndarray:
+    """Return the derivative (11, 16) of :data:`NAMES` by :data:`PARAMETER_NAMES`."""
+    rows = np.array([[float(OWN.get(theirs) == ours) for ours in PARAMETER_NAMES] for theirs in NAMES])
+    rows[NAMES.index("b1"), :2] = [1, -1]
+    return rows
 
 
 def _edge(camera: CameraModel) -> np.ndarray:
@@ -206,13 +207,8 @@ def cameras(camera: Camera, name: str) -> str:
 
 
 def _covariance(camera: Camera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Return Metashape's names of the parameters of the camera's model, and their covariance."""
     basis = intrinsic_basis(camera.colmap_model)
-    rows = np.zeros((len(NAMES), len(PARAMETER_NAMES)))
-    for row, name in enumerate(NAMES):
-        if name in OWN:
-            rows[row, PARAMETER_NAMES.index(OWN[name])] = 1
-    rows[NAMES.index("b1"), [PARAMETER_NAMES.index("fx"), PARAMETER_NAMES.index("fy")]] = [1, -1]
+    rows = _theirs_by_ours()
     if not camera.fisheye:
         rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
     by_model = rows @ basis
