@@ -212,11 +212,9 @@ POINT_CELLS = 3
 
 @dataclass(frozen=True, slots=True)
 class ImageLine:
-    """The first line of an image: its number; qw, qx, qy, qz, tx, ty, tz; the image's name; and whether its second line
-    is there, which programs that remove empty lines remove."""
+    """The first line of an image, by number, and whether its second one is there: empty ones may have been removed."""
 
     number: int
-    pose: list[float]
     name: str
     followed: bool
 
@@ -224,50 +222,44 @@ class ImageLine:
 def image_lines(text: str, where: str) -> list[ImageLine]:
     """Return the images of ``images.txt``, also of one from which empty lines were removed."""
     images: list[ImageLine] = []
-    pending: tuple[int, list[float], str] | None = None  # an image whose second line is to come
-    for number, line in enumerate(text.splitlines(), 1):
-        record = _record(line)
-        if pending is not None:
-            images.append(ImageLine(*pending, followed=record is None))
-            pending = None
-            if record is None:
-                if not _are_points(line):
-                    raise InputError(
-                        "E-MODEL-UNREADABLE",
-                        f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
-                        "model anew",
-                    )
-                continue
-        elif not line.strip() or line.lstrip().startswith("#"):
+    lines = iter([*enumerate(text.splitlines(), 1), (0, "")])
+    number, line = next(lines)
+    while number:
+        if not line.strip() or line.lstrip().startswith("#"):
+            number, line = next(lines)
             continue
-        if record is None:
+        if not _is_image(line):
             raise InputError(
                 "E-MODEL-UNREADABLE",
                 f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
             )
-        pending = (number, *record)
-    if pending is not None:
-        images.append(ImageLine(*pending, followed=False))
+        first, name = number, line.split(maxsplit=CELLS - 1)[-1].strip()
+        number, line = next(lines)
+        followed = number > 0 and not _is_image(line)
+        images.append(ImageLine(first, name, followed))
+        if followed and not _are_points(line):
+            raise InputError(
+                "E-MODEL-UNREADABLE",
+                f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
+                "model anew",
+            )
+        if followed:
+            number, line = next(lines)
     return images
 
 
-def _record(line: str) -> tuple[list[float], str] | None:
-    """Return pose and name of an image's first line; None for any other line."""
+def _is_image(line: str) -> bool:
     cells = line.split(maxsplit=CELLS - 1)
-    pose = floats_of(cells[1:8])
-    if len(cells) < CELLS or pose is None or floats_of([cells[0], cells[8]]) is None or _are_points(line):
-        return None
-    return pose, cells[9].strip()
+    return len(cells) == CELLS and _are_numbers(cells[:9]) and not _are_points(line)
 
 
 def _are_points(line: str) -> bool:
     cells = line.split()
-    return len(cells) % POINT_CELLS == 0 and floats_of(cells) is not None
+    return len(cells) % POINT_CELLS == 0 and _are_numbers(cells)
 
 
-def floats_of(cells: list[str]) -> list[float] | None:
-    """Return the numbers of the cells; None if a cell is no number."""
+def _are_numbers(cells: list[str]) -> bool:
     try:
-        return [float(cell) for cell in cells]
+        return all(float(cell) is not None for cell in cells)
     except ValueError:
-        return None
+        return False
