@@ -82,26 +82,20 @@ def declared(parameter: inspect.Parameter) -> inspect.Parameter:
 
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
 Run = Annotated[Path, "Read the finished run in this folder.", Arg("RUN")]
-CameraFile = Annotated[
-    Path, "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
-]
+CameraFile = Annotated[Path, "Read the intrinsics from this file of COLMAP, OpenCV, ROS, Kalibr, mrcal and others."]
 OptionalCamera = Annotated[
     Path | None,
     "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB. If not given, they "
     "are found from the board's dots or the target's printed faces.",
 ]
 CAMERA = "--camera"
-CameraName = Annotated[
-    str, "Take this camera from a --camera file of several: its name, or COLMAP's number.", Opt("--camera-name")
-]
+CameraName = Annotated[str, "Take this camera, by name or number, of a --camera file of several.", Opt("--camera-name")]
 """Option that every command with ``--camera`` has."""
 TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
-BoardFile = Annotated[
-    Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
-]
+BoardFile = Annotated[Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference."]
 PlateMargin = Annotated[
     float,
-    "Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
+    "Assume that plates end this far beyond their circles without outline_mm.",
     Opt("--margin-mm", min=0, max=1e4),
 ]
 Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)]
@@ -110,35 +104,25 @@ FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard
 RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
 LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
 JsonFile = Annotated[
-    Path | None,
-    "Also write all results to this file (JSON), or to standard output with `-`.",
-    Opt("--json", writes=True),
+    Path | None, "Also write all results to this file (JSON; `-`: standard output).", Opt("--json", writes=True)
 ]
 ReportFile = Annotated[
     Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
 ]
 Device = Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."]
-Gain = Annotated[
-    float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
-]
+Gain = Annotated[float | None, "Set this gain, in the driver's unit; unchanged if not given.", Opt(min=0, max=1e6)]
 Exclude = Annotated[
-    list[str] | None,
-    "Ignore this image, by its name in results, such as 12/IMG_1003.jpg; repeat it for more images.",
-    Opt(metavar="IMAGE"),
+    list[str] | None, "Ignore this image, such as 12/IMG_1003.jpg; repeat it for more.", Opt(metavar="IMAGE")
 ]
 Strict = Annotated[bool, "End with exit code 4 if a check has failed; results are written in any case."]
 StrictByDefault = Annotated[
-    bool,
-    "End with exit code 4 if the answer is no, or with 0 all the same. Results are written in any case.",
-    Opt("--strict/--no-strict"),
+    bool, "End with exit code 4 if the answer is no; results are written.", Opt("--strict/--no-strict")
 ]
 """Option of the commands that say whether a run may be used."""
 Overwrite = Annotated[bool, "Replace existing output files.", Opt("--overwrite")]
 """Option of every command that writes a file."""
 Quiet = Annotated[bool, "Print only warnings and errors, and a verdict that is not good.", Opt("--quiet -q")]
-Verbose = Annotated[
-    bool, "Print more: each step, the time of each stage, and what is found in the images.", Opt("--verbose -v")
-]
+Verbose = Annotated[bool, "Print more: steps, times, and what is found in images.", Opt("--verbose -v")]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
 WRITE_NOTHING = ("serve", "live", "dry_run")
@@ -149,15 +133,12 @@ MOST_SEED = 2**63 - 1
 """Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
 
-Scheduler = Annotated[
-    str | None, "Send the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
-]
+Scheduler = Annotated[str | None, "Send the images to the Dask scheduler at this address, tcp://host:8786."]
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
 
 
 Quaternions = Annotated[
-    Literal["wxyz", "xyzw"],
-    "Read quaternions by the names of their columns (wxyz), or take the columns in their order as x, y, z, w (xyzw).",
+    Literal["wxyz", "xyzw"], "Read quaternions by the names of their columns, or in their order as x, y, z, w (xyzw)."
 ]
 Rotation = Annotated[
     str | None,
@@ -166,20 +147,16 @@ Rotation = Annotated[
 ]
 PayloadKg = Annotated[
     float | None,
-    "Take this mass at the flange for all rows without a column payload_kg; if not given, that of the robot file.",
+    "Take this mass at the flange for rows without payload_kg; the robot file's if not given.",
     Opt(min=0, max=1e4),
 ]
 MinDiameter = Annotated[
-    float | None,
-    "Ignore circles smaller than this, px; 4.5, and 9 over 8 megapixels, if not given.",
-    Opt(min=4, max=1e6),
+    float | None, "Ignore circles smaller than this, px; 4.5, 9 over 8 megapixels, if not given.", Opt(min=4, max=1e6)
 ]
 MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8, max=1e6)]
 
 
-FirstTable = Annotated[
-    Path | None, "Read rows from this file (CSV), in place of the argument, and join those of --b.", Opt("--a")
-]
+FirstTable = Annotated[Path | None, "Read rows from this file (CSV), and join those of --b.", Opt("--a")]
 SecondTable = Annotated[Path | None, "Read the values that belong to the rows of --a from this file (CSV).", Opt("--b")]
 Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]
 

@@ -48,60 +48,43 @@ def simulate(
     distance: shared.Distance = 1000.0,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
-        float | None,
-        "Use an equidistant lens with this field over the diagonal, degrees, that is not centred on the target.",
-        Opt(min=60, max=170),
+        float | None, "Use an equidistant lens of this diagonal field, degrees.", Opt(min=60, max=170)
     ] = None,
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[
-        float | None,
-        "Use a thin lens of this f-number, with --focal-mm if there is a --camera; without it, all is in focus.",
-        Opt(min=0.5, max=100),
+        float | None, "Use a thin lens of this f-number; if not given, all is in focus.", Opt(min=0.5, max=100)
     ] = None,
     focus: Annotated[
-        float | None,
-        "Set the lens's plane of focus at this depth; at --distance if not given.",
-        Opt("--focus-mm", min=10, max=1e7),
+        float | None, "Focus at this depth; at --distance if not given.", Opt("--focus-mm", min=10, max=1e7)
     ] = None,
     focal: Annotated[
         float | None,
-        "Set the focal length of the thin lens; if not given, it follows from a sensor 22.3 mm wide.",
+        "Set the focal length; if not given, that of a sensor 22.3 mm wide.",
         Opt("--focal-mm", min=0.5, max=5000),
     ] = None,
     rim: Annotated[
-        float,
-        "Set the height of rims in front of the faces' circles; with < 0 the circles are raised.",
-        Opt("--rim-mm", min=-20, max=20),
+        float, "Set the height of rims before circles of faces; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)
     ] = 0.0,
-    slope: Annotated[
-        float, "Let the light of each circle of the faces rise by this fraction from side to side.", Opt(min=0, max=1)
-    ] = 0.0,
+    slope: Annotated[float, "Let the light of circles rise by this fraction across.", Opt(min=0, max=1)] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
-        float | None,
-        "Add a table below that reflects target and board with this reflectance.",
-        Opt("--table-reflectance", min=0, max=1),
+        float | None, "Add a table below that reflects this fraction.", Opt("--table-reflectance", min=0, max=1)
     ] = None,
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
     groups: Annotated[
-        str | None,
-        "Photograph these pairs of faces together, such as 12,14 or front-right,front-top; if not given, all pairs "
-        "that are visible together.",
+        str | None, "Photograph these pairs of faces, such as 12,14; all that are visible together if not given."
     ] = None,
     camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
-    one_board: Annotated[
-        bool, "Photograph the same board with all groups, as `plan` assumes, instead of another copy with each."
-    ] = False,
+    one_board: Annotated[bool, "Photograph one board with all groups, as `plan` assumes."] = False,
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
     png: Annotated[bool, "Write PNG instead of JPEG."] = False,
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     body_seed: Annotated[
         int | None,
-        "Draw the errors of target, camera and the board of --one-board with this seed, to photograph the same ones "
-        "again with another --seed. If not given, it is that of --seed.",
+        "Draw errors of target, camera and board with this seed; with --seed if not given.",
         Opt(min=0, max=MOST_SEED),
     ] = None,
     margin: shared.PlateMargin = 15.0,
@@ -268,9 +251,7 @@ def compare(
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path | None, "Keep data set and run in this folder; if not given, a temporary folder is used."
-    ] = None,
+    out: Annotated[Path | None, "Keep data set and run in this folder, in place of a temporary one."] = None,
     workers: shared.Workers = None,
 ) -> None:
     """Render a small data set with known truth, calibrate it, and compare the faces with the truth."""
@@ -307,9 +288,7 @@ def draw(
         "Print on as many sheets of this paper as needed: A5 … A0, Letter, Legal or Tabloid. With own, a page is as "
         "large as its content. If not given, A4 for .pdf and own for the others.",
     ] = "",
-    margin: Annotated[
-        float, "Add this margin around the outermost circles, mm.", Opt("--margin-mm", min=0, max=1e4)
-    ] = 10.0,
+    margin: Annotated[float, "Add this margin around the circles, mm.", Opt("--margin-mm", min=0, max=1e4)] = 10.0,
     net: Annotated[bool, "Draw a target's plates as one net to fold, using outline_mm and rough_pose."] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
@@ -326,13 +305,9 @@ def draw(
 @app.command()
 def design(
     folder: Annotated[Path, "Write target.toml to this folder, and board.toml if there is none.", Arg()],
-    size: Annotated[
-        str,
-        "Make it for a box of this width, height and depth, W,H,D in mm; with --tags, give the width between "
-        "opposite faces.",
-    ],
+    size: Annotated[str, "Make it for a box of W,H,D mm; for --tags, give the width between opposite faces."],
     tags: Annotated[
-        Literal["cube", "dodecahedron"] | None, "Make a cube or dodecahedron with a tag on each face and no board."
+        Literal["cube", "dodecahedron"] | None, "Make this body with a tag on each face and no board."
     ] = None,
     dictionary: Annotated[str, "Take the tags of --tags from this dictionary."] = DICTIONARY,
     first_id: Annotated[int, "Number the tags of --tags from this id.", Opt(min=0, max=100_000)] = 0,
@@ -344,13 +319,11 @@ def design(
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
         float | None,
-        "Draw the smaller circles with this radius; if not given, it is chosen for box and camera.",
+        "Draw the smaller circles with this radius; chosen if not given.",
         Opt("--radius-mm", min=0.01, max=1e4),
     ] = None,
     distance: shared.Distance = 1000.0,
-    width: Annotated[
-        int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
-    ] = 5184,
+    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     bright: Annotated[
         bool, "Make bright circles on dark plates, or dark ones on bright.", Opt("--bright/--dark")
