@@ -397,56 +397,52 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
 
 
 def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
-    """Return the text of a ``target.toml`` for ``target``, with comments; ``printed`` : returns the lines of the board
-    or tags of a face, needed if the target has such faces."""
-    round_ = [
-        "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
-        "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+    """Return the text of a ``target.toml`` for ``target``, with comments; ``printed`` : returns the lines of the board or
+    tags of a face, needed if the target has such faces."""
+    of_circles = any(face.printed is None for face in target.faces)
+    lines = ["# A body with tags or boards on its faces. Lengths in mm."]
+    if of_circles:
+        lines = [
+            "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
+            "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+        ]
+    lines += ["# Faces of tags or boards: seen from outside X to the right, Y down."] * target.has_printed
+    lines += [f"name = {toml_string(target.name)}", f'polarity = "{target.polarity}"']
+    lines[-1] += '  # circles are "bright" or "dark" against what surrounds them' * of_circles
+    lines += stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm)
+    scales = [
+        f"  {{ from = {toml_string(known.first)}, to = {toml_string(known.second)}, mm = {_number(known.mm)}, "
+        f"sigma_mm = {_number(known.sigma_mm)}{', drawn = true' * known.drawn} }},"
+        for known in target.distances
     ]
-    printed_alone = all(face.printed is not None for face in target.faces)
-    of_circles = '  # circles are "bright" or "dark" against what surrounds them'
-    lines = [
-        *(["# A body with tags or boards on its faces. Lengths in mm."] if printed_alone else round_),
-        *(["# Faces of tags or boards: seen from outside X to the right, Y down."] if target.has_printed else []),
-        f"name = {toml_string(target.name)}",
-        f'polarity = "{target.polarity}"' + of_circles * (not printed_alone),
-        *stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm),
-    ]
-    scales: list[str] = []
-    for known in target.distances:
-        ends = f"from = {toml_string(known.first)}, to = {toml_string(known.second)}"
-        drawn = ", drawn = true" if known.drawn else ""
-        scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)}{drawn} }},")
     lines += ["scale = [", *scales, "]"] if scales else []
     for face in target.faces:
         lines += ["", "[[face]]", f"id = {toml_string(face.id)}"]
+        pose, outline = face.rough_target_from_face, []
+        if face.outline_mm is not None:
+            corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in face.outline_mm.tolist())
+            outline = [f"outline_mm = [{corners}]  # corners of its plate, for `draw`"]
         if face.printed is not None:
             assert printed is not None, "faces with a board or tags are written by stcal.boards.target"
-            pose = _rough_lines(face.rough_target_from_face @ INWARDS) if face.rough_target_from_face else []
-            lines += [*pose, *_outline_lines(face.outline_mm), *printed(face)]
+            lines += [*(_rough_lines(pose @ INWARDS) if pose else []), *outline, *printed(face)]
             continue
         lines += [
             "# The face frame: origin at one circle, X through a second one, Y on the side of a third, Z outwards.",
             f"origin = {toml_string(face.origin)}",
             f"x = {toml_string(face.x)}",
             f"y = {toml_string(face.y)}",
-            *_rough_lines(face.rough_target_from_face),
-            *_outline_lines(face.outline_mm),
+            *_rough_lines(pose),
+            *outline,
             "circles = [",
         ]
+        rims = [""] * len(face.ids) if face.rim_mm is None else [f", rim_mm = {_number(rim)}" for rim in face.rim_mm]
         lines += [
             f"  {{ id = {toml_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, "
             f"radius_mm = {_number(r)}{rim} }},"
-            for circle, (x, y), r, rim in zip(face.ids, face.xy_mm, face.radius_mm, _rims(face), strict=True)
+            for circle, (x, y), r, rim in zip(face.ids, face.xy_mm, face.radius_mm, rims, strict=True)
         ]
         lines += ["]"]
     return "\n".join(lines) + "\n"
-
-
-def _rims(face: FaceDesign) -> list[str]:
-    if face.rim_mm is None:
-        return [""] * len(face.ids)
-    return [f", rim_mm = {_number(height)}" for height in face.rim_mm]
 
 
 def _rough_lines(pose: Rigid | None) -> list[str]:
@@ -456,18 +452,9 @@ def _rough_lines(pose: Rigid | None) -> list[str]:
     ]
     if pose is None:
         return [*about, "# rough_pose = { origin_mm = [0.0, 0.0, 0.0], x = [1.0, 0.0, 0.0], normal = [0.0, 0.0, 1.0] }"]
-    place, x, normal = (
-        f"[{', '.join(map(_number, values))}]"
-        for values in (pose.translation, pose.rotation[:, 0], pose.rotation[:, 2])
-    )
+    vectors = pose.translation, pose.rotation[:, 0], pose.rotation[:, 2]
+    place, x, normal = (f"[{', '.join(map(_number, values))}]" for values in vectors)
     return [*about, f"rough_pose = {{ origin_mm = {place}, x = {x}, normal = {normal} }}"]
-
-
-def _outline_lines(outline: np.ndarray | None) -> list[str]:
-    if outline is None:
-        return []
-    corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in np.asarray(outline).tolist())
-    return [f"outline_mm = [{corners}]  # corners of its plate, for `draw`"]
 
 
 def board_toml(board: BoardDesign) -> str:
@@ -475,32 +462,28 @@ def board_toml(board: BoardDesign) -> str:
     corner = board.corner or (0, 0)
     corner_radius = board.corner_radius_mm or 1.5 * board.radius_mm
     prefix = "" if board.corner else "# "
-    sizes = [(entry.name, getattr(board.stated, entry.name)) for entry in fields(StatedSize)]
-    return (
-        "\n".join(
-            [
-                "# A rectangular grid of dots. Dot (row 0, column 0) is the origin, columns run along X, rows along Y.",
-                f"rows = {board.rows}",
-                f"columns = {board.columns}",
-                f"pitch_mm = {_number(board.pitch_mm)}",
-                f"radius_mm = {_number(board.radius_mm)}",
-                f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
-                f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
-                *([f"rim_mm = {_number(board.rim_mm)}  # height of rims before the dots"] if board.rim_mm else []),
-                *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
-                *([f"rings = {list(map(list, board.rings))}  # dots with a hole"] if board.rings else []),
-                *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
-                "",
-                "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
-                "# same after half a turn, which a run settles by comparing the images of a group.",
-                f"{prefix}[corner]",
-                f"{prefix}row = {corner[0]}",
-                f"{prefix}column = {corner[1]}",
-                f"{prefix}radius_mm = {_number(corner_radius)}",
-            ]
-        )
-        + "\n"
-    )
+    sizes = {entry.name: getattr(board.stated, entry.name) for entry in fields(StatedSize)}
+    lines = [
+        "# A rectangular grid of dots. Dot (row 0, column 0) is the origin, columns run along X, rows along Y.",
+        f"rows = {board.rows}",
+        f"columns = {board.columns}",
+        f"pitch_mm = {_number(board.pitch_mm)}",
+        f"radius_mm = {_number(board.radius_mm)}",
+        f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
+        f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
+        *([f"rim_mm = {_number(board.rim_mm)}  # height of rims before the dots"] if board.rim_mm else []),
+        *(f"{key} = {_number(value)}" for key, value in sizes.items() if value is not None),
+        *([f"rings = {list(map(list, board.rings))}  # dots with a hole"] if board.rings else []),
+        *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
+        "",
+        "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
+        "# same after half a turn, which a run settles by comparing the images of a group.",
+        f"{prefix}[corner]",
+        f"{prefix}row = {corner[0]}",
+        f"{prefix}column = {corner[1]}",
+        f"{prefix}radius_mm = {_number(corner_radius)}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _number(value: float) -> str:
