@@ -116,9 +116,7 @@ def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.For
         for _ in range(min(count, len(content) // 24)):
             number, kind, width, height = struct.unpack_from("<IiQQ", content, at)
             model = foreign.NUMBERS[kind]
-            length = (
-                foreign.COLMAP_FOREIGN[model][1] if model in foreign.COLMAP_FOREIGN else len(parameter_names(model))
-            )
+            _, length = foreign.COLMAP_FOREIGN.get(model) or (0, len(parameter_names(model)))
             cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
             at += 24 + 8 * length
     except (struct.error, KeyError) as error:
