@@ -11,10 +11,7 @@ OTHER = "stcal-*.dist-info"
 
 
 def fault(package: Path) -> str:
-    """Returns in one line that another distribution shares the folder of the package, or an empty string.
-
-    ``package`` : folder of the package, such as ``site-packages/stcal``.
-    """
+    """Returns in one line that another distribution shares the folder of the package, or an empty string."""
     for other in sorted(package.parent.glob(OTHER)):
         name, version = other.name.removesuffix(".dist-info").split("-", 1)
         return (

@@ -28,12 +28,14 @@ class Printed(Protocol):
         ...
 
 
+MIN_SINE = 0.02
+"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
 DOTS_SIGMA_MM = 0.005
 """σ of the places of a board's dots where its file states none, mm per axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FaceDesign(ByValue, Brief):
+class FaceDesign(Brief):
     """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
     Parameters
@@ -41,7 +43,7 @@ class FaceDesign(ByValue, Brief):
     id : str
         Name of the face.
     ids : tuple of str
-        Names of its n circles.
+        Names of its n circles, which neither occur twice nor overlap.
     xy_mm : (n, 2) array
         Centres, face frame, mm.
     radius_mm : (n,) array
@@ -49,13 +51,11 @@ class FaceDesign(ByValue, Brief):
     origin, x, y : str
         Circles that define the frame.
     rough_target_from_face : Rigid, optional
-        Approximate pose of the face in a frame that all faces share. Plans and simulations use it, a calibration does
-        not.
+        Approximate pose in a frame that all faces share, for plans and simulations; a calibration does not use it.
     outline_mm : (k, 2) array, optional
         Corners of its plate in order, face frame, for drawings.
     rim_mm : (n,) array, optional
-        Heights of the rims in front of the circles, negative for discs that stand out; if None, the circles lie in the
-        surface of the plate.
+        Heights of the rims in front of the circles, negative for discs that stand out; None if they lie in the surface.
     printed : Printed, optional
         The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose frame
         is the face frame, Z into the body; None for a face of circles.
@@ -66,11 +66,6 @@ class FaceDesign(ByValue, Brief):
         Relative σ of the printed size, and the share of its variance that is due to the edges of tags.
     of_tags : bool
         Whether the corners are those of tags, four by four, whose edges light and ink move.
-
-    Raises
-    ------
-    InputError
-        Arrays of other shapes; circles that overlap or occur twice; frame circles that give no frame.
     """
 
     id: str
@@ -93,11 +88,49 @@ class FaceDesign(ByValue, Brief):
         require_fields(self, f"face {self.id}", sigma_mm=0, size_sigma=0)
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
-        require_face(self.ids, self.xy_mm, self.radius_mm, (self.origin, self.x, self.y), f"face {self.id}")
+        self._require_possible()
         if self.outline_mm is not None:
             freeze(self, "outline_mm", (None, 2), f"face {self.id}: outline")
         if self.rim_mm is not None:
             freeze(self, "rim_mm", (len(self.ids),), f"face {self.id}: rims")
+
+    def _require_possible(self) -> None:
+        """Refuses circles that occur twice or overlap, and frame circles that give no frame."""
+        where, ids, xy, radius = f"face {self.id}", self.ids, self.xy_mm, self.radius_mm
+        frame = self.origin, self.x, self.y
+        _require_different(ids, f"{where}: circle id")
+        for key, circle in zip(("origin", "x", "y"), frame, strict=True):
+            if circle not in ids:
+                raise InputError(
+                    "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
+                )
+        if radius.min() <= 0:
+            raise InputError(
+                "E-TARGET-RADIUS",
+                f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
+            )
+        gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
+        np.fill_diagonal(gap, np.inf)
+        if gap.min() <= 0:
+            i, j = np.unravel_index(gap.argmin(), gap.shape)
+            raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
+        origin, x, y = (xy[ids.index(circle)] for circle in frame)
+        length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
+        named = ", ".join(frame)
+        if min(length_x, length_y) == 0:
+            raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named}; three different ones needed")
+        axis = (x - origin) / length_x
+        sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
+        if abs(sine) < MIN_SINE:
+            raise InputError(
+                "E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line"
+            )
+        if sine < 0:
+            raise InputError(
+                "E-TARGET-FRAME",
+                f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside; swap x and y, "
+                "or give positions as seen from outside with y up",
+            )
 
     def labels(self) -> list[CircleLabel]:
         """Returns the label ``face:circle`` of every circle, in order."""
@@ -116,10 +149,8 @@ class FaceDesign(ByValue, Brief):
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """A measured distance between two points of the target, mm, with its σ: a scale bar.
-
-    ``drawn`` : True if it is that of the drawing, and defines the unit of a target of which no size is known.
-    """
+    """A measured distance between two points of the target, mm, with its σ: a scale bar; ``drawn`` : True if it is that
+    of the drawing, and defines the unit of a target of which no size is known."""
 
     first: CircleLabel
     second: CircleLabel
@@ -132,8 +163,8 @@ class KnownDistance:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class TargetDesign(ByValue, Brief):
-    """Target: its faces, and whether its circles are brighter or darker than their surroundings.
+class TargetDesign(Brief):
+    """Target: its faces, which differ, and whether its circles are brighter or darker than their surroundings.
 
     Parameters
     ----------
@@ -147,11 +178,6 @@ class TargetDesign(ByValue, Brief):
         True if unusually large or small radii are not a mistake of units.
     distances : tuple of KnownDistance
         Known distances between its points.
-
-    Raises
-    ------
-    InputError
-        Another polarity, ids that occur twice, faces that look alike, lengths that are not mm.
     """
 
     name: str
@@ -163,7 +189,10 @@ class TargetDesign(ByValue, Brief):
     def __post_init__(self):
         where = f"target {self.name}"
         require_fields(self, where)
-        require_ids([face.id for face in self.faces], where)
+        ids = [face.id for face in self.faces]
+        _require_different(ids, f"{where}: face id")
+        if BOARD in ids:
+            raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
         circles = [face for face in self.faces if face.printed is None]
         sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
         radii = [radius(f"radius_mm of circle {label}", float(mm)) for label, mm in sizes]
@@ -307,8 +336,27 @@ class BoardDesign(ByValue):
         if not (np.isfinite(self.sigma_mm) and self.sigma_mm >= 0):
             raise InputError("E-SIGMA-VALUE", f"board: sigma_mm {self.sigma_mm:g}; 0 or a positive number needed")
         require_millimetres(board_lengths(self.pitch_mm, self.radius_mm), self.unusual_size, "board")
-        size = self.rows, self.columns, self.pitch_mm, self.radius_mm
-        require_board(*size, self.corner, self.corner_radius_mm, "board")
+        size, corner = (self.rows, self.columns), self.corner
+        if min(size) < 1:
+            raise InputError("E-BOARD-SIZE", "board: {} rows and {} columns; 1 or more of each needed".format(*size))
+        if not 0 < 2 * self.radius_mm < self.pitch_mm:
+            raise InputError(
+                "E-BOARD-RADIUS",
+                f"board: radius {self.radius_mm:g} mm, under half the pitch {self.pitch_mm:g} mm needed",
+            )
+        if corner is None:
+            return
+        if any(place not in (0, count - 1) for place, count in zip(corner, size, strict=True)):
+            raise InputError(
+                "E-BOARD-CORNER",
+                f"board: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
+            )
+        least, most = 1.15 * self.radius_mm, self.pitch_mm - self.radius_mm
+        if self.corner_radius_mm is None or not least <= self.corner_radius_mm < most:
+            raise InputError(
+                "E-BOARD-CORNER",
+                f"board: corner radius {self.corner_radius_mm} mm; at least {least:g} mm and under {most:g} mm needed",
+            )
 
     def scaled(self, factor: float) -> "BoardDesign":
         """Returns the board printed larger by a factor."""
@@ -357,54 +405,6 @@ class BoardDesign(ByValue):
         return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
 
 
-MIN_SINE = 0.02
-"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
-
-
-def require_face(
-    ids: Sequence[str], xy: np.ndarray, radius: np.ndarray, frame: tuple[str, str, str], where: str
-) -> None:
-    """Refuses circles of a face that occur twice or overlap, and frame circles (origin, x, y) that give no frame."""
-    _require_different(ids, f"{where}: circle id")
-    for key, circle in zip(("origin", "x", "y"), frame, strict=True):
-        if circle not in ids:
-            raise InputError(
-                "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
-            )
-    if radius.min() <= 0:
-        raise InputError(
-            "E-TARGET-RADIUS",
-            f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
-        )
-    gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() <= 0:
-        i, j = np.unravel_index(gap.argmin(), gap.shape)
-        raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
-    origin, x, y = (xy[ids.index(circle)] for circle in frame)
-    length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
-    named = ", ".join(frame)
-    if min(length_x, length_y) == 0:
-        raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named}; three different ones needed")
-    axis = (x - origin) / length_x
-    sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
-    if abs(sine) < MIN_SINE:
-        raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line")
-    if sine < 0:
-        raise InputError(
-            "E-TARGET-FRAME",
-            f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside; swap x and y, or "
-            "give positions as seen from outside with y up",
-        )
-
-
-def require_ids(ids: Sequence[str], where: str) -> None:
-    """Refuses ids of faces that occur twice, or that are the board's."""
-    _require_different(ids, f"{where}: face id")
-    if BOARD in ids:
-        raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
-
-
 def _require_different(ids: Sequence[str], what: str) -> None:
     for i, value in enumerate(ids):
         if value in ids[:i]:
@@ -449,42 +449,10 @@ def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
     return [side("pitch_mm", pitch_mm), radius("radius_mm", radius_mm)]
 
 
-def require_board(
-    rows: int,
-    columns: int,
-    pitch_mm: float,
-    radius_mm: float,
-    corner: tuple[int, int] | None,
-    corner_radius_mm: float | None,
-    where: str,
-) -> None:
-    """Refuses a grid with too few or overlapping dots, and a larger dot that is not larger or not at a corner."""
-    if min(rows, columns) < 1:
-        raise InputError("E-BOARD-SIZE", f"{where}: {rows} rows and {columns} columns; 1 or more of each needed")
-    if not 0 < 2 * radius_mm < pitch_mm:
-        raise InputError(
-            "E-BOARD-RADIUS", f"{where}: radius {radius_mm:g} mm, under half the pitch {pitch_mm:g} mm needed"
-        )
-    if corner is None:
-        return
-    if corner[0] not in (0, rows - 1) or corner[1] not in (0, columns - 1):
-        raise InputError(
-            "E-BOARD-CORNER", f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed"
-        )
-    if corner_radius_mm is None or not 1.15 * radius_mm <= corner_radius_mm < pitch_mm - radius_mm:
-        raise InputError(
-            "E-BOARD-CORNER",
-            f"{where}: corner radius {corner_radius_mm} mm; at least {1.15 * radius_mm:g} mm and under "
-            f"{pitch_mm - radius_mm:g} mm needed",
-        )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleReference(BoardDesign):
-    """All that a run takes its scale from: the board if there is one, faces of known shape, known distances.
-
-    Without a board it has no dots: ``rows`` and ``columns`` are 0.
-    """
+    """All that a run takes its scale from: the board, of no rows and columns if there is none, faces of known shape,
+    and known distances."""
 
     faces: tuple[FaceDesign, ...] = ()
     distances: tuple[KnownDistance, ...] = ()
@@ -524,10 +492,8 @@ DRAWN_SIGMA = 1e-7
 
 
 def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
-    """Returns the design with one drawn distance as the unit: the longest on a face that most images see whole.
-
-    ``images`` : labels seen in each image.
-    """
+    """Returns the design with one drawn distance as the unit: the longest on a face that most images, by their labels,
+    see whole."""
     views = [set(labels) for labels in images]
     best: tuple[int, float, KnownDistance] | None = None
     for face in target.faces:
@@ -560,11 +526,7 @@ def _dot_labels(rows: int, columns: int) -> tuple[DotLabel, ...]:
 def reference_target() -> TargetDesign:
     """Returns the reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1).
 
-    Returns
-    -------
-    TargetDesign
-        Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) as far as that is
-        consistent.
+    Rough poses are in the frame of face 1, close to table 2 of that paper as far as it is consistent.
     """
     common = {"1": (0, 0), "2": (40, 0), "3": (80, 0), "4": (0, 40), "5": (0, 80), "6": (40, 40), "7": (80, 80)}
     small = {"a": (20, 0), "b": (0, 20)}
@@ -588,11 +550,5 @@ def reference_target() -> TargetDesign:
 
 
 def reference_board() -> BoardDesign:
-    """Returns the reference board.
-
-    Returns
-    -------
-    BoardDesign
-        9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm.
-    """
+    """Returns the reference board: 9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm."""
     return BoardDesign(7, 9, 30.0, 7.5, "bright", DOTS_SIGMA_MM)

@@ -47,13 +47,7 @@ def in_python(message: str) -> str:
 
 
 class StcalError(Exception):
-    """Base of every error that stcal raises on purpose.
-
-    Parameters
-    ----------
-    code : kind of the mistake, like ``E-CAMERA-MODEL``
-    message : one line for people
-    """
+    """Base of every error that stcal raises on purpose: ``code``, its kind, and ``message``, one line."""
 
     exit_code = 3
 
@@ -109,6 +103,16 @@ class ChecksFailed(StcalError):
     exit_code = 4
 
 
+@contextmanager
+def named(where: str, instead: str = "") -> Iterator[None]:
+    """Lets messages of errors begin with ``where``, what they are about; ``instead`` : their beginning so far."""
+    try:
+        yield
+    except StcalError as error:
+        error.args = error.code, f"{where}: {error.args[1].removeprefix(f'{instead}: ')}"
+        raise
+
+
 NO_MEMORY = "not enough memory"
 USED_UP = (
     "allocate",
@@ -122,10 +126,7 @@ USED_UP = (
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """True if the error, or one of its causes, says that memory or processes are used up.
-
-    Python, the loader of libraries, and the libraries themselves report this in different ways.
-    """
+    """True if the error, or one of its causes, says in one of many ways that memory or processes are used up."""
     chain: list[BaseException] = [error]
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)

@@ -72,13 +72,11 @@ def counted(progress: Progress, stage: str, total: int) -> Callable[[object], No
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Limits BLAS and OpenMP to one thread in the context; as a decorator, ``@one_thread()``, during each call.
+    """Limits BLAS and OpenMP to one thread in the context, or, as a decorator, ``@one_thread()``, during each call.
 
-    The matrices here are small, or sparse: threads that wait for each other took the larger part of a run's processor
-    time. The limit is set in the heavy public functions, not at the start of the program. The program and a caller from
-    Python thus behave alike, libraries that are loaded later are limited too, and the limit is gone when the function
-    returns. A nested call, or one while another thread holds the limit, changes nothing: two calls that
-    each restored the previous state could leave the limit behind.
+    The matrices here are small, or sparse: threads that wait for each other took most of a run's processor time. Only
+    public functions set the limit, so that program and callers behave alike. A nested call, or one while another thread
+    holds the limit, changes nothing: two that each restored the state before could leave it behind.
     """
     if not _limited.acquire(blocking=False):
         yield
@@ -95,10 +93,8 @@ def one_thread() -> Iterator[None]:
 
 @cache
 def reserve_buffers() -> None:
-    """Lets both libraries of linear algebra, NumPy's and SciPy's, take their working memory, which they keep.
-
-    OpenBLAS takes it at the first call that needs it. Where it then gets none, it ends the process, or tries for ever.
-    """
+    """Lets both libraries of linear algebra, NumPy's and SciPy's, take their working memory while there is some:
+    without it OpenBLAS ends the process, or tries for ever."""
     import numpy as np
     import scipy.linalg
 
@@ -111,12 +107,10 @@ def run_parallel(
 ) -> Iterator[tuple[int, R]]:
     """Yields (index of the job, result of ``function(*job)``) as results arrive, in any order.
 
-    Processes are forked from a server that has loaded the libraries and has no threads (forking a process with threads
-    can hang). They are spawned if the system cannot fork. They do not import the caller's main module, so that a script
-    needs no ``if __name__ == "__main__"``. One worker, or one job, runs in this process; so does all work within a
-    process of ``multiprocessing.Pool``, which may start no others: a note says so.
-
-    ``workers`` : number of processes; one per core if None. Within :func:`kept_processes`, its number counts.
+    Processes are forked from a server that has loaded the libraries and has no threads, or spawned where the system
+    cannot fork; they do not import the caller's main module. One worker, or one job, runs in this process; so does all
+    work within a process of ``multiprocessing.Pool``. ``workers`` : one per core if None, or as :func:`kept_processes`
+    has it.
     """
     kept = _kept.get()
     workers = min(kept.workers if kept else _number_of_processes(workers), len(jobs))
@@ -134,13 +128,8 @@ def run_in_order(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[R]:
-    """Returns the results of :func:`run_parallel` in the order of the jobs.
-
-    If a process is ended from outside, the other jobs run in this process, more slowly.
-
-    ``workers`` : as there; 1 for jobs of a tenth of a second, for which only processes that are there already are used.
-    ``progress`` : called with the number of jobs done, and the number of all jobs.
-    """
+    """Returns the results of :func:`run_parallel` in the order of the jobs; jobs of a process that is ended from
+    outside run in this one. ``progress`` is called with the numbers of jobs done and of all jobs."""
     results: dict[int, R] = {}
     here = ((i, function(*job)) for i, job in enumerate(jobs) if i not in results)
     for found in (run_parallel(function, jobs, workers), here):
@@ -155,10 +144,8 @@ def run_in_order(
 def hand_over(
     executor: Executor, function: Callable[..., R], jobs: Iterable[tuple], at_once: int
 ) -> Iterator[tuple[int, R]]:
-    """Yields index and result of each job, in any order; ``at_once`` : number of jobs that the executor has at a time.
-
-    The executor stays open.
-    """
+    """Yields index and result of each job, in any order; the executor, which stays open, has ``at_once`` of them at a
+    time."""
     waiting: dict[Future[R], int] = {}
     remaining = enumerate(jobs)
     try:
@@ -211,10 +198,7 @@ _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None
 
 @contextlib.contextmanager
 def kept_processes(workers: int | None = None) -> Iterator[None]:
-    """Keeps the processes of :func:`run_parallel` from call to call, so that libraries are loaded only once.
-
-    ``workers`` : number of processes, one per core if None; they start when they are first needed.
-    """
+    """Keeps the processes of :func:`run_parallel` from call to call, so that libraries are loaded only once."""
     if _kept.get():
         yield
         return
@@ -273,10 +257,8 @@ def _sockets() -> str:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Prepares the start of processes, by one thread at a time, and leaves all that it changes as it was.
-
-    New processes have the environment of workers and do not see the file of the main module.
-    """
+    """Prepares the start of processes, by one thread at a time: new ones have the environment of workers and do not see
+    the file of the main module. Leaves all that it changes as it was."""
     main = vars(sys.modules["__main__"])
     with _one_starts, _deaf_to_interrupts():
         hidden = {name: main[name] for name in ("__file__", "__spec__") if name in main}

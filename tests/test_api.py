@@ -1,5 +1,6 @@
 """Public names are documented, their constructors are as strict as readers of files, and values show themselves."""
 
+import copy
 import dataclasses
 import importlib
 import inspect
@@ -183,6 +184,22 @@ def test_no_field_takes_a_value_of_another_type(made):
                 continue
             taken.append((entry.name, value))
     assert taken == []
+
+
+@pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
+def test_a_copy_of_a_value_is_equal(made):
+    for again in (copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
+        assert again == made
+        assert hash(again) == hash(made)
+
+
+def test_results_and_designs_are_equal_by_value():
+    """Those of the engine of least squares hold functions."""
+    kinds = [kind for name, kind in PUBLIC.items() if dataclasses.is_dataclass(kind) and "adjust" not in name]
+    assert [kind for kind in kinds if kind.__eq__ is object.__eq__] == []
+    xyz = np.vstack([np.eye(3), np.ones((1, 3)), -np.eye(3)])
+    found = register.register(xyz, xyz + 1.0)
+    assert pickle.loads(pickle.dumps(found)) == found != replace(found, notes=("another",))
 
 
 def test_transforms_are_equal_by_value():

@@ -27,8 +27,8 @@ def main_sfm() -> None:
 def _run(name: str) -> None:
     """Runs a program. ``--version`` alone is answered at once, before the commands are loaded.
 
-    Signals that come after the end of the program do not change its exit code. Python removes handlers while it ends,
-    and a signal would then end a command as if it had failed, although its results are in place.
+    Signals after the end of the program do not change its exit code: Python removes handlers while it ends, and a
+    signal would then end a command as if it had failed, although its results are in place.
     """
     _replace_closed_streams()
     try:
@@ -44,10 +44,8 @@ def _run(name: str) -> None:
 
 
 def _replace_closed_streams() -> None:
-    """Opens the null device in place of standard streams that are closed (`>&-`).
-
-    The first files that are opened would take their numbers, and C libraries print into these.
-    """
+    """Opens the null device in place of closed standard streams (`>&-`), whose numbers the first files would take, so
+    that C libraries print into these."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -68,11 +66,8 @@ def _print_version() -> None:
 
 
 def _program() -> ModuleType:
-    """Loads and returns the module of the commands.
-
-    The commands use one thread of OpenBLAS. It starts its threads when it is loaded, and if memory is too little for
-    them, it sends its own process SIGINT, or tries for ever.
-    """
+    """Loads and returns the module of the commands, which use one thread of OpenBLAS: where memory is too little for
+    its threads, it sends its own process SIGINT, or tries for ever."""
     _answer()
     _require_address_space()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -86,10 +81,7 @@ def _program() -> ModuleType:
 
 
 def _require_address_space() -> None:
-    """Ends the program if a limit of the system (`ulimit -v`) is below the memory that loading needs.
-
-    C libraries would end the process without a message, or hang. Help and version load none of them.
-    """
+    """Ends the program if `ulimit -v` is below what loading needs: C libraries would end it, or hang, silently."""
     if sys.platform == "win32" or {"-h", "--help", "--version"} & set(sys.argv):
         return
     import resource

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 class Opt:
     """An option: what its help text and its parameter do not state.
 
-    ``name`` : its names, such as ``--a``, or ``--robust/--least-squares``; ``--held-out`` for ``held_out`` if not
-    given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is written; ``metavar``,
-    ``envvar`` : word for the value in the help text, and variable of the environment that sets it.
+    ``name`` : its names, ``--held-out`` for ``held_out`` if not given; ``min``, ``max`` : range of a number; ``writes``
+    : whether a file of this name is written; ``metavar``, ``envvar`` : word for the value in the help text, and
+    variable that sets it.
     """
 
     name: str = ""
@@ -71,50 +71,31 @@ class Arg:
         return typer.Argument(metavar=self.metavar, help=text, min=self.min, max=self.max, writable=self.writes)
 
 
-@dataclass(frozen=True, slots=True)
-class Declared:
-    """``annotation`` : of a parameter, for Typer; ``word`` : its name in messages; ``writes`` : whether its value is a
-    path that is written."""
-
-    annotation: Any
-    word: str
-    writes: bool
-
-
-def declared(parameter: str, annotation: Any) -> Declared:
-    """Returns Typer's form of a parameter."""
-    kind, text, *rest = get_args(annotation)
+def declared(parameter: inspect.Parameter) -> inspect.Parameter:
+    """Returns a parameter with Typer's form of its annotation."""
+    kind, text, *rest = get_args(parameter.annotation)
     [given] = rest or [Opt()]
-    info = given.info(parameter, text)
-    is_path = "Path" in str(kind)
-    info.rich_help_panel = panel_of(parameter, is_path, given.writes)
-    # With Annotated, Typer takes an option's first name for its default.
-    word = info.default if isinstance(given, Opt) else parameter
-    return Declared(Annotated[kind, info], word, given.writes)
+    info = given.info(parameter.name, text)
+    info.rich_help_panel = panel_of(parameter.name, "Path" in str(kind), given.writes)
+    return parameter.replace(annotation=Annotated[kind, info])
 
 
 Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
 Run = Annotated[Path, "Read the finished run in this folder.", Arg("RUN")]
-CameraFile = Annotated[
-    Path, "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
-]
+CameraFile = Annotated[Path, "Read the intrinsics from this file of COLMAP, OpenCV, ROS, Kalibr, mrcal and others."]
 OptionalCamera = Annotated[
     Path | None,
     "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB. If not given, they "
     "are found from the board's dots or the target's printed faces.",
 ]
 CAMERA = "--camera"
-CameraName = Annotated[
-    str, "Take this camera from a --camera file of several: its name, or COLMAP's number.", Opt("--camera-name")
-]
+CameraName = Annotated[str, "Take this camera, by name or number, of a --camera file of several.", Opt("--camera-name")]
 """Option that every command with ``--camera`` has."""
 TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
-BoardFile = Annotated[
-    Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
-]
+BoardFile = Annotated[Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference."]
 PlateMargin = Annotated[
     float,
-    "Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
+    "Assume that plates end this far beyond their circles without outline_mm.",
     Opt("--margin-mm", min=0, max=1e4),
 ]
 Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)]
@@ -123,35 +104,25 @@ FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard
 RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
 LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
 JsonFile = Annotated[
-    Path | None,
-    "Also write all results to this file (JSON), or to standard output with `-`.",
-    Opt("--json", writes=True),
+    Path | None, "Also write all results to this file (JSON; `-`: standard output).", Opt("--json", writes=True)
 ]
 ReportFile = Annotated[
     Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
 ]
 Device = Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."]
-Gain = Annotated[
-    float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
-]
+Gain = Annotated[float | None, "Set this gain, in the driver's unit; unchanged if not given.", Opt(min=0, max=1e6)]
 Exclude = Annotated[
-    list[str] | None,
-    "Ignore this image, by its name in results, such as 12/IMG_1003.jpg; repeat it for more images.",
-    Opt(metavar="IMAGE"),
+    list[str] | None, "Ignore this image, such as 12/IMG_1003.jpg; repeat it for more.", Opt(metavar="IMAGE")
 ]
 Strict = Annotated[bool, "End with exit code 4 if a check has failed; results are written in any case."]
 StrictByDefault = Annotated[
-    bool,
-    "End with exit code 4 if the answer is no, or with 0 all the same. Results are written in any case.",
-    Opt("--strict/--no-strict"),
+    bool, "End with exit code 4 if the answer is no; results are written.", Opt("--strict/--no-strict")
 ]
 """Option of the commands that say whether a run may be used."""
 Overwrite = Annotated[bool, "Replace existing output files.", Opt("--overwrite")]
 """Option of every command that writes a file."""
 Quiet = Annotated[bool, "Print only warnings and errors, and a verdict that is not good.", Opt("--quiet -q")]
-Verbose = Annotated[
-    bool, "Print more: each step, the time of each stage, and what is found in the images.", Opt("--verbose -v")
-]
+Verbose = Annotated[bool, "Print more: steps, times, and what is found in images.", Opt("--verbose -v")]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
 WRITE_NOTHING = ("serve", "live", "dry_run")
@@ -162,15 +133,12 @@ MOST_SEED = 2**63 - 1
 """Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
 
-Scheduler = Annotated[
-    str | None, "Send the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
-]
+Scheduler = Annotated[str | None, "Send the images to the Dask scheduler at this address, tcp://host:8786."]
 SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
 
 
 Quaternions = Annotated[
-    Literal["wxyz", "xyzw"],
-    "Read quaternions by the names of their columns (wxyz), or take the columns in their order as x, y, z, w (xyzw).",
+    Literal["wxyz", "xyzw"], "Read quaternions by the names of their columns, or in their order as x, y, z, w (xyzw)."
 ]
 Rotation = Annotated[
     str | None,
@@ -179,20 +147,16 @@ Rotation = Annotated[
 ]
 PayloadKg = Annotated[
     float | None,
-    "Take this mass at the flange for all rows without a column payload_kg; if not given, that of the robot file.",
+    "Take this mass at the flange for rows without payload_kg; the robot file's if not given.",
     Opt(min=0, max=1e4),
 ]
 MinDiameter = Annotated[
-    float | None,
-    "Ignore circles smaller than this, px; 4.5, and 9 over 8 megapixels, if not given.",
-    Opt(min=4, max=1e6),
+    float | None, "Ignore circles smaller than this, px; 4.5, 9 over 8 megapixels, if not given.", Opt(min=4, max=1e6)
 ]
 MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8, max=1e6)]
 
 
-FirstTable = Annotated[
-    Path | None, "Read rows from this file (CSV), in place of the argument, and join those of --b.", Opt("--a")
-]
+FirstTable = Annotated[Path | None, "Read rows from this file (CSV), and join those of --b.", Opt("--a")]
 SecondTable = Annotated[Path | None, "Read the values that belong to the rows of --a from this file (CSV).", Opt("--b")]
 Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]
 
@@ -242,17 +206,14 @@ def exports_of(words: Sequence[str], forms: Collection[str]) -> list[tuple[str, 
     """Returns form and file of each FORM=FILE of --export; ``forms`` : the known ones."""
     from stcal.io.poses.programs import require_form
 
+    exports = []
     for word in words:
         form, _, path = word.partition("=")
         require_form(form, forms)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
-    return _exports(words)
-
-
-def _exports(words: Sequence[str]) -> list[tuple[str, Path]]:
-    parts = [word.partition("=") for word in words]
-    return [(form, Path(path)) for form, _, path in parts if path]
+        exports.append((form, Path(path)))
+    return exports
 
 
 def name_of(source: "Path | Table") -> str:
@@ -272,37 +233,28 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
 
 
 def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None, verdict: str = "") -> None:
-    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given.
-
-    Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, what failed.
-    """
-    if strict and failed:
-        others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
-        where = f"; see {report}" if report else ""
-        raise ChecksFailed(
-            "E-CHECKS-FAILED",
-            f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them{where}",
-        )
-    if verdict or failed:
-        warn_if_quiet(verdict or f"failed: {', '.join(failed)}")
+    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given; otherwise a quiet
+    command writes ``verdict``, the sentence of a verdict that is not good, or what failed."""
+    others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
+    said = f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them"
+    _require(strict, said, report, bool(failed), verdict or f"failed: {', '.join(failed)}" * bool(failed))
 
 
 def require_usable(
     strict: bool, reasons: Sequence[str], page: Path | None = None, verdict: str = "", but: str = "do not use them"
 ) -> None:
-    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given.
+    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given;
+    otherwise a quiet command writes ``verdict``, or the reasons. ``but`` : ends what is said of the results, which are
+    written."""
+    said = f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0"
+    _require(strict, said, page, bool(reasons), verdict or "; ".join(reasons))
 
-    Otherwise a quiet command writes ``verdict``, the sentence of a verdict that is not good; if empty, the reasons.
-    ``but`` : what is to be said of the results that are written all the same.
-    """
-    if strict and reasons:
-        where = f"; see {page}" if page else ""
-        raise ChecksFailed(
-            "E-CHECKS-FAILED",
-            f"{'; '.join(reasons)}; results are written, {but}; --no-strict ends with 0{where}",
-        )
-    if verdict or reasons:
-        warn_if_quiet(verdict or "; ".join(reasons))
+
+def _require(strict: bool, said: str, page: Path | None, failed: bool, verdict: str) -> None:
+    if strict and failed:
+        raise ChecksFailed("E-CHECKS-FAILED", said + (f"; see {page}" if page else ""))
+    if verdict:
+        warn_if_quiet(verdict)
 
 
 def load_ahead(workers: int | None) -> None:
@@ -334,9 +286,8 @@ def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
 def protect_outputs(application: typer.Typer) -> None:
     """Prevents the commands of an application from overwriting their inputs, or other files without a request.
 
-    Every path among the parameters is an input, except those whose option is ``writable``. Existing files are replaced
-    only with ``--overwrite``, an option that is added to each command that writes a file. ``--quiet`` and ``--verbose``
-    are added to all commands. Only ``--json -`` may use standard output. Each option gets its panel of the help text.
+    Every path among the parameters is an input unless its option ``writes``. Commands that write get ``--overwrite``,
+    all of them ``--quiet`` and ``--verbose``; only ``--json -`` may use standard output.
     """
     for command in application.registered_commands:
         if command.callback is not None:
@@ -383,9 +334,11 @@ def _protected(command: Callable) -> Callable:
         return command
     command = _grouped(command)
     signature = inspect.signature(command, eval_str=True)
-    parameters = {name: declared(name, each.annotation) for name, each in signature.parameters.items()}
-    words = {name: each.word for name, each in parameters.items()}
-    outputs = {name for name, each in parameters.items() if each.writes}
+    every = [*map(declared, signature.parameters.values())]
+    infos = {each.name: get_args(each.annotation)[1] for each in every}
+    # With Annotated, Typer takes an option's first name for its default.
+    words = {name: info.default if isinstance(info.default, str) else name for name, info in infos.items()}
+    outputs = {name for name, info in infos.items() if info.writable}
 
     @wraps(command)
     def checked(
@@ -404,7 +357,8 @@ def _protected(command: Callable) -> Callable:
         written, read = (
             [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
         )
-        written += [("--export", path) for _, path in _exports(given.get("export") or ())]
+        exports = (word.partition("=")[2] for word in given.get("export") or ())
+        written += [("--export", Path(path)) for path in exports if path]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in to_stdout:
             if option != "--json":
@@ -416,16 +370,20 @@ def _protected(command: Callable) -> Callable:
             if option == "--report" and path.suffix.lower() == ".pdf":
                 also = ", and --pdf for the PDF" if "pdf" in given else "; a browser prints it as PDF"
                 raise InputError(
-                    "E-OUTPUT-SUFFIX",
-                    f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}",
+                    "E-OUTPUT-SUFFIX", f"--report {path}: the page is HTML; give {path.with_suffix('.html')}{also}"
                 )
         keep_apart(written, read)
         token = _replacing.set(overwrite)
         try:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
-            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes():
-                return command(**given) if not camera_name else _with(camera_name, command, given)
+            choice: AbstractContextManager[None] = nullcontext()
+            if camera_name:
+                from stcal.io.cameras.read import camera_chosen
+
+                choice = camera_chosen(camera_name)
+            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes(), choice:
+                return command(**given)
         finally:
             _replacing.reset(token)
 
@@ -433,22 +391,15 @@ def _protected(command: Callable) -> Callable:
     further: dict[str, tuple[Any, Any]] = {"camera_name": (CameraName, "")} if CAMERA in words.values() else {}
     further |= {"overwrite": (Overwrite, False)} if outputs and command.__name__ not in ALWAYS_NEW else {}
     further |= {"quiet": (Quiet, False), "verbose": (Verbose, False)}
-    every = [each.replace(annotation=parameters[name].annotation) for name, each in signature.parameters.items()]
-    for name, (annotation, default) in further.items():
-        kind = declared(name, annotation).annotation
-        every.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind))
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    every += [
+        declared(inspect.Parameter(name, keyword, default=default, annotation=annotation))
+        for name, (annotation, default) in further.items()
+    ]
     # Typer reads both.
     checked.__signature__ = signature.replace(parameters=every)  # type: ignore[attr-defined]
     checked.__annotations__ = {each.name: each.annotation for each in every} | {"return": None}
     return checked
-
-
-def _with(camera_name: str, command: Callable, given: dict):
-    """Run a command with the camera of this name if a camera file has several."""
-    from stcal.io.cameras.read import camera_chosen
-
-    with camera_chosen(camera_name):
-        return command(**given)
 
 
 @contextmanager
@@ -476,13 +427,19 @@ def designs_told(
     """Prints which reference designs are assumed (unless switched off), and which faces are nearly alike; errors within
     the context name the designs."""
     from stcal.boards.target import body_of
+    from stcal.design import reference_board, reference_target
     from stcal.sfm.detect.sightings import likeness_notes
 
+    assumed = []
     if target is not None:
         design = body_of(target)
         print_each("note", likeness_notes(design))
         with_board = with_board and not design.has_scale
-    assumed = assumed_designs(target is None and with_target, board is None and with_board)
+    elif with_target:
+        faces = reference_target().faces
+        assumed.append(f"the reference target, {len(faces)} faces of {len(faces[0].ids)} circles (no --target)")
+    if board is None and with_board:
+        assumed.append(f"the reference board, {board_in_words(reference_board())} (no --board)")
     for design in assumed:
         say(f"assumed: {design}")
     try:
@@ -491,20 +448,6 @@ def designs_told(
         if assumed and not isinstance(error, InputError):
             error.append(f"; assumed: {' and '.join(assumed)}")
         raise
-
-
-def assumed_designs(target: bool, board: bool) -> list[str]:
-    """Returns short descriptions of the reference target and board, with the options that name others."""
-    from stcal.design import reference_board, reference_target
-
-    reference, dots, words = reference_target(), reference_board(), []
-    if target:
-        words.append(
-            f"the reference target, {len(reference.faces)} faces of {len(reference.faces[0].ids)} circles (no --target)"
-        )
-    if board:
-        words.append(f"the reference board, {board_in_words(dots)} (no --board)")
-    return words
 
 
 def board_in_words(board: "BoardDesign") -> str:

@@ -32,23 +32,6 @@ _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 
 _quiet: ContextVar[bool] = ContextVar("_quiet", default=False)
 _verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
-RED, YELLOW, GREEN = 31, 33, 32
-"""Colour codes of ECMA-48."""
-COLOURS = {
-    "failed": RED,
-    "do not use": RED,
-    "suspicious": YELLOW,
-    "use with care": YELLOW,
-    "warning": YELLOW,
-    "passed": GREEN,
-    "good": GREEN,
-}
-"""Colour of each verdict's word."""
-VERDICTS = re.compile(
-    r"(?m)(?P<before>^ *|^verdict: |(?<=checks: )\d+ |(?<=, )\d+ )"
-    rf"(?P<word>{'|'.join(COLOURS)})(?=[:;,]| *$)"
-)
-"""Places of a verdict's word: before the judged item, after `verdict`, and in the counts of checks."""
 
 
 @contextmanager
@@ -134,12 +117,7 @@ def say(*values: object, sep: str = " ", end: str = "\n") -> None:
     """Prints the values, unless the command is quiet. Names from files may contain any characters."""
     if _quiet.get():
         return
-    text = printable(sep.join(map(str, values)))
-    if sys.stdout.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb":  # no-color.org
-        text = VERDICTS.sub(
-            lambda match: f"{match['before']}\x1b[{COLOURS[match['word']]}m{match['word']}\x1b[0m", text
-        )
-    print(text + end, end="")  # at once: threads may say something too
+    print(printable(sep.join(map(str, values))) + end, end="")  # at once: threads may say something too
 
 
 @contextmanager

@@ -55,31 +55,35 @@ class ByValue:
     __slots__ = ()
 
     def __eq__(self, other: object) -> bool:
-        return self is other or (_value(self) == _value(other) if type(other) is type(self) else NotImplemented)
+        return _same(self, other) if type(other) is type(self) else NotImplemented
 
     def __hash__(self) -> int:
         values = [getattr(self, entry.name) for entry in fields(self)]  # type: ignore[arg-type]
-        numbers = [float(part.sum()) if isinstance(part, np.ndarray) else part for part in values]
-        return hash((type(self).__name__, *(part for part in numbers if isinstance(part, str | int | float))))
+        numbers = [float(np.nansum(part)) if isinstance(part, np.ndarray) else part for part in values]
+        known = (part for part in numbers if isinstance(part, str | int | float) and part == part)
+        return hash((type(self).__name__, *known))
 
 
-def _value(part: Any) -> Any:
-    if isinstance(part, np.ndarray):
-        return part.tolist()
-    if isinstance(part, list | tuple):
-        return [_value(each) for each in part]
-    if isinstance(part, dict):
-        return {name: _value(each) for name, each in part.items()}
-    if is_dataclass(part):
-        return type(part), [_value(getattr(part, entry.name)) for entry in fields(part)]
-    return part
+def _same(one: Any, two: Any) -> bool:
+    """Return True if two values are equal, arrays by their values; NaN, which stands for what is not known, is NaN."""
+    if one is two:
+        return True
+    if isinstance(one, np.ndarray) or isinstance(two, np.ndarray):
+        return np.array_equal(one, two, equal_nan=np.asarray(one).dtype.kind == "f")
+    if type(one) is not type(two):
+        return one == two
+    if isinstance(one, list | tuple):
+        return len(one) == len(two) and all(map(_same, one, two))
+    if isinstance(one, dict):
+        return one.keys() == two.keys() and all(_same(each, two[name]) for name, each in one.items())
+    if is_dataclass(one):
+        return all(_same(getattr(one, entry.name), getattr(two, entry.name)) for entry in fields(one))
+    return bool(one == two or (one != one and two != two))
 
 
-class Brief:
-    """Base of results with many values, made with ``@dataclass(repr=False)``.
-
-    Their ``repr`` is one line with plain values, notes, and the size of everything else.
-    """
+class Brief(ByValue):
+    """Base of results with many values, made with ``@dataclass(eq=False, repr=False)``, that show themselves in one
+    line: with plain values, notes, and the size of everything else."""
 
     __slots__ = ()
 
@@ -182,8 +186,7 @@ def _rules(kind: type) -> dict[str, tuple[Rule, bool]]:
 def require_fields(instance: object, what: str, **least: float) -> None:
     """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``.
 
-    Numbers must be finite, words in fields of a Literal type must be among those that it lists. Arrays are left to
-    :func:`freeze`. ``least`` : lowest value of a number, by field.
+    Numbers must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`.
     """
     for name, ((admits, words), is_choice) in _rules(type(instance)).items():
         value = getattr(instance, name)
@@ -221,7 +224,6 @@ def _require_unmasked(value: object, what: str) -> None:
 
 
 def _holds_text(values: object) -> bool:
-    """Return True if a text is among the values of nested lists."""
     return isinstance(values, str) or (isinstance(values, list | tuple) and any(map(_holds_text, values)))
 
 
@@ -232,11 +234,8 @@ def frozen(
     dtype: DTypeLike = float,
     finite: bool = True,
 ) -> np.ndarray:
-    """Return a read-only copy of values.
-
-    ``shape`` : the required one, if any; ``None`` in it admits any length; ``what`` : name of the values in messages;
-    ``finite`` : whether floats must be finite; if not, NaN stands for values that are not known.
-    """
+    """Return a read-only copy of values of a shape, in which ``None`` admits any length; ``what`` : their name in
+    messages; ``finite`` : whether NaN is refused, which else stands for what is not known."""
     if type(values) is np.ndarray and values.dtype == dtype:
         array = values if values.base is None and not values.flags.writeable else values.copy()
     else:
@@ -253,7 +252,6 @@ def frozen(
 
 
 def _as_array(values: ArrayLike, shape: Shape | None, what: str, dtype: DTypeLike) -> np.ndarray:
-    """Return a copy of values of any type."""
     _require_unmasked(values, what)
     if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
         raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stcal.errors import ConvergenceError, InputError
+from stcal.errors import ConvergenceError, InputError, named
 from stcal.geometry.arrays import Array, ByValue, freeze, frozen, require_arguments, require_fields
 
 MAX_NEWTON_STEPS = 50
@@ -53,22 +53,19 @@ LEAST_SHARE_OF_SIDE = 0.015
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera(ByValue):
-    """A central camera with OpenCV's lens model and perspective or equidistant projection.
+    """A central camera with OpenCV's lens model and perspective or equidistant projection, before the camera.
 
     Perspective: the ideal point (x, y) = (X, Y) / Z is distorted by OpenCV's rational model with thin prisms (its first
     twelve coefficients; COLMAP's FULL_OPENCV without prisms). Equidistant: the point is moved to the radius θ, its
-    angle from the axis: (x, y) θ / r. It is then distorted by 1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸, p1, p2, s1 and s3
-    (Kannala & Brandt 2006; OpenCV's fisheye; COLMAP's THIN_PRISM_FISHEYE). Only points at less than 90° from the axis
-    are seen.
+    angle from the axis, and then distorted by 1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸, p1, p2, s1 and s3 (Kannala & Brandt
+    2006; OpenCV's fisheye; COLMAP's THIN_PRISM_FISHEYE).
 
     Parameters
     ----------
     width, height : int
         Image size, px.
-    focal : (2,) array
-        fx, fy, px.
-    centre : (2,) array
-        cx, cy, px, centre of the top-left pixel at (0, 0).
+    focal, centre : (2,) array
+        fx, fy and cx, cy, px, centre of the top-left pixel at (0, 0).
     distortion : (12,) array
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in OpenCV's order; or the first eight.
     fisheye : bool
@@ -77,11 +74,6 @@ class Camera(ByValue):
         The COLMAP model that represents the camera exactly; the most general one of its projection if not given.
     covariance : (q, q) array, optional
         Covariance of the parameters of ``colmap_model``, in its order; None if unknown.
-
-    Raises
-    ------
-    InputError
-        Numbers that no camera has, an unknown ``colmap_model`` or one of another projection, arrays of other shapes.
     """
 
     width: int
@@ -117,7 +109,8 @@ class Camera(ByValue):
         if self.covariance is not None:
             count = len(COLMAP_LAYOUT[self.colmap_model])
             freeze(self, "covariance", (count, count), "camera's covariance")
-        require_lens(self.parameters(), self.width, self.height, "camera")
+        with named("camera"):
+            require_lens(self.parameters(), self.width, self.height)
 
     @classmethod
     def of(cls, camera: "Camera", colmap_model: str, covariance: np.ndarray | None = None) -> "Camera":
@@ -138,16 +131,9 @@ class Camera(ByValue):
             ``cameraMatrix``: fx, fy, cx, cy, px; without skew.
         distortion : (k,) array
             k1, k2, p1, p2, k3, k4, k5, k6, all or the first 4 or 5; none for a lens without distortion. With
-            ``fisheye`` k1, k2, k3, k4 of ``cv2.fisheye``.
+            ``fisheye``, the equidistant projection of ``cv2.fisheye``, its k1, k2, k3, k4.
         size : (int, int)
             Width and height of the images, px.
-        fisheye : bool
-            Equidistant projection, as of ``cv2.fisheye``.
-
-        Raises
-        ------
-        InputError
-            A matrix of another form, numbers of coefficients that OpenCV does not know, a size that is none.
         """
         k = frozen(matrix, (3, 3), "camera matrix")
         if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
@@ -156,17 +142,13 @@ class Camera(ByValue):
                 f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed; skew is not supported",
             )
         given = frozen(np.ravel(distortion), None, "distortion")
-        flat, model = opencv_lens(given, fisheye, "camera")
+        with named("camera"):
+            flat, model = opencv_lens(given, fisheye)
         return cls(int(size[0]), int(size[1]), k[[0, 1], [0, 1]], k[:2, 2], flat, fisheye, model)
 
     def to_opencv(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four.
-
-        Raises
-        ------
-        InputError
-            An equidistant lens with tangential terms or prisms, which ``cv2.fisheye`` does not have.
-        """
+        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four, without
+        prisms."""
         matrix = np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]])
         if not self.fisheye:
             count = next(n for n in (4, 5, 8, 12) if not self.distortion[n:].any())
@@ -226,18 +208,7 @@ class Camera(ByValue):
         return jacobian
 
     def distort(self, xy: ArrayLike) -> np.ndarray:
-        """Apply the lens distortion to ideal normalised coordinates.
-
-        Parameters
-        ----------
-        xy : (..., 2) array
-            Ideal normalised coordinates.
-
-        Returns
-        -------
-        (..., 2) array
-            Distorted normalised coordinates.
-        """
+        """Return distorted normalised coordinates (..., 2) of ideal ones (..., 2)."""
         xy = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(xy)
@@ -247,20 +218,7 @@ class Camera(ByValue):
         return np.stack(self._moved(x, y, r2, top / bottom), axis=-1)
 
     def distort_jacobian(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Apply the lens distortion and return its derivative, too.
-
-        Parameters
-        ----------
-        xy : (..., 2) array
-            Ideal normalised coordinates.
-
-        Returns
-        -------
-        distorted : (..., 2) array
-            Result of :meth:`distort`.
-        jacobian : (..., 2, 2) array
-            Derivative of the distorted by the ideal coordinates.
-        """
+        """Return :meth:`distort` of ideal coordinates (..., 2), and its derivative (..., 2, 2)."""
         xy = ideal = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(ideal)
@@ -319,13 +277,8 @@ class Camera(ByValue):
         return moved_x, moved_y
 
     def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
-        """Invert :meth:`distort` by Newton's method to 1e-12.
-
-        Raises
-        ------
-        ConvergenceError
-            Where the distortion model folds over, so that no inverse exists, or for coordinates that are not finite.
-        """
+        """Invert :meth:`distort` by Newton's method to 1e-12; ConvergenceError where the distortion folds the image
+        over."""
         target = np.asarray(xy_distorted, float)
         if not self.distortion.any():
             return self._perspective(target.copy(), target)
@@ -402,69 +355,56 @@ def _angle_share(r2: np.ndarray) -> np.ndarray:
 
 
 def _equidistant_jacobian(xy: np.ndarray) -> np.ndarray:
-    """Return the derivative (..., 2, 2) of :func:`_equidistant`."""
     r2 = (xy**2).sum(-1)
     share, near = _angle_share(r2), r2 <= NEAR_AXIS
     along = np.where(near, -2 / 3 + 4 / 5 * r2, (1 / (1 + r2) - share) / np.where(near, 1.0, r2))
     return share[..., None, None] * np.eye(2) + along[..., None, None] * xy[..., :, None] * xy[..., None, :]
 
 
-def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool = False) -> tuple[np.ndarray, str]:
-    """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly.
-
-    ``fisheye`` : k1 to k4 of an equidistant lens, or with ``tangential`` k1, k2, p1, p2, k3, k4.
-    """
+def opencv_lens(given: np.ndarray, fisheye: bool, tangential: bool = False) -> tuple[np.ndarray, str]:
+    """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly; of a
+    fisheye k1 to k4, or if ``tangential`` k1, k2, p1, p2, k3, k4."""
     distortion = np.zeros(COEFFICIENTS)
     if fisheye:
         if len(given) not in ((6,) if tangential else (0, 4)):
             raise InputError(
-                "E-CAMERA-COEFFICIENTS",
-                f"{where}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed",
+                "E-CAMERA-COEFFICIENTS", f"{len(given)} coefficients of an equidistant lens; k1 to k4 needed"
             )
         distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
         return distortion, "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
     if given[8:].any():
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS", f"{where}: {len(given)} distortion coefficients, at most 8 are supported"
-        )
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{len(given)} distortion coefficients, at most 8 are supported")
     if len(given) not in DISTORTION_COUNTS:
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
-            f"{where}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
+            f"{len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
             "(k1, k2, p1, p2, k3 …)",
         )
     distortion[: min(len(given), 8)] = given[:8]
     return distortion, "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
 
 
-def require_lens(flat: np.ndarray, width: float | None, height: float | None, where: str) -> None:
+def require_lens(flat: np.ndarray, width: float | None, height: float | None) -> None:
     """Refuse parameters (16,), see :data:`PARAMETER_NAMES`, and sizes that no camera has; None: not stated."""
     if not np.isfinite(flat).all():
-        raise InputError("E-CAMERA-NOT-FINITE", f"{where}: a camera parameter is not a finite number; correct it")
+        raise InputError("E-CAMERA-NOT-FINITE", "a camera parameter is not a finite number; correct it")
     if (far := np.abs(flat).max()) > FARTHEST:
-        raise InputError(
-            "E-CAMERA-TOO-FAR",
-            f"{where}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
-        )
+        raise InputError("E-CAMERA-TOO-FAR", f"a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it")
     if (flat[:2] <= 0).any():
-        raise InputError(
-            "E-CAMERA-FOCAL", f"{where}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed"
-        )
+        raise InputError("E-CAMERA-FOCAL", f"focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed")
     if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"{where}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
+            f"focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
             "times apart needed, pixels are nearly square",
         )
     for side in (width, height):
         if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
-            raise InputError(
-                "E-CAMERA-SIZE", f"{where}: image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed"
-            )
+            raise InputError("E-CAMERA-SIZE", f"image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed")
     if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"{where}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
+            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
             f"of {width:g}×{height:g} px; pixels needed; check that they are not mm, or shares of a side",
         )
 

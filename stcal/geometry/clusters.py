@@ -28,8 +28,7 @@ LEAST_TOLD = 1e-14
 class ByClusters:
     """Covariance (q, q) of the parameters, never below the ``independent`` one, of independent errors.
 
-    ``differ`` : by how much clusters differ more than independent errors explain, as a ratio of σ; ``freedom`` : (q,)
-    effective degrees of freedom of what they tell about each parameter.
+    ``differ`` : ratio of σ by which clusters differ more than those explain; ``freedom`` : (q,) effective degrees.
     """
 
     covariance: np.ndarray
@@ -39,9 +38,9 @@ class ByClusters:
 
 
 def released(values: np.ndarray, share: np.ndarray, power: float = 0.5) -> np.ndarray:
-    """Return what clusters would show, had they not taken part in the answer.
+    """Return what clusters would show, of unit variance, (…, k), had they not taken their share (…, k, k) in the
+    answer.
 
-    ``values`` : (…, k) what they show, of unit variance by itself; ``share`` : (…, k, k) part that the answer took;
     ``power`` : 0.5 for the variance of independent errors (CR2), 1 for the answer without the cluster (CR3)
     """
     taken, axes = np.linalg.eigh((share + np.swapaxes(share, -1, -2)) / 2)
@@ -50,13 +49,10 @@ def released(values: np.ndarray, share: np.ndarray, power: float = 0.5) -> np.nd
 
 
 def by_clusters(normal: np.ndarray, pull: np.ndarray, information: np.ndarray) -> ByClusters:
-    """Return the covariance of parameters at a minimum, from the n clusters of its observations.
+    """Return the covariance of parameters at a minimum with a normal matrix (q, q), priors included, from n clusters.
 
-    Parameters
-    ----------
-    normal : (q, q) normal matrix, priors included
-    pull : (n, q) half the downhill gradient of each cluster's cost, other unknowns eliminated
-    information : (n, q, q) each cluster's part of ``normal``
+    ``pull`` : (n, q) half the downhill gradient of each cluster's cost, other unknowns eliminated; ``information`` :
+    (n, q, q) each cluster's part of ``normal``
     """
     own = np.diag(normal)
     scale = np.sqrt(np.where(own > 0, own, 1.0))

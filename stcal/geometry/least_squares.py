@@ -55,11 +55,8 @@ L = TypeVar("L", bound=Linear)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one problem, or of h problems at once.
-
-    ``cost`` : number, or (h,); ``normal`` : (k, k), or (h, k, k); ``gradient`` : (k,), or (h, k), half the gradient of
-    the cost. A parameter that nothing determines is not moved.
-    """
+    """Normal equations of one problem, or of h problems at once: cost, normal matrix (..., k, k), and half the gradient
+    of the cost (..., k). A parameter that nothing determines is not moved."""
 
     cost: float | np.ndarray
     normal: np.ndarray
@@ -90,12 +87,8 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum(Generic[S, L]):
-    """End of a descent.
-
-    ``linear`` : the problem linearised about ``state``; ``converged`` : True if the state is a minimum, (h,) for h
-    problems; ``promised`` : predicted decrease of the cost by the last step, in units of σ²; ``steps`` : number of
-    steps tried.
-    """
+    """End of a descent after a number of ``steps``: the state, the problem linearised about it, whether it is a
+    minimum, and the decrease of the cost that the last step promised, in σ²."""
 
     state: S
     linear: L
@@ -127,25 +120,14 @@ def minimise(
     max_steps: int = MAX_STEPS,
     hopeless: float = np.inf,
 ) -> Minimum[S, L]:
-    """Return the state of least cost, found by descent from a start.
+    """Return the state of least cost, of one problem, or of h problems at once if costs are (h,), found from a start.
 
-    Parameters
-    ----------
-    state : start of the descent; of h problems at once if the costs of ``linearise`` are (h,)
-    linearise : returns the problem linearised about a state
-    moved : returns the state after a step (k,), or (h, k)
-    cost : returns the cost of a state, for a single problem. To be given if it is cheaper than ``linearise``, which is
-        then called at accepted states only
-    select : given (take (h,), new, old) for h problems, returns the new state or :class:`Linear` where ``take``, else
-        the old one
-    damping, least_damping : damping at the start, and its lower limit, which regularises directions that nothing
-        determines
-    settled, least_gain : a minimum is reached when the predicted decrease of the next undamped step is at most
-        ``settled`` times the cost plus ``least_gain``, in σ²
-    max_steps : largest number of steps tried
-    hopeless : excess of a problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`
-
-    The result holds whether the descent converged; see :meth:`Minimum.required`.
+    ``linearise`` : returns the problem about a state; ``moved`` : a state after a step (k,), or (h, k); ``cost`` : that
+    of a state, where it is cheaper, so that accepted states alone are linearised; ``select`` : returns the new state or
+    :class:`Linear` where ``take`` (h,), else the old one; ``damping``, ``least_damping`` : at the start, and the lower
+    limit, which regularises what nothing determines; ``settled``, ``least_gain`` : a minimum is reached when the next
+    undamped step promises at most ``settled`` times the cost plus ``least_gain``, in σ²; ``hopeless`` : excess of a
+    problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`.
     """
     current = linearise(state)
     damp = np.full(np.shape(current.cost), float(damping))
@@ -257,8 +239,7 @@ class Normal(NormalEquations):
     def of(cls, residual: np.ndarray, by_pose: np.ndarray, possible: np.ndarray, huber: float) -> "Normal":
         """Return the normal equations of Huber's loss on the lengths of whitened residuals (h, n, 2).
 
-        ``by_pose`` : (h, n, 2, 6) negative derivative of the residuals; ``possible`` : (h,) mask, the cost of other
-        poses is infinite.
+        ``by_pose`` : (h, n, 2, 6) negative derivatives; the cost is infinite where a pose is not ``possible`` (h,).
         """
         length = np.sqrt((residual**2).sum(2))
         cost = np.where(possible, huber_cost(length, huber).sum(1), np.inf)
@@ -296,15 +277,8 @@ def descend(
     settled: float,
     hopeless: float = np.inf,
 ) -> Minima:
-    """Return the minima reached from h poses at once.
-
-    Parameters
-    ----------
-    evaluate : returns the normal equations at h poses
-    poses : starts of the descent
-    settled : a step is the last if it lowers χ² by less than this value, or by less than this share of χ²
-    hopeless : excess of a pose's χ² over the best one up to which the pose is followed to its end
-    """
+    """Return the minima reached from h poses at once; a step that lowers χ² by less than ``settled``, or by less than
+    this share, is the last, and so is any one of a pose whose χ² exceeds the best one by ``hopeless``."""
     result = minimise(
         poses,
         evaluate,

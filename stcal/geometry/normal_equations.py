@@ -20,9 +20,8 @@ LARGE = 100
 class Reduction:
     """Elimination of m blocks of ``a`` unknowns each from the normal equations of k other unknowns.
 
-    ``normal`` : (k, k) and ``right`` : (k,) are to be subtracted from normal matrix and right-hand side of the other
-    unknowns; ``step`` : (m, a) step of the blocks if the others stay; ``from_kept`` : (m, a, k) is multiplied by the
-    step of the others and subtracted from ``step``; ``block`` : (m, a, a); ``gain`` : decrease of the cost by ``step``
+    ``normal`` : (k, k) and ``right`` : (k,) are to be subtracted from those of the others; ``step`` : (m, a) of the
+    blocks if the others stay, of which ``from_kept`` : (m, a, k) times their step is subtracted; ``gain`` : of ``step``
     alone.
     """
 
@@ -44,13 +43,8 @@ class Reduction:
 
 
 def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction:
-    """Eliminate independent blocks of unknowns.
-
-    ``block`` : (m, a, a) normal matrices of the blocks; ``right`` : (m, a) right-hand sides of the blocks; ``cross`` :
-    (m, a, k) mixed parts of the normal matrix, blocks by other unknowns.
-
-    Raises LinAlgError: a block is singular.
-    """
+    """Eliminate m independent blocks of unknowns with normal matrices (m, a, a), right-hand sides (m, a), and mixed
+    parts of the normal matrix (m, a, k). LinAlgError: a block is singular."""
     m, a, k = cross.shape
     if not m:
         return Reduction(np.zeros((k, k)), np.zeros(k), right, cross, block, 0.0)
@@ -93,8 +87,7 @@ def blocks_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k).
 
-    ``jacobian`` : (n, c, k) derivatives of each observation by the unknowns of its block, divided by σ; ``residual`` :
-    (n, c) observed minus computed, divided by σ; ``index`` : (n,) block of each observation.
+    Of n observations: derivatives (n, c, k) and residuals (n, c), both over σ, and the block of each, (n,).
     """
     n, _, k = jacobian.shape
     if count == 1:
@@ -119,10 +112,8 @@ def free_motions(xyz: np.ndarray, scale: bool) -> np.ndarray:
 
 
 def constrained_inverse(normal: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return the inverse of a normal matrix (k, k) with inner constraints: the datum of smallest trace over the points.
-
-    ``normal`` : singular in the directions ``free``, (k, f), which are orthonormal (S-transformation, Baarda 1973).
-    """
+    """Return the inverse of a normal matrix (k, k), singular in the orthonormal directions ``free`` (k, f), with the
+    datum of smallest trace over the points (S-transformation, Baarda 1973)."""
     if not free.any():
         return np.linalg.inv(normal)
     held = datum(np.diag(normal), free)

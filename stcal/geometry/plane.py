@@ -17,14 +17,11 @@ from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
 
 def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
-    """Return points whose ordinary projection is the centre of the ellipse that each circle projects to.
+    """Return points (..., 3) whose ordinary projection is the centre of the ellipse that each circle projects to.
 
-    With centre C, unit normal n and radius r the ellipse centre is the projection of
-    ``C + (r²/C_z)(n_z·n − e_z)`` (from the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C];
-    Hartley & Zisserman, sec. 2.2 and 8.3). ``e_z`` is the optical axis.
-
-    ``xyz_camera``, ``normal_camera`` : (..., 3) centre and unit normal (either sign), camera frame; ``radius_mm`` :
-    (...) in the unit of ``xyz_camera``.
+    With centre C, unit normal n and radius r it is that of ``C + (r²/C_z)(n_z·n − e_z)``, e_z the optical axis (from
+    the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C]; Hartley & Zisserman, sec. 2.2 and 8.3). All in the camera frame
+    and one unit; normals (..., 3) of either sign.
     """
     c, n = np.asarray(xyz_camera, float), np.asarray(normal_camera, float)
     shift = n[..., 2:] * n - np.array([0.0, 0.0, 1.0])
@@ -34,10 +31,8 @@ def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radiu
 def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`.
 
-    ``xyz_camera`` : (n, 3) centres, camera frame; the circles lie wholly in front of it; ``axes_camera`` : (3, 2)
-    orthonormal directions in the plane, camera frame; ``radius_mm`` : (n,) in the unit of ``xyz_camera``.
-
-    Returns normalised; the rim is ``centre + shape @ unit circle``, shape symmetric.
+    Centres (n, 3), radii (n,), and two orthonormal directions in the plane, (3, 2), give centres (n, 2) and symmetric
+    shapes (n, 2, 2), normalised: the rim is ``centre + shape @ unit circle``.
     """
     dual = radius_mm[:, None, None] ** 2 * (axes_camera @ axes_camera.T) - xyz_camera[:, :, None] * xyz_camera[:, None]
     dual = -dual / dual[:, 2:, 2:]
@@ -59,10 +54,7 @@ of the distance."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """The plane ``normal · xyz = offset``; ``rms`` is the spread of the fitted points about it.
-
-    ``normal`` : (3,) unit vector; ``offset``, ``rms`` : in the unit of the points.
-    """
+    """The plane ``normal · xyz = offset``, normal (3,) of unit length; ``rms`` : spread of the fitted points."""
 
     normal: Array
     offset: float
@@ -81,10 +73,7 @@ class Plane:
 
 
 def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
-    """Return the total-least-squares plane through (n, 3) points, its normal on the side of direction ``towards``.
-
-    Raises DegenerateError: fewer than three points, or collinear ones.
-    """
+    """Return the total-least-squares plane of n ≥ 3 points (n, 3) off a line, its normal on the side of ``towards``."""
     normal, offset, rms = fit_planes(np.asarray(xyz, float)[None], towards)
     return Plane(normal[0], float(offset[0]), float(rms[0]))
 
@@ -98,10 +87,7 @@ def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit a plane to each of k sets of points, (k, n, 3); see :func:`fit_plane`.
-
-    Returns normals (k, 3), offsets (k,) and RMS distances (k,).
-    """
+    """Return normals (k, 3), offsets (k,) and RMS distances (k,) of the planes of k sets of points, (k, n, 3)."""
     n = xyz.shape[1]
     if n < 3:
         raise DegenerateError("E-POINTS-FEW", f"plane: {n} points, 3 needed")
@@ -116,10 +102,7 @@ def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.n
 
 
 def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
-    """Return the 3×3 homography a_from_b of n ≥ 4 point pairs (n, 2): normalised DLT (Hartley & Zisserman, alg. 4.2).
-
-    Raises DegenerateError: fewer than four pairs, or three of the four on a line.
-    """
+    """Return the 3×3 homography a_from_b of n ≥ 4 pairs (n, 2): normalised DLT (Hartley & Zisserman, alg. 4.2)."""
     b, a = np.asarray(xy_b, float), np.asarray(xy_a, float)
     if len(b) < 4:
         raise DegenerateError("E-POINTS-FEW", f"homography: {len(b)} point pairs, 4 needed")
@@ -132,10 +115,8 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
 
 
 def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the homographies (k, 3, 3) of k sets of point pairs, (k, n, 2); see :func:`fit_homography`.
-
-    ``used`` : (k, n) mask of the pairs to use, four or more per set. A homography that they do not determine is NaN.
-    """
+    """Return the homographies (k, 3, 3) of k sets of pairs, (k, n, 2), each of the four or more that ``used`` (k, n)
+    marks; NaN where they do not determine it."""
     count, on = used.sum(1), used[..., None]
 
     def normalised(p):
@@ -173,7 +154,6 @@ def apply_homography(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
 
 
 def _mapped(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Return the homogeneous images (..., 3) of points."""
     constant = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
     return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + constant
 
@@ -186,11 +166,19 @@ def homography_jacobian(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
     return (homography[..., :2, :2] - mapped[..., :2, None] / w * homography[..., 2:, :2]) / w
 
 
-def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
-    """Return the pose of a plane with a metric frame from its homography into normalised image coordinates.
+def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return which points (n, 2) lie in a polygon (k, 2), (n,) bool."""
+    side = np.roll(polygon, -1, axis=0) - polygon
+    above = polygon[:, 1] > points[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = polygon[:, 0] + (points[:, 1:] - polygon[:, 1]) * side[:, 0] / side[:, 1]
+    return ((above != np.roll(above, -1, axis=1)) & (points[:, :1] < crossing)).sum(1) % 2 == 1
 
-    Zhang (2000), closed form: the first two columns are the plane's axes up to scale. The pattern lies in
-    front of the camera (positive depth of the plane's origin where the homography has that sign).
+
+def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
+    """Return the pose of a plane with a metric frame from its homography into normalised coordinates (Zhang 2000).
+
+    The plane's origin has a positive depth where the homography has that sign.
     """
     h = np.asarray(normalised_from_plane, float)
     h = h / np.sqrt(np.linalg.norm(h[:, 0]) * np.linalg.norm(h[:, 1]))
@@ -201,15 +189,9 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
-    """Return the pose that minimises the reprojection error of a plane's points.
+    """Return camera_from_plane of least reprojection error, from a start before which the points lie.
 
-    ``camera_from_plane`` : start of the descent, mm; ``xy_plane`` : (n, 2) points in the plane's frame, mm;
-    ``xy_normalised`` : (n, 2) their ideal normalised image coordinates.
-
-    Returns camera_from_plane.
-
-    Raises DegenerateError: points lie behind the camera at the start.
-    Raises ConvergenceError: no minimum is reached.
+    ``xy_plane`` : (n, 2) mm; ``xy_normalised`` : (n, 2) ideal coordinates.
     """
     xyz = np.column_stack([xy_plane, np.zeros(len(xy_plane))])
 
@@ -248,11 +230,7 @@ Descend = Callable[[PoseStack, float], Minima]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneMinima:
-    """The distinct minima of the residuals of single points.
-
-    ``minima`` : one or two, the better one first; ``robust_sigma`` : robust σ of the residuals in units of their stated
-    σ, 1 or more.
-    """
+    """One or two distinct minima, the better one first, and the residuals' robust σ over the stated one, 1 or more."""
 
     minima: Minima
     robust_sigma: float
@@ -280,11 +258,9 @@ def step_between(pose: PoseStack, second: PoseStack) -> np.ndarray:
 
 
 def distinct(poses: PoseStack, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
-    """Return True if the second of two poses differs significantly from the first.
+    """Return True if the second of two poses differs significantly from the first, of the normal matrix (6, 6).
 
-    ``poses`` : the two poses; ``normal`` : (6, 6) normal matrix of the first pose, by the stated σ; ``robust_sigma`` :
-    robust σ of the residuals, in stated σ. If it exceeds 1, the stated σ are too small, and so is the σ of the pose:
-    without this factor two minima that the residuals cannot tell apart would count as two.
+    ``robust_sigma`` : of the residuals, in stated σ: where these are too small, so is σ of the pose.
     """
     step = step_between(poses[[0]], poses[[1]])
     return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
@@ -299,15 +275,10 @@ def two_minima(
 ) -> PlaneMinima:
     """Return one or two distinct minima of the residuals of single points.
 
-    Parameters
-    ----------
-    descend_near : returns the descent with residuals whitened near a stack of one pose; the whitening is the same for
-        both minima, so that their costs are comparable
-    start : one pose, to which its mirror image is added, or two poses, the likelier one first
-    target_from_plane : frame with the origin in the middle of the points, Z along the plane's normal
-    failure : message of the ConvergenceError
-    planar : True if all points lie in the plane. If the two starts then end in the same minimum, they may have been on
-        the same side, and the mirror image of the minimum is tried as a further start
+    ``descend_near`` : whitens residuals near one pose, alike for both minima, and returns the descent; ``start`` : one
+    pose, to which its mirror image is added, or two, the likelier one first; ``target_from_plane`` : origin in the
+    middle of the points, Z along the normal; ``planar`` : whether all points are in the plane, so that two starts that
+    end alike may have been on one side, and the mirror image of their minimum is tried.
     """
     poses = start.plus(mirrored(start, target_from_plane)) if len(start) == 1 else start
     sigma = 1.0
@@ -339,12 +310,8 @@ def weights_of(length: np.ndarray) -> np.ndarray:
 
 
 def deciding_delta(flip_odds: float, sigma_margin: float, variance_factor: float) -> float:
-    """Return the Δχ² of the second solution that decides for the first: −2 ln of the odds, times a variance factor.
-
-    ``flip_odds`` : largest odds of the second solution, for Gaussian errors; ``sigma_margin`` : factor by which all σ
-    may be too small without exceeding these odds; ``variance_factor`` : χ² over redundancy; it counts if it exceeds the
-    margin's square.
-    """
+    """Return the Δχ² of the second solution that decides for the first: −2 ln of its largest odds, times a variance
+    factor: the square of ``sigma_margin``, by which all σ may be too small, or χ² over redundancy if that is larger."""
     return -2 * float(np.log(flip_odds)) * max(sigma_margin**2, variance_factor)
 
 
@@ -356,11 +323,8 @@ def covariance_of_both(covariance: np.ndarray, away: np.ndarray, delta_chi2: flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """Result of one step of generalised least squares from h poses.
-
-    ``poses`` : poses after the step; ``residual`` : (h, n, 2) after the step, to first order; ``normal`` : (h, 6, 6);
-    ``chi2`` : (h,); ``moved2`` : (h,) squared length of the step in σ.
-    """
+    """h poses after one step of generalised least squares, with residuals (h, n, 2) to first order, normal matrices, χ²
+    (h,), and squared lengths of the steps in σ, (h,)."""
 
     poses: PoseStack
     residual: np.ndarray
@@ -370,11 +334,8 @@ class Weighed:
 
 
 def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: PoseStack) -> Weighed:
-    """Return the step of h poses that weights the points by the full covariance of their residuals.
-
-    ``residual`` : (h, n, 2) measured minus projected; ``by_pose`` : (h, n, 2, 6) negative derivative of the residuals
-    by left perturbations; ``covariance`` : (h, 2n, 2n).
-    """
+    """Return the step of h poses that weights the points by the full covariance (h, 2n, 2n) of their residuals (h, n,
+    2); ``by_pose`` : (h, n, 2, 6) negative derivatives by left perturbations."""
     h = len(residual)
     r, a = residual.reshape(h, -1, 1), by_pose.reshape(h, -1, 6)
     solved = np.linalg.solve(covariance, np.concatenate([a, r], axis=2))
@@ -389,12 +350,8 @@ def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, pos
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanePoses:
-    """The two poses camera_from_plane that agree with a homography about one point to first order.
-
-    ``poses`` : both poses; ``determinant`` : determinant of the homography's derivative at the point, in (normalised
-    coordinates per unit of the plane)²; ``foreshortening`` : cosine of the angle between the plane's normal and the
-    line of sight, independent of the size and distance of the plane.
-    """
+    """Both poses camera_from_plane that agree with a homography about a point to first order; the determinant of its
+    derivative there; and ``foreshortening``, the cosine between the plane's normal and the line of sight."""
 
     poses: tuple[Rigid, Rigid]
     determinant: float
@@ -404,10 +361,8 @@ class PlanePoses:
 def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:
     """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2).
 
-    The homography is computed by the normalised DLT, its derivative at the mean of the points. The Z axis of the plane
-    points away from the camera.
-
-    Raises DegenerateError: the points do not determine a homography, or the plane is seen edge-on or from behind.
+    The homography's derivative is taken at their mean. Z of the plane points away from the camera. DegenerateError: the
+    points determine no homography, or the plane is seen edge-on or from behind.
     """
     xy, xy_image = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
     middle = xy.mean(0)

@@ -27,8 +27,8 @@ PRIOR_LOGS = np.log(10.0)
 class PrintModes:
     """Smooth deviations of n points: ``modes`` (3n, m), orthonormal, and the σ of their coordinates, (m,) mm.
 
-    The size is not among them: it is stated, or the scale of all that is measured. ``affine`` : whether stretch and
-    shear are the first two, as points on a line tell neither; ``amplitude`` : factor on the σ of printers and paper.
+    The size is not among them. ``affine`` : whether stretch and shear are the first two, which points on a line do not
+    tell; ``amplitude`` : factor on the σ of printers and paper.
     """
 
     modes: np.ndarray
@@ -92,11 +92,8 @@ class PrintModes:
         return float(flat @ flat - along @ along) / sigma_mm**2, of_modes
 
     def as_found(self, off_mm: np.ndarray, covariance: np.ndarray, sigma_mm: float) -> "PrintModes":
-        """Return the modes with the amplitude that explains the deviations best.
-
-        ``off_mm`` : (n, 3) adjusted with this amplitude; ``covariance`` : (m, m) of the modes' coordinates after the
-        adjustment.
-        """
+        """Return the modes with the amplitude that explains deviations (n, 3), adjusted with this one, best;
+        ``covariance`` : (m, m) of the modes' coordinates after the adjustment."""
         told = Told(
             self.modes.T @ off_mm.ravel(), covariance, np.full(len(self.spread_mm), sigma_mm**2), self.spread_mm
         )
@@ -131,10 +128,8 @@ class Told:
 
 
 def found_amplitude(prints: Sequence[Told], amplitude: float) -> float:
-    """Return the amplitude that explains the modes of all prints best, by restricted maximum likelihood.
-
-    ``amplitude`` : the one of the adjustment. Where the data tell nothing, the answer stays near 1.
-    """
+    """Return the amplitude that explains the modes of all prints best, by restricted maximum likelihood, from the one
+    of the adjustment; near 1 where the data tell nothing."""
     images = []
     for each in prints:
         known = np.linalg.inv(each.covariance)

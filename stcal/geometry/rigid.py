@@ -126,11 +126,8 @@ class Rigid(ByValue):
 
     @classmethod
     def exp(cls, twist: ArrayLike) -> "Rigid":
-        """Return the transform of a rotation vector (rad) and a translation (mm), (6,).
-
-        It is not the SE(3) exponential of the twist, but the product perturbation ``(exp(w), t)`` in which the package
-        states pose covariances.
-        """
+        """Return the transform of a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential, but
+        the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
         motion = np.asarray(twist, float)
         return cls(Rotation.from_rotvec(motion[:3]).as_matrix(), motion[3:])
 
@@ -181,10 +178,8 @@ class Rigid(ByValue):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity(ByValue):
-    """A similarity a_from_b: ``xyz_a = scale * rotation @ xyz_b + translation``.
-
-    COLMAP's world has no unit; a transform out of it is a Similarity, so that forgetting the scale is a type error.
-    """
+    """A similarity a_from_b, ``xyz_a = scale * rotation @ xyz_b + translation``, as from COLMAP's world, which has no
+    unit."""
 
     scale: float
     rigid: Rigid
@@ -226,7 +221,7 @@ class Similarity(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Poses(ByValue, Brief):
+class Poses(Brief):
     """A stack of m transforms a_from_b.
 
     Parameters
@@ -235,11 +230,6 @@ class Poses(ByValue, Brief):
         Proper rotations, to 1e-6.
     translation : (m, 3) array
         Origins of b in a, mm.
-
-    Raises
-    ------
-    InputError
-        Arrays of other shapes, or matrices that are no rotations.
     """
 
     rotation: Array
@@ -263,13 +253,8 @@ class Poses(ByValue, Brief):
 
     @classmethod
     def from_matrices(cls, matrices: ArrayLike) -> "Poses":
-        """Return the transforms of homogeneous matrices (m, 4, 4), mm; rotations are projected onto SO(3).
-
-        Raises
-        ------
-        InputError
-            Another shape; or a matrix that is not finite, left-handed, scaled or transposed, named by its number.
-        """
+        """Return the transforms of homogeneous matrices (m, 4, 4), mm, with rotations projected onto SO(3); of one that
+        is not finite, left-handed, scaled or transposed the number is named."""
         rigid = []
         for number, matrix in enumerate(frozen(matrices, (None, None, None), "poses", finite=False), 1):
             try:
@@ -353,14 +338,7 @@ class Poses(ByValue, Brief):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Affine(ByValue):
-    """An affine transform a_from_b of twelve parameters.
-
-    Parameters
-    ----------
-    linear : (3, 3) array
-    translation : (3,) array
-        Image of b's origin in a, mm.
-    """
+    """An affine transform a_from_b of twelve parameters, ``linear`` (3, 3) and ``translation`` (3,), mm."""
 
     linear: Array
     translation: Array
@@ -376,13 +354,7 @@ class Affine(ByValue):
         return m
 
     def inverse(self) -> "Affine":
-        """Return b_from_a.
-
-        Raises
-        ------
-        DegenerateError
-            The linear part is singular.
-        """
+        """Return b_from_a; a singular linear part is refused."""
         if np.linalg.cond(self.linear) > 1e12:
             raise DegenerateError(
                 "E-AFFINE-SINGULAR", "affine transform: its 3×3 part is singular; an invertible one needed"
@@ -413,10 +385,8 @@ def other_axes(xyz: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
     """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
 
-    ``xyz_a``, ``xyz_b`` : (n, 3) arrays, n ≥ 3, not collinear; ``weights`` : (n,) not negative; the points of positive
-    weight must not be collinear.
-
-    Raises DegenerateError: fewer than three points, or collinear ones.
+    ``xyz_a``, ``xyz_b`` : (n, 3), n ≥ 3, those of positive weight not collinear, else DegenerateError; ``weights`` :
+    (n,)
     """
     return _align(xyz_a, xyz_b, weights, with_scale=False).rigid
 
@@ -427,10 +397,7 @@ def align_similarity(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray |
 
 
 def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Affine:
-    """Return a_from_b with twelve parameters by linear least squares; arguments as :func:`align_rigid`.
-
-    Raises DegenerateError: fewer than four points, or b's points are coplanar to rounding.
-    """
+    """Return a_from_b with twelve parameters by linear least squares, from four or more points off a plane."""
     a, b, w = _checked(xyz_a, xyz_b, weights, 4)
     mean_a, mean_b = w @ a, w @ b
     root = np.sqrt(w)[:, None]
@@ -443,10 +410,8 @@ def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | Non
 
 
 def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotations R, (..., 3, 3), that maximise tr(Rᵀ cross), and these maxima, (...).
-
-    ``cross`` : (..., 3, 3). If it is Σ wᵢ aᵢ bᵢᵀ of centred points, R is the rotation of a_from_b (Kabsch 1976).
-    """
+    """Return the rotations R that maximise tr(Rᵀ cross), (..., 3, 3), and these maxima: those of a_from_b if ``cross``
+    is Σ wᵢ aᵢ bᵢᵀ of centred points (Kabsch 1976)."""
     u, s, vt = np.linalg.svd(cross)
     sign = np.ones(s.shape)
     sign[..., 2] = np.sign(np.linalg.det(u @ vt))
@@ -509,10 +474,7 @@ class ImageFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainRigid:
-    """A transform a_from_b with ``covariance`` (6, 6) of its errors: R' = exp(w) R, t' = t + dt.
-
-    A covariance of zero means an exact transform.
-    """
+    """A transform a_from_b with ``covariance`` (6, 6) of its errors, R' = exp(w) R, t' = t + dt; zero if exact."""
 
     rigid: Rigid
     covariance: Array

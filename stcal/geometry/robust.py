@@ -25,14 +25,11 @@ TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
 
 
 def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
-    """Return the length that sound errors in two coordinates exceed with probability ``beyond``, from a sample.
+    """Return the length over σ that sound errors in two coordinates exceed with probability ``beyond``, from a sample
+    (n,).
 
-    Where σ are estimates, errors over σ have Student's distribution, and rare ones are longer than normal ones. Its
-    degrees of freedom are the fewest that the ratio of two quantiles of the sample admits. Both are far below gross
-    errors, which do not move them.
-
-    ``length`` : (n,) lengths of errors over their σ; ``beyond`` : probability; ``together`` : number of lengths that
-    share an error, so that the sample tells as much as one of n / ``together``.
+    Where σ are estimates, errors over σ have Student's distribution. Its degrees of freedom are the fewest that the
+    ratio of two quantiles admits, both far below gross errors. ``together`` : number of lengths that share an error.
     """
 
     def quantile(exceeded: float, freedom: float) -> float:
@@ -56,10 +53,8 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
 
 
 def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:
-    """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F.
-
-    ``freedom``, ``redundancy`` : degrees of freedom. The lower tail is used: it stays exact for small probabilities.
-    """
+    """Return the ratio of two variances that chance exceeds with probability ``beyond``: a quantile of F, by its lower
+    tail, which stays exact for small probabilities."""
     return float(1 / fdtri(redundancy, freedom, beyond))
 
 
@@ -80,19 +75,16 @@ def huber_cost(length: np.ndarray, limit: float) -> np.ndarray:
 
 
 def robust_sigma(length: np.ndarray, coordinates: int = 1, redundancy: float = 1.0) -> float:
-    """Return σ of one coordinate from the median of lengths (n,); up to half of them may be outliers.
+    """Return σ of one coordinate from the median of lengths (n,) over ``coordinates``, up to half of them outliers.
 
-    ``length`` : (n,) Absolute values, or lengths over ``coordinates``; ``coordinates`` : number of coordinates in each
-    length; ``redundancy`` : redundancy per observation: residuals are shorter than errors by its square root.
+    ``redundancy`` : per observation; residuals are shorter than errors by its square root.
     """
     return _median(length) / (median_length(coordinates) * np.sqrt(redundancy))
 
 
 def robust_sigmas(length: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Return :func:`robust_sigma` (n,) of each row of absolute values (n, m).
-
-    ``among`` : (n, m) mask of the values to use; σ is NaN for a row without any.
-    """
+    """Return :func:`robust_sigma` (n,) of each row of absolute values (n, m), of those ``among`` (n, m); NaN without
+    any."""
     ordered = np.sort(np.where(among, length, np.inf), axis=1)
     count = among.sum(1)
     middle = np.maximum(np.stack([(count - 1) // 2, count // 2], 1), 0)

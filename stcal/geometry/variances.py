@@ -19,15 +19,9 @@ def component_variances(
 ) -> np.ndarray:
     """Return restricted maximum-likelihood variances (f,) of covariances that are sums of components.
 
-    Parameters
-    ----------
-    residuals : (m, a) residuals near a solution
-    jacobian : (m, a, k) derivative of the residuals by the parameters solved for; dependent columns do no harm
-    known : (m, a, a) known part of the covariances
-    free : (f, m, a, a) components, each to be multiplied by its variance
-    first : (f,) initial variances
-    bounds : (f,) smallest and largest variances
-    caution : redundancy of each variance that is not counted
+    Of residuals (m, a) near a solution and their derivatives (m, a, k) by what was solved for; ``known`` : (m, a, a)
+    part of the covariances; ``free`` : (f, m, a, a) components, each to be multiplied by its variance, from ``first``
+    (f,) and within ``bounds``; ``caution`` : redundancy of each variance that is not counted.
     """
     flat = jacobian.reshape(-1, jacobian.shape[2])
     u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
@@ -55,8 +49,6 @@ def component_variances(
 
 
 def sigma_factor(square: float, redundancy: float) -> float:
-    """Return the factor on a σ that makes the normalised sum of squares equal its redundancy (Förstner 1979).
-
-    ``square`` : sum of squared residuals over σ². If other σ are estimated too, this is one step of an iteration.
-    """
+    """Return the factor on σ that makes the sum of squares over σ² equal its redundancy (Förstner 1979); one step of an
+    iteration if other σ are estimated too."""
     return float(np.sqrt(square / max(redundancy, 1.0)))

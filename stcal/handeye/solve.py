@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import require_fields
+from stcal.geometry.arrays import ByValue, require_fields
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
@@ -59,7 +59,7 @@ HELD_MM = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HandEyeOptions:
+class HandEyeOptions(ByValue):
     """Options of a hand-eye calibration: known errors, and further unknowns.
 
     Parameters

@@ -41,10 +41,8 @@ def made_by() -> str:
 
 
 def packed(key: str, arrays: Mapping[str, Any], meta: dict[str, Any]) -> bytes:
-    """Return the content of a file that :func:`kept` reads: arrays by name, and plain values ``meta``.
-
-    ``key`` : hash of all that the values were made from; the file's name without its suffix
-    """
+    """Return the content of a file that :func:`kept` reads: arrays by name, plain values ``meta``, and ``key``, the
+    hash of all that they were made from, by which the file is called."""
     content = {name: np.asarray(values) for name, values in arrays.items()}
     content[META] = _bytes(json.dumps(meta | {MADE_FROM: key}).encode())
     stream = io.BytesIO()
@@ -65,10 +63,8 @@ def keep_packed(path: Path, content: bytes) -> None:
 
 
 def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], R]) -> R | None:
-    """Return the result that ``make`` builds from the arrays and values of a file.
-
-    None if there is no such file; None, with a note, if it is damaged, edited, or was made from other inputs.
-    """
+    """Return the result that ``make`` builds from the arrays and values of a file; None if there is no such file, or,
+    with a note, if it is damaged, edited, or was made from other inputs."""
     try:
         if path.exists() and not path.is_file():  # a named pipe would never end
             raise ValueError("no file")

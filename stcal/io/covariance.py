@@ -48,12 +48,10 @@ class Fault:
 
 
 def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
-    """Return the fault of the first of many matrices that is not a covariance, None if all are.
+    """Return the fault of the first of m matrices (m, n, n) that is no covariance, None if all are.
 
-    A covariance is finite, symmetric and without negative eigenvalues, up to rounding. The eigenvalues of the
-    correlation matrix are tested, since the units of the rows differ.
-
-    ``matrices`` : (m, n, n); ``definite`` : True if eigenvalues must be positive, since the matrix will be inverted.
+    A covariance is finite, symmetric and without negative eigenvalues of its correlations, up to rounding; without any
+    that are not positive if it will be inverted, ``definite``.
     """
     size = matrices.shape[-1]
     nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)

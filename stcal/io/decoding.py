@@ -67,8 +67,8 @@ TRIED_PX = 1024
 def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
     """Return the patterns that a grey image may be a mosaic of: two, as red and blue look alike; none if it is none.
 
-    In a mosaic both greens, on one diagonal of each 2×2 pixels, are alike, and another colour differs from them all
-    over the image. Medians hide what the scene adds, as it favours no pixel of the four.
+    Both greens, on one diagonal of each 2×2 pixels, are alike, and another colour differs all over the image, which
+    medians show: the scene favours no pixel of the four.
     """
     height, width = (min(side, TRIED_PX) // 2 * 2 for side in image.shape)
     if not height or not width:

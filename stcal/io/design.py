@@ -20,16 +20,13 @@ from stcal.design import (
     board_lengths,
     reference_board,
     reference_target,
-    require_board,
-    require_distinct,
-    require_face,
-    require_ids,
 )
-from stcal.errors import InputError
+from stcal.errors import InputError, named
+from stcal.geometry.plane import inside
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string
-from stcal.lengths import radius, require_millimetres, stated_unusual
+from stcal.lengths import radius, stated_unusual
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
@@ -106,8 +103,6 @@ def _kind_of_face(face: Any) -> str:
 
 
 class _ScaleFile(Strict):
-    """A known distance between two points."""
-
     first: str = Field(alias="from")
     second: str = Field(alias="to")
     mm: Positive
@@ -184,8 +179,7 @@ class SizeEntry(Strict):
 
     def stated(self) -> StatedSize:
         """Return the values as a :class:`StatedSize`, the input of the error budget."""
-        values = {entry.name: getattr(self, entry.name, None) for entry in fields(StatedSize)}
-        return StatedSize(**{key: None if value is None else float(value) for key, value in values.items()})
+        return StatedSize(**self.model_dump(include={entry.name for entry in fields(StatedSize)}))
 
 
 Place = Annotated[int, Field(ge=0, le=999, strict=True)]
@@ -235,6 +229,8 @@ class BoardEntry(BoardSizeEntry):
     rings: Rings = ()
 
 
+OF_DESIGN = {"rows", "columns", "pitch_mm", "radius_mm", "polarity", "sigma_mm", "unusual_size", "rim_mm"}
+"""Keys of a board file that are fields of the design."""
 PrintedReader = Callable[[PrintedFaceFile, bool, str], FaceDesign]
 """Makes a face from its entry; ``True`` if the file states an unusual size; and the beginning of messages."""
 
@@ -243,23 +239,10 @@ def load_target(path: str | Path, printed: PrintedReader | None = None) -> Targe
     """Read ``target.toml`` (form: ``data_layout.md``).
 
     ``printed`` : reads faces with a board or tags, which :func:`stcal.boards.target.load_body` does; they are refused
-    if it is None.
-
-    Raises
-    ------
-    InputError
-        Unknown or missing keys, duplicate ids, overlapping circles, frame circles that are missing, collinear,
-        or left-handed, faces that look the same; the message names the file and the place.
+    if it is None. The message of an InputError names the file and the place.
     """
     data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
-    of_circles = [face for face in data.face if isinstance(face, _FaceFile)]
-    require_millimetres(
-        [radius(f"radius_mm of circle {face.id}:{c.id}", c.radius_mm) for face in of_circles for c in face.circles],
-        data.unusual_size,
-        where,
-    )
-    require_ids([face.id for face in data.face], where)
     faces = []
     for face in data.face:
         of_face = f"{where}: face {face.id}"
@@ -273,9 +256,9 @@ def load_target(path: str | Path, printed: PrintedReader | None = None) -> Targe
             )
         else:
             faces.append(printed(face, data.unusual_size, of_face))
-    require_distinct([face for face in faces if face.printed is None], where)
-    distances = tuple(_distance(entry, faces, where) for entry in data.scale)
-    return TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size, distances)
+    with named(where, f"target {data.name}"):
+        target = TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size)
+    return replace(target, distances=tuple(_distance(entry, faces, where) for entry in data.scale))
 
 
 def _distance(entry: _ScaleFile, faces: Sequence[FaceDesign], where: str) -> KnownDistance:
@@ -316,24 +299,17 @@ def _require_dots(path: str | Path) -> None:
 
 def board_design(data: BoardEntry, where: str) -> BoardDesign:
     """Return the board of an entry; the message of an InputError begins with ``where``."""
-    require_millimetres(board_lengths(data.pitch_mm, data.radius_mm), data.unusual_size, where)
-    corner = None if data.corner is None else (data.corner.row, data.corner.column)
-    corner_mm = None if data.corner is None else data.corner.radius_mm
-    require_board(data.rows, data.columns, data.pitch_mm, data.radius_mm, corner, corner_mm, where)
-    return BoardDesign(
-        data.rows,
-        data.columns,
-        data.pitch_mm,
-        data.radius_mm,
-        data.polarity,
-        data.sigma_mm,
-        corner,
-        corner_mm,
-        data.stated(),
-        data.unusual_size,
-        data.rim_mm,
-        rings_of(data.rings, data.rows, data.columns, True, where),
-    )
+    corner = data.corner
+    same = data.model_dump(include=OF_DESIGN)
+    rings = rings_of(data.rings, data.rows, data.columns, True, where)
+    with named(where, "board"):
+        return BoardDesign(
+            **same,
+            corner=corner and (corner.row, corner.column),
+            corner_radius_mm=corner and corner.radius_mm,
+            stated=data.stated(),
+            rings=rings,
+        )
 
 
 def target_of(given: str | Path | TargetDesign | None) -> TargetDesign:
@@ -347,31 +323,36 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
 
 
 def _face(face: _FaceFile, where: str) -> FaceDesign:
-    ids = [circle.id for circle in face.circles]
+    """Return the face of an entry, whose places are in the frame of a drawing, in its own frame."""
     xy = np.array([[circle.x_mm, circle.y_mm] for circle in face.circles])
-    radius = np.array([circle.radius_mm for circle in face.circles])
-    require_face(ids, xy, radius, (face.origin, face.x, face.y), where)
-    origin, x = (xy[ids.index(key)] for key in (face.origin, face.x))
-    axis = (x - origin) / np.linalg.norm(x - origin)
-    face_from_drawing = np.array([axis, [-axis[1], axis[0]]])
-    rough = None
+    rims = [face.rim_mm if circle.rim_mm is None else circle.rim_mm for circle in face.circles]
+    with named(where, f"face {face.id}"):
+        drawn = FaceDesign(
+            face.id,
+            tuple(circle.id for circle in face.circles),
+            xy,
+            [circle.radius_mm for circle in face.circles],
+            face.origin,
+            face.x,
+            face.y,
+            rim_mm=None if rims == [None] * len(rims) else np.array([rim or 0.0 for rim in rims]),
+        )
+    origin, x = xy[drawn.ids.index(face.origin)], xy[drawn.ids.index(face.x)]
+    along = (x - origin) / np.linalg.norm(x - origin)
+    face_from_drawing = np.array([along, [-along[1], along[0]]])
+    rough = outline = None
     if face.rough_pose is not None:
         drawing_from_face = np.eye(3)
         drawing_from_face[:2, :2] = face_from_drawing.T
         rough = _rough_pose(face.rough_pose, where) @ Rigid(drawing_from_face, np.append(origin, 0.0))
-    xy_face = (xy - origin) @ face_from_drawing.T
-    outline = None
     if face.outline_mm is not None:
-        _require_inside(ids, xy, radius, np.array(face.outline_mm), where)
-        outline = (np.array(face.outline_mm) - origin) @ face_from_drawing.T
-    stated = [face.rim_mm if circle.rim_mm is None else circle.rim_mm for circle in face.circles]
-    design = FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline)
-    if all(rim is None for rim in stated):
-        return design
-    return replace(design, rim_mm=np.array([rim or 0.0 for rim in stated]))
+        outline = np.array(face.outline_mm)
+        _require_inside(drawn, outline, where)
+        outline = (outline - origin) @ face_from_drawing.T
+    return replace(drawn, xy_mm=(xy - origin) @ face_from_drawing.T, rough_target_from_face=rough, outline_mm=outline)
 
 
-def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline: np.ndarray, where: str) -> None:
+def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
     """Refuse circles that extend beyond the outline of their plate."""
     side = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(side, axis=1)
@@ -380,18 +361,13 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
             "E-TARGET-OUTLINE",
             f"{where}: outline_mm has the same corner twice; corners in order around the plate needed",
         )
-    from_corner = xy[:, None] - outline
+    from_corner = face.xy_mm[:, None] - outline
     along = ((from_corner * side).sum(2) / length**2).clip(0, 1)
-    gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - radius
-    above = outline[:, 1] > xy[:, 1:]
-    crossed = above != np.roll(above, -1, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = outline[:, 0] + (xy[:, 1:] - outline[:, 1]) * side[:, 0] / side[:, 1]
-    inside = (crossed & (xy[:, :1] < at)).sum(1) % 2 == 1
-    for name in (name for name, ok in zip(ids, inside & (gap >= 0), strict=True) if not ok):
+    gap = np.linalg.norm(from_corner - along[..., None] * side, axis=2).min(1) - face.radius_mm
+    for i in np.flatnonzero(~inside(outline, face.xy_mm) | (gap < 0))[:1]:
         raise InputError(
             "E-TARGET-OUTLINE",
-            f"{where}: circle {name} reaches beyond outline_mm; corners in order around all circles needed",
+            f"{where}: circle {face.ids[i]} reaches beyond outline_mm; corners in order around all circles needed",
         )
 
 
@@ -421,59 +397,51 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
 
 
 def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
-    """Return the text of a ``target.toml`` for ``target``, with comments.
-
-    ``printed`` : returns the lines of the board or tags of a face, needed if the target has such faces.
-    """
-    round_ = [
-        "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
-        "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+    """Return the text of a ``target.toml``, with comments; ``printed`` : returns the lines of a face's board or tags."""
+    of_circles = any(face.printed is None for face in target.faces)
+    lines = ["# A body with tags or boards on its faces. Lengths in mm."]
+    if of_circles:
+        lines = [
+            "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
+            "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+        ]
+    lines += ["# Faces of tags or boards: seen from outside X to the right, Y down."] * target.has_printed
+    lines += [f"name = {toml_string(target.name)}", f'polarity = "{target.polarity}"']
+    lines[-1] += '  # circles are "bright" or "dark" against what surrounds them' * of_circles
+    lines += stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm)
+    scales = [
+        f"  {{ from = {toml_string(known.first)}, to = {toml_string(known.second)}, mm = {_number(known.mm)}, "
+        f"sigma_mm = {_number(known.sigma_mm)}{', drawn = true' * known.drawn} }},"
+        for known in target.distances
     ]
-    printed_alone = all(face.printed is not None for face in target.faces)
-    of_circles = '  # circles are "bright" or "dark" against what surrounds them'
-    lines = [
-        *(["# A body with tags or boards on its faces. Lengths in mm."] if printed_alone else round_),
-        *(["# Faces of tags or boards: seen from outside X to the right, Y down."] if target.has_printed else []),
-        f"name = {toml_string(target.name)}",
-        f'polarity = "{target.polarity}"' + of_circles * (not printed_alone),
-        *stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm),
-    ]
-    scales: list[str] = []
-    for known in target.distances:
-        ends = f"from = {toml_string(known.first)}, to = {toml_string(known.second)}"
-        drawn = ", drawn = true" if known.drawn else ""
-        scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)}{drawn} }},")
     lines += ["scale = [", *scales, "]"] if scales else []
     for face in target.faces:
         lines += ["", "[[face]]", f"id = {toml_string(face.id)}"]
+        pose, outline = face.rough_target_from_face, []
+        if face.outline_mm is not None:
+            corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in face.outline_mm.tolist())
+            outline = [f"outline_mm = [{corners}]  # corners of its plate, for `draw`"]
         if face.printed is not None:
             assert printed is not None, "faces with a board or tags are written by stcal.boards.target"
-            pose = _rough_lines(face.rough_target_from_face @ INWARDS) if face.rough_target_from_face else []
-            lines += [*pose, *_outline_lines(face.outline_mm), *printed(face)]
+            lines += [*(_rough_lines(pose @ INWARDS) if pose else []), *outline, *printed(face)]
             continue
         lines += [
             "# The face frame: origin at one circle, X through a second one, Y on the side of a third, Z outwards.",
             f"origin = {toml_string(face.origin)}",
             f"x = {toml_string(face.x)}",
             f"y = {toml_string(face.y)}",
-            *_rough_lines(face.rough_target_from_face),
-            *_outline_lines(face.outline_mm),
+            *_rough_lines(pose),
+            *outline,
             "circles = [",
         ]
+        rims = [""] * len(face.ids) if face.rim_mm is None else [f", rim_mm = {_number(rim)}" for rim in face.rim_mm]
         lines += [
             f"  {{ id = {toml_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, "
             f"radius_mm = {_number(r)}{rim} }},"
-            for circle, (x, y), r, rim in zip(face.ids, face.xy_mm, face.radius_mm, _rims(face), strict=True)
+            for circle, (x, y), r, rim in zip(face.ids, face.xy_mm, face.radius_mm, rims, strict=True)
         ]
         lines += ["]"]
     return "\n".join(lines) + "\n"
-
-
-def _rims(face: FaceDesign) -> list[str]:
-    """Returns the key of each circle's rim, empty where the design states none."""
-    if face.rim_mm is None:
-        return [""] * len(face.ids)
-    return [f", rim_mm = {_number(height)}" for height in face.rim_mm]
 
 
 def _rough_lines(pose: Rigid | None) -> list[str]:
@@ -483,18 +451,9 @@ def _rough_lines(pose: Rigid | None) -> list[str]:
     ]
     if pose is None:
         return [*about, "# rough_pose = { origin_mm = [0.0, 0.0, 0.0], x = [1.0, 0.0, 0.0], normal = [0.0, 0.0, 1.0] }"]
-    place, x, normal = (
-        f"[{', '.join(map(_number, values))}]"
-        for values in (pose.translation, pose.rotation[:, 0], pose.rotation[:, 2])
-    )
+    vectors = pose.translation, pose.rotation[:, 0], pose.rotation[:, 2]
+    place, x, normal = (f"[{', '.join(map(_number, values))}]" for values in vectors)
     return [*about, f"rough_pose = {{ origin_mm = {place}, x = {x}, normal = {normal} }}"]
-
-
-def _outline_lines(outline: np.ndarray | None) -> list[str]:
-    if outline is None:
-        return []
-    corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in np.asarray(outline).tolist())
-    return [f"outline_mm = [{corners}]  # corners of its plate, for `draw`"]
 
 
 def board_toml(board: BoardDesign) -> str:
@@ -502,32 +461,28 @@ def board_toml(board: BoardDesign) -> str:
     corner = board.corner or (0, 0)
     corner_radius = board.corner_radius_mm or 1.5 * board.radius_mm
     prefix = "" if board.corner else "# "
-    sizes = [(entry.name, getattr(board.stated, entry.name)) for entry in fields(StatedSize)]
-    return (
-        "\n".join(
-            [
-                "# A rectangular grid of dots. Dot (row 0, column 0) is the origin, columns run along X, rows along Y.",
-                f"rows = {board.rows}",
-                f"columns = {board.columns}",
-                f"pitch_mm = {_number(board.pitch_mm)}",
-                f"radius_mm = {_number(board.radius_mm)}",
-                f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
-                f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
-                *([f"rim_mm = {_number(board.rim_mm)}  # height of rims before the dots"] if board.rim_mm else []),
-                *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
-                *([f"rings = {list(map(list, board.rings))}  # dots with a hole"] if board.rings else []),
-                *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
-                "",
-                "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
-                "# same after half a turn, which a run settles by comparing the images of a group.",
-                f"{prefix}[corner]",
-                f"{prefix}row = {corner[0]}",
-                f"{prefix}column = {corner[1]}",
-                f"{prefix}radius_mm = {_number(corner_radius)}",
-            ]
-        )
-        + "\n"
-    )
+    sizes = {entry.name: getattr(board.stated, entry.name) for entry in fields(StatedSize)}
+    lines = [
+        "# A rectangular grid of dots. Dot (row 0, column 0) is the origin, columns run along X, rows along Y.",
+        f"rows = {board.rows}",
+        f"columns = {board.columns}",
+        f"pitch_mm = {_number(board.pitch_mm)}",
+        f"radius_mm = {_number(board.radius_mm)}",
+        f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
+        f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
+        *([f"rim_mm = {_number(board.rim_mm)}  # height of rims before the dots"] if board.rim_mm else []),
+        *(f"{key} = {_number(value)}" for key, value in sizes.items() if value is not None),
+        *([f"rings = {list(map(list, board.rings))}  # dots with a hole"] if board.rings else []),
+        *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
+        "",
+        "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
+        "# same after half a turn, which a run settles by comparing the images of a group.",
+        f"{prefix}[corner]",
+        f"{prefix}row = {corner[0]}",
+        f"{prefix}column = {corner[1]}",
+        f"{prefix}radius_mm = {_number(corner_radius)}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _number(value: float) -> str:

@@ -55,11 +55,6 @@ class OpenCVSource:
         Its number, or a path such as ``/dev/video0``.
     gain : float, optional
         Gain in the driver's unit; unchanged if None.
-
-    Raises
-    ------
-    InputError
-        There is no such camera, or its driver accepts no gain.
     """
 
     def __init__(self, device: str, gain: float | None = None):
@@ -110,16 +105,10 @@ class SimulatedSource:
     Parameters
     ----------
     image : str or Path
-        The image.
     gain : float, optional
         Factor on the brightness; 1 if None.
     seed : int
         Seed of the noise.
-
-    Raises
-    ------
-    InputError
-        The image cannot be read.
     """
 
     def __init__(self, image: str | Path, gain: float | None = None, seed: int = 0):
@@ -151,14 +140,10 @@ def png(image: np.ndarray) -> bytes:
 
 @contextmanager
 def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
-    """Open a camera, a stream, a video file or a folder of images, and return its pictures, grey.
+    """Open a camera by number, a stream by URL, a video file or a folder of images, and return its pictures, grey.
 
-    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is.
-
-    ``source`` : number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), a video file, or a
-    folder, whose images come in order of name.
-
-    Raises InputError: it cannot be opened or gives no picture; in between, if no picture comes for ``PATIENCE_S``.
+    Pictures of a camera or a stream that come while one is measured are left out; of a file or a folder none is. Raises
+    InputError: it cannot be opened or gives no picture, or none for ``PATIENCE_S`` in between.
     """
     if isinstance(source, str) and Path(source).is_dir():
         paths = [file.path for file in find_images(source)[0]]
@@ -232,7 +217,6 @@ def _grey(frame: np.ndarray) -> np.ndarray:
 
 
 def _every(device: cv2.VideoCapture) -> Generator[np.ndarray, None, None]:
-    """Yield each picture of a video file."""
     while (read := device.read())[0]:
         yield _grey(read[1])
 

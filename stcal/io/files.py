@@ -9,7 +9,6 @@ import stat
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,10 +31,7 @@ MODEL_BYTES = 1000 * MB
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
-    """Return the whole content of a file.
-
-    Raises OSError: it cannot be read, or is larger than ``most`` bytes.
-    """
+    """Return the whole content of a file; raise OSError if it cannot be read, or is larger than ``most`` bytes."""
     chunks, remaining = [], most + 1
     with open(path, "rb") as stream:
         step = max(os.fstat(stream.fileno()).st_size + 1, MB)  # `read` allocates as much memory as it is asked for
@@ -48,20 +44,14 @@ def read_bytes(path: str | Path, most: int) -> bytes:
 
 
 def text_of(content: bytes) -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
-
-    Raises UnicodeDecodeError: it is neither.
-    """
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed."""
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = content.decode("utf-16" if wide else "utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def require_size(path: str | Path, most: int) -> None:
-    """Refuse a file that is too large; for files that another program's library reads.
-
-    Raises OSError: the file is larger than ``most`` bytes.
-    """
+    """Raise OSError for a file of more than ``most`` bytes, which another program's library is to read."""
     if Path(path).stat().st_size > most:
         raise _too_large(path, most)
 
@@ -148,29 +138,11 @@ def require_new_folder(out: Path, images: Path) -> None:
 def require_written(
     path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike", most: float, unit: str
 ) -> None:
-    """Read a written file again, and require that it gives the values that were reported.
+    """Read a written file with the reader of later commands, and require that it gives the values that were reported.
 
-    Parameters
-    ----------
-    path : the file, for the message
-    read : reads the file with the reader of later commands, and returns what it predicts
-    reported : the same quantity from the result in memory; nan where there is none
-    most : largest difference of one value: rounding by the decimals of the file
-    unit : unit of the values
-
-    Raises ConvergenceError: the file cannot be read again, or gives other values.
+    ``reported`` : the same quantity from the result in memory, nan where there is none; ``most`` : largest difference,
+    rounding by the decimals of the file; ``unit`` : of the values. Raises ConvergenceError.
     """
-    difference = _difference(path, read, reported)
-    if not difference <= most:
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
-            f"{most:g} allowed; do not use the file, and report this with its data",
-        )
-
-
-def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
-    """Returns the largest difference between a file and the reported values; infinite for another shape."""
     import numpy as np
 
     try:
@@ -181,9 +153,14 @@ def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "Ar
             f"{path}: written, and cannot be read again: {error}; do not use the file, and report this with its data",
         ) from error
     reported = np.asarray(reported, float)
-    if again.shape != reported.shape or (np.isnan(again) != np.isnan(reported)).any():
-        return float("inf")
-    return float(np.nanmax(np.abs(again - reported), initial=0.0))
+    comparable = again.shape == reported.shape and not (np.isnan(again) != np.isnan(reported)).any()
+    difference = float(np.nanmax(np.abs(again - reported), initial=0.0)) if comparable else np.inf
+    if not difference <= most:
+        raise ConvergenceError(
+            "E-WRITTEN-DIFFERS",
+            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
+            f"{most:g} allowed; do not use the file, and report this with its data",
+        )
 
 
 def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:
@@ -221,10 +198,7 @@ def own_digest(content: dict) -> str:
 
 
 def require_unchanged(path: str | Path) -> None:
-    """Refuses a file of a run's folder that is not as the run left it, by the hash that the run's marker holds.
-
-    Files elsewhere, and those of runs without hashes, pass.
-    """
+    """Refuses a file of a run's folder that is not as the run left it, by the hash in the run's marker; others pass."""
     path = Path(path)
     run = path.parent if (path.parent / RUN_MARKER).is_file() else path.parent.parent
     name = path.relative_to(run).as_posix()
@@ -243,8 +217,9 @@ def require_unchanged(path: str | Path) -> None:
 def json_text(content) -> str:
     """Return the text of a JSON file in the package's form; ``content`` : dict or ``stcal.io.json.ResultFile``."""
     plain = content if isinstance(content, dict) else content.content()
-    text = _indented(plain, "\n")
-    text = (text if len(text) < COMPACT_FROM else _encode(plain)) + "\n"
+    text = json.dumps(plain, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    if len(text) > COMPACT_FROM:
+        text = json.dumps(plain, separators=(",", ":"), ensure_ascii=False, allow_nan=False) + "\n"
     if len(text) > TABLE_BYTES:
         raise InputError(
             "E-OUTPUT-SIZE",
@@ -253,41 +228,9 @@ def json_text(content) -> str:
     return text
 
 
-_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
-PLAIN = {float, int, bool, type(None)}
-"""Types whose text holds neither a comma nor a bracket."""
-
-
-def _indented(value, line: str) -> str:
-    """Return ``json.dumps`` with ``indent=1``, faster: lists of numbers at once; ``line`` : break and indent."""
-    inner = line + " "
-    if isinstance(value, dict):
-        items = [f"{_key(key)}: {_indented(item, inner)}" for key, item in value.items()]
-        return f"{{{inner}{f',{inner}'.join(items)}{line}}}" if items else "{}"
-    if not isinstance(value, list | tuple):
-        return _encode(value)
-    if not value:
-        return "[]"
-    kinds = set(map(type, value))
-    if kinds <= PLAIN:
-        return f"[{inner}{_encode(value)[1:-1].replace(',', f',{inner}')}{line}]"
-    if kinds == {list} and all(value) and set(map(type, chain.from_iterable(value))) <= PLAIN:
-        ends, between = f"{inner}]", f"{inner} "
-        rows = _encode(value)[2:-2].replace(",", f",{between}").replace(f"],{between}[", f"{ends},{inner}[{between}")
-        return f"[{inner}[{between}{rows}{ends}{line}]"
-    return f"[{inner}{f',{inner}'.join([_indented(item, inner) for item in value])}{line}]"
-
-
-def _key(key) -> str:
-    """Return a key as ``json.dumps`` writes it: numbers in quotes."""
-    return _encode(key) if isinstance(key, str) else _encode({key: 0})[1:-3]
-
-
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
-    """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
-
-    ``outputs``, ``inputs`` : (option, path); an input may be a folder.
-    """
+    """Refuse, before the work, outputs (option, path) that would replace an input, a file in an input folder, or each
+    other."""
     places: dict[Path, str] = {}
     for option, path in outputs:
         place = real_place(path)

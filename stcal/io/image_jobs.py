@@ -18,12 +18,10 @@ _elsewhere: ContextVar[tuple[Executor, int, bool] | None] = ContextVar("executor
 
 @contextlib.contextmanager
 def spread(executor: Executor, at_once: int, send_images: bool = False) -> Iterator[None]:
-    """Let an executor run the jobs on single images, detection and ``measure``, inside the ``with`` block.
+    """Let an executor, which stays open, run the jobs on single images inside the ``with`` block; results are the same.
 
-    The executor stays open. With the same libraries, results equal those of local processes bit by bit.
-
-    ``at_once`` : number of images that are handed over at a time; it bounds the memory for their contents;
-    ``send_images`` : True sends images with their content; False sends paths on storage that all machines share.
+    ``at_once`` : number of images that are handed over at a time; ``send_images`` : whether by content, and not by
+    their path on storage that all machines share.
     """
     token = _elsewhere.set((executor, at_once, send_images))
     try:
@@ -37,12 +35,9 @@ def run_on_images(
 ) -> Iterator[tuple[int, R]]:
     """Yield index and result of each job, run by :func:`stcal.parallel.run_parallel` or the executor of :func:`spread`.
 
-    The first argument of a job is an image file, or a list of them; a job needs nothing else of this machine.
-
-    ``kept`` : True if the caller keeps finished results, so that a second try continues there.
-
-    Raises DetectionError: a process was ended from outside. Raises InputError: a worker does not see the folder of an
-    image that it should read.
+    The first argument of a job is an image file, or a list of them. ``kept`` : True if the caller keeps finished
+    results, so that a second try continues there. Raises DetectionError: a process was ended from outside. Raises
+    InputError: a worker does not see the folder of an image.
     """
     if current := _elsewhere.get():
         executor, at_once, send_images = current

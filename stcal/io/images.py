@@ -65,11 +65,8 @@ _STANDARD_ERROR = threading.Lock()
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """An image file.
-
-    ``name`` : path below the image folder, with forward slashes; ``content`` : bytes of the file if they are carried
-    along to a machine that does not see the path, else None.
-    """
+    """An image file; ``name`` : path below the image folder, with forward slashes; ``content`` : its bytes if they are
+    carried along to a machine that does not see the path."""
 
     path: Path
     name: str
@@ -79,12 +76,8 @@ class ImageFile:
     def read(self) -> bytes:
         """Return the content of the file.
 
-        Raises
-        ------
-        InputError
-            The file is gone. A result without it would be another one than was asked for.
-        OSError
-            The file cannot be read, or is too large for an image.
+        Raises InputError: it is gone, and a result without it would be another one than was asked for. Raises OSError:
+        it cannot be read, or is too large for an image.
         """
         if self.content is not None:
             return self.content
@@ -149,10 +142,7 @@ def _refuse_mosaics(files: Sequence[ImageFile]) -> None:
 
 
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
-    """Return the image files below ``folder``, sorted by group and name, and the files that are skipped.
-
-    ``folder`` : it may also be a single image.
-    """
+    """Return the image files below a folder, or the one image, by group and name, and the files that are skipped."""
     root = Path(folder)
     files: list[ImageFile] = []
     skipped: list[Skipped] = []
@@ -190,10 +180,8 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
 
 
 def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list[ImageFile], list[Skipped]]:
-    """Return the result of :func:`find_images` with the images ``exclude`` moved to the skipped files.
-
-    ``exclude`` : names of images in results (``12/IMG_1003.jpg``), or their paths.
-    """
+    """Return the result of :func:`find_images` with the images ``exclude``, by their names in results or their paths,
+    moved to the skipped files."""
     return without_excluded(*find_images(folder), exclude, folder)
 
 
@@ -254,10 +242,11 @@ def name_fault(name: str) -> str | None:
 
 
 def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes.
+    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes, with pixels as the sensor gave
+    them.
 
-    EXIF orientation is ignored: pixels are as the sensor gave them. Only where ``size``, width and height of the
-    camera's images, is given and the image has its sides swapped, the image is turned as its EXIF says.
+    Only where the camera's ``size``, width and height, is given and the image has its sides swapped, it is turned as
+    its EXIF says.
     """
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
@@ -340,7 +329,6 @@ def _turn(data: bytes) -> int | None:
 
 
 def _tag(data: bytes, tag: int) -> object:
-    """Return a tag of a TIFF or of EXIF; None if there is none."""
     try:
         with Image.open(BytesIO(data)) as image:
             return image.getexif().get(tag)
@@ -349,10 +337,8 @@ def _tag(data: bytes, tag: int) -> object:
 
 
 def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | None:
-    """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable.
-
-    Raises InputError: two sizes are equally frequent, so that the order of the files would decide.
-    """
+    """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable,
+    an error if two sizes are equally frequent, so that the order of the files would decide."""
     with_size: dict[tuple[int, int], list[ImageFile]] = {}
     for file in files:
         try:
@@ -477,12 +463,10 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two grey images are two files of one exposure.
+    """Return True if two grey images are two files of one exposure, of equal noise but for losses by compression.
 
-    Such files share their noise, except for losses by compression. The noise of two exposures from one place is
-    independent: they differ by √2 times the noise.
-
-    ``image``, ``other`` : (height, width) their brightness may differ by a factor and a constant.
+    The noise of two exposures from one place differs by √2 times itself. Brightness may differ by a factor and a
+    constant.
     """
     if image.shape != other.shape:
         return False

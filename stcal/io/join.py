@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import ByValue, require_arguments
 from stcal.geometry.rigid import Order
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
 
@@ -17,7 +17,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Joined:
+class Joined(ByValue):
     """Two tables in one.
 
     Parameters
@@ -34,26 +34,17 @@ class Joined:
 
 @require_arguments
 def load_table(path: str | Path, quaternions: Order = "wxyz", what: str = "table") -> Table:
-    """Reads a table.
+    """Reads a table, CSV or another text file, for any function that takes one; units are in the names of its columns.
 
     Parameters
     ----------
     path : str or Path
-        CSV or another text file.
     quaternions : {"wxyz", "xyzw"}
         ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
     what : str
         What the file holds, for messages.
 
-    Returns
-    -------
-    Table
-        For any function that reads a table. Units are in the names of its columns.
-
-    Raises
-    ------
-    InputError
-        The file is no table, a column is missing, or a row has another length.
+    Raises InputError: the file is no table, a column is missing, or a row has another length.
     """
     return read_table(path, what, quaternions)
 
@@ -66,7 +57,7 @@ def join_tables(
     prefixes: tuple[str, str] = ("", ""),
     quaternions: Order = "wxyz",
 ) -> Joined:
-    """Returns the rows of two tables that have the same key, side by side.
+    """Returns the rows of two tables that have the same key, side by side, in the order and lines of ``a``.
 
     Parameters
     ----------
@@ -77,21 +68,12 @@ def join_tables(
     prefixes : (str, str)
         Prefix for the columns of a pose or a position in each table, ``x_mm`` to ``qz`` and covariances: ``("a", "b")``
         for a registration, ``("base_from_flange_", "camera_from_board_")`` for hand-eye, ``("commanded_", "")`` to
-        verify a robot. Other columns keep their names; if both tables have a column of that name, the one of ``a`` is
-        used.
+        verify a robot. Other columns keep their names; of two of one name, that of ``a`` is used.
     quaternions : {"wxyz", "xyzw"}
-        ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
+        As of :func:`load_table`.
 
-    Returns
-    -------
-    Joined
-        The rows have the order and the line numbers of ``a``.
-
-    Raises
-    ------
-    InputError
-        A file is no table or lacks the key column, a key occurs twice, no key is common to both, or both files have
-        the same pose column.
+    Raises InputError: a file is no table or lacks the key column, a key occurs twice, no key is common to both, or both
+    files have the same pose column.
     """
     tables = [read_table(source, "table", quaternions) for source in (a, b)]
     a, b = (source.where if isinstance(source, Table) else source for source in (a, b))
@@ -142,20 +124,11 @@ def stack_tables(
     ----------
     tables : sequence of Table
     names : sequence of str
-        Name of each table, written into the new column ``column``.
+        Different names of the tables, written into the new column.
     called : dict of str, optional
         Second names of some columns, by which copies of these are added: ``{"pose": "image"}``.
     column : str
         Name of the new column.
-
-    Returns
-    -------
-    Table
-
-    Raises
-    ------
-    InputError
-        A name occurs twice.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -35,11 +35,8 @@ def mistake(reason: object) -> PydanticCustomError:
 def first_mistake(
     error: ValidationError, where: str = "", missing: str = "key missing; add it", top: Collection[str] = ()
 ) -> InputError:
-    """Return the error that names the first mistake, ``where: place: reason``, and the number of further mistakes.
-
-    ``missing`` : reason for a key that is missing; ``top`` : keys before the first table, which belong to it if they
-    stand after its head.
-    """
+    """Return the error that names the first mistake, ``where: place: reason``, and the number of further mistakes;
+    ``missing`` : reason for a missing key; ``top`` : keys before the first table, which belong to it after its head."""
     first = error.errors()[0]
     keys = [part for part in first["loc"] if not str(part).startswith("<")]  # not which kind of entry it was taken for
     place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in keys)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import ByValue
 from stcal.geometry.rigid import UNIT_WITHIN, Order, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
@@ -30,7 +31,7 @@ POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Table:
+class Table(ByValue):
     """The rows of a table, as of :func:`stcal.load_table`.
 
     Parameters
@@ -169,10 +170,8 @@ class Table:
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
-        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`; None if there are no such columns.
-
-        Raises InputError: only some of the columns exist, or a matrix is not positive definite.
-        """
+        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`, positive definite; None if there are
+        none."""
         names = [prefix + name for name in COVARIANCE]
         if not any(name in self for name in names):
             return None
@@ -184,10 +183,8 @@ class Table:
         return full
 
     def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
-        """Refuse covariances (m, n, n) of the rows unless all are positive definite.
-
-        Raises InputError: the message names the first bad line and its fault.
-        """
+        """Refuse covariances (m, n, n) of the rows unless all are positive definite, by the first bad line and its
+        fault."""
         fault = first_fault(full, rows, definite=True)
         if fault is not None:
             raise InputError(
@@ -198,9 +195,7 @@ class Table:
     def common_errors(self, covariance: np.ndarray | None, prefix: str = "") -> np.ndarray | None:
         """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
 
-        ``prefix`` : text with which the names of these columns begin.
-
-        Raises InputError: only some of the columns exist, or they exceed the covariance (m, 6, 6), which includes them.
+        ``prefix`` : of these columns' names. The covariance (m, 6, 6) must include them.
         """
         stems = (name.removeprefix(prefix) for name in self.columns if name.startswith(prefix))
         count = len({stem.split("_")[0] for stem in stems if COMMON.fullmatch(stem)})
@@ -243,18 +238,13 @@ class Table:
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or
-    ``%`` with a space are ignored.
+    """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or ``%`` with a space are
+    ignored.
 
-    Commas, semicolons, tabs or spaces separate columns, as in the header. Without commas between columns, numbers may
+    Commas, semicolons, tabs or spaces separate columns, as in the header; without commas between columns, numbers may
     have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header. Units in
-    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``.
-
-    ``path`` : a :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if the quaternion columns hold x, y,
-    z, w in this order, whatever their names.
-
-    Raises InputError: the file is unreadable, not UTF-8, has no header or no rows, a column name occurs twice, a row
-    has another length than the header, or its commas may be of decimals or of thousands.
+    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``. A :class:`Table` is
+    returned unchanged; ``quaternions`` : ``xyzw`` if their columns hold x, y, z, w in this order, whatever their names.
     """
     if isinstance(path, Table):
         return path
@@ -297,24 +287,21 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
                 "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
             )
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
-        raise InputError(
-            "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is no header of the rows below it; remove it",
-        )
+        raise InputError("E-TABLE-HEADER", f"{where}: line {used[0][0]} is no header of the rows below it; remove it")
     if len(used) == 1:
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
     numbers = [i for i, _ in used[1:]]
     rows = [line for _, line in used[1:]]
-    if between != ",":
-        return _other_form(names, used[1:], between, where, quaternions)
+    if between == ",":
+        try:
+            fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
+            if fast.shape == (len(rows), len(names)):
+                return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions, rows)
+        except ValueError:
+            pass  # there is text among the numbers: parse row by row
     try:
-        fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
-        if fast.shape == (len(rows), len(names)):
-            return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions, rows)
-    except ValueError:
-        pass  # there is text among the numbers: parse row by row
-    try:
-        cells = [[plain(cell) for cell in row] for row in csv.reader(rows)]
+        split = map(str.split, rows) if between == " " else csv.reader(rows, delimiter=between)
+        cells = [[plain(cell.strip()) for cell in row] for row in split]
     except csv.Error:  # an unclosed cell, longer than any may be
         cells = []
     if len(cells) != len(rows):
@@ -328,7 +315,12 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
             raise InputError(
                 "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
             )
-    return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers, quaternions)
+    columns = {name: [row[k] for row in cells] for k, name in enumerate(names)}
+    if between == ",":
+        return Table(where, dict(columns), numbers, quaternions)
+    columns, commas = decimal_points(columns, between, where)
+    form = SEPARATORS[between] + (", decimal commas" if commas else "")
+    return Table(where, dict(columns), numbers, quaternions, form=form)
 
 
 SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "spaces between columns"}
@@ -408,10 +400,8 @@ def csv_rows(text: str) -> Iterator[dict[str, Any]]:
 
 
 def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
-    """Return the names of columns as the package writes them, where they differ in the case or form of the unit alone.
-
-    In ``euler_ZYX_1_deg`` the case means turned axes: such names stay. ``comments`` : lines; one of them may state the
-    unit of columns x, y, z without one.
+    """Return the names of columns as the package writes them, where they differ in the case or form of the unit alone;
+    one of the ``comments`` may state the unit of x, y, z. In ``euler_ZYX_1_deg`` the case means turned axes: it stays.
     """
     said = [match[1].lower() for line in comments for match in _UNIT_SAID.finditer(line)]
     units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _LONG[u]))) for word in said}
@@ -435,7 +425,6 @@ RTDE |= {f"actual_q_{i}": f"q{i + 1}_rad" for i in range(6)}
 
 
 def _short(unit: str) -> str:
-    """Return a unit as the package writes it."""
     word = unit.lower().replace("µ", "u").replace("°", "deg")
     return next((short for short, long in _LONG.items() if word.startswith(long)), word)
 
@@ -458,9 +447,7 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
     """Return the columns with decimal points in place of decimal commas, and whether there were such.
 
     Semicolons stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must
-    show that its comma is not of thousands.
-
-    Raises InputError: there are decimal points, too, or no number shows what the commas are.
+    show that its comma is not of thousands; decimal points beside it are refused.
     """
     numeric = {name: cells for name, cells in columns.items() if all(re.fullmatch(_COMMA_NUMBER, c) for c in cells)}
     with_comma = {name: cells for name, cells in numeric.items() if any("," in cell for cell in cells)}
@@ -490,26 +477,6 @@ def _separator(lines: Sequence[str]) -> str:
         return "\t"
     count = len(header.split())
     return " " if count > 1 and len(lines) > 1 and all(len(line.split()) == count for line in lines[1:]) else ","
-
-
-def _other_form(
-    names: list[str], used: Sequence[tuple[int, str]], between: str, where: str, quaternions: Order
-) -> Table:
-    """Return a table whose columns are not separated by commas."""
-    rows = []
-    for line, text in used:
-        try:
-            row = cells_of(text, between)
-        except csv.Error as error:
-            raise InputError("E-TABLE-CELLS", f"{where}: line {line}: {error}; correct it") from error
-        if len(row) != len(names):
-            raise InputError(
-                "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
-            )
-        rows.append(row)
-    columns, commas = decimal_points({name: [row[k] for row in rows] for k, name in enumerate(names)}, between, where)
-    form = SEPARATORS[between] + (", decimal commas" if commas else "")
-    return Table(where, dict(columns), [line for line, _ in used], quaternions, form=form)
 
 
 def _points_of_analyzer(
@@ -579,10 +546,8 @@ def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> 
 
 
 def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, remedy: str) -> None:
-    """Refuse quaternions (m, 4) that are not of unit length.
-
-    ``place`` : returns the place of row i in ``where``; ``remedy`` : end of the message.
-    """
+    """Refuse quaternions (m, 4) that are not of unit length; ``place`` : returns that of row i; ``remedy`` : ends the
+    message."""
     with np.errstate(over="ignore"):  # quaternions that are refused
         length = np.linalg.norm(wxyz, axis=1)
     bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))

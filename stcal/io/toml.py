@@ -138,20 +138,13 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
 def load_yaml(text: str):
-    """Return the values of a text.
-
-    ``cv2.FileStorage`` begins its files with ``%YAML:1.0``, which is no valid YAML directive; it is removed.
-
-    Raises yaml.YAMLError: the text is not YAML, has aliases, or a key twice.
-    """
+    """Return the values of a text; of aliases, or a key twice, YAMLError. ``%YAML:1.0`` of ``cv2.FileStorage`` is
+    removed."""
     return yaml.load(_without_directive(text), _Loader)
 
 
 def load_documents(text: str) -> list:
-    """Return the values of each document of a text, as ``rostopic echo`` ends each with ``---``.
-
-    Raises yaml.YAMLError: the text is not YAML, has aliases, or a key twice.
-    """
+    """Return the values of each document of a text, as ``rostopic echo`` ends each with ``---``."""
     return list(yaml.load_all(_without_directive(text), _Loader))
 
 

@@ -66,8 +66,8 @@ def checked_every(every: str | int) -> str | int:
 def sharpness(grey: np.ndarray) -> float:
     """Return how much steeper the edges of a grey image are than after a blur, in the direction where they are least.
 
-    It is a ratio of squared differences of neighbours, less 1, where the blurred image has its steepest edges:
-    brightness, contrast and the share of the image that is empty do not count. Motion blurs in one direction.
+    It is a ratio of squared differences of neighbours, less 1, at the blurred image's steepest edges, so that
+    brightness, contrast and empty parts do not count.
     """
     picture = grey.astype(np.float32)
     blurred = cv2.GaussianBlur(picture, (0, 0), SHARP_BLUR_PX)
@@ -107,29 +107,23 @@ def _move(first: _Frame, second: _Frame) -> float:
     return float(np.percentile(np.linalg.norm(flow, axis=2), MOVING)) / SMALL_PX
 
 
-def _emptied(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("frame_*.png"):
-            old.unlink()
-    except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"folder {folder}: {error.strerror or error}; give a writable folder"
-        ) from error
-
-
 def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO) -> list[Path]:
     """Write the chosen frames of a video into a folder, as ``frame_<number>.png``; those of an earlier call go.
 
-    A warning lists them. Frames that are blurred more than others are left out.
-
-    Raises InputError: the video cannot be read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be
-    written.
+    A warning lists them. Frames that are blurred more than others are left out. Raises InputError: the video cannot be
+    read, fewer than ``LEAST_FRAMES`` views of it differ, or the folder cannot be written.
     """
     video, folder, every = Path(video), Path(folder), checked_every(every)
     written: list[tuple[Path, int, float]] = []
     with frames_of(video) as frames:
-        _emptied(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for old in folder.glob("frame_*.png"):
+                old.unlink()
+        except OSError as error:
+            raise InputError(
+                "E-OUTPUT-UNWRITABLE", f"folder {folder}: {error.strerror or error}; give a writable folder"
+            ) from error
         for frame in chosen_frames(frames, every):
             path = folder / f"frame_{frame.number:06d}.png"
             save(path, png(frame.grey))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.cross_validation import dealt, held_out_errors
-from stcal.geometry.arrays import Array, Brief, freeze
+from stcal.geometry.arrays import Array, Brief, ByValue, freeze
 from stcal.register.models import Transform
 from stcal.register.pairs import Problem
 
@@ -29,7 +29,7 @@ class ErrorFigures:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldOutPoints:
+class HeldOutPoints(ByValue):
     """Errors |b − b_from_a a| of points that were left out of the fit, by cross-validation.
 
     Parameters
@@ -54,7 +54,7 @@ class HeldOutPoints:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Alternative:
+class Alternative(ByValue):
     """Another transform that fits other points as well as the result fits its own.
 
     Parameters

@@ -56,9 +56,7 @@ NO_PANGO = (
 
 
 def pdf_of(page: str) -> bytes:
-    """Return the PDF of a page as its style sheet prints it, A4 with page numbers; equal pages give equal bytes.
-
-    ``page`` : HTML with all of its content embedded; external resources are not loaded.
+    """Return the PDF of a page whose content is all embedded, A4 with page numbers; equal pages give equal bytes.
 
     Raises InputError: WeasyPrint, or Pango, which it uses, is not installed.
     """
@@ -85,16 +83,11 @@ MOST_ROWS, MOST_PRINTED = 500, 60
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table, on the terminal and on a page.
+    """A table, on the terminal and on a page. Of many rows only the first ones are shown; result files have all.
 
-    Parameters
-    ----------
-    heads : of the columns; ``<`` before a head aligns its column to the left
-    rows : cells; the first one is the head of its row
-    over : heads above the heads, each with the number of columns that it spans
-    css : ``text`` if cells hold sentences, ``text facts`` for names and values without heads
-
-    Of many rows, only the first ones are shown, with the number of all; result files have all rows.
+    ``heads`` : ``<`` before one aligns its column to the left; ``rows`` : each begins with its head; ``over`` : heads
+    above, each with the number of columns that it spans; ``css`` : ``text`` for sentences, ``text facts`` for names and
+    values without heads.
     """
 
     heads: Sequence[str]
@@ -215,11 +208,8 @@ Block = str | Table | Notes | Printed | Html | None
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A section of a page.
-
-    ``terminal`` : whether its sentences and tables are printed too; ``name`` : by which links lead to it, made from its
-    heading if not given
-    """
+    """A section of a page; ``terminal`` : whether its sentences and tables are printed too; ``name`` : by which links
+    lead to it, made from its heading if not given."""
 
     heading: str
     blocks: Sequence[Block]
@@ -233,10 +223,8 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A report: its title, a line on what it is about, and its sections, the answer first.
-
-    ``banner`` : blocks between title and contents; ``window`` : title of the browser's window if it is another one
-    """
+    """A report: its title, what it is about, and its sections, the answer first; ``banner`` : blocks before the
+    contents; ``window`` : title of the browser's window if it is another one."""
 
     title: str
     about: str

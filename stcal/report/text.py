@@ -2,8 +2,10 @@
 
 import io
 import math
+import re
 import textwrap
 from collections.abc import Iterable, Sequence
+from itertools import takewhile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -44,61 +46,21 @@ def join(values: Iterable) -> str:
 
 
 def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
-    """Return short names that remain distinct.
-
-    The beginning and end that all names share are removed, but words and numbers stay whole. Names that are still too
-    long keep both ends, or a part between, with an ellipsis for the rest. If the results are not distinct, they are
-    numbers from 1.
-
-    ``most`` : largest number of characters
-    """
-    if len(set(names)) < 2:
-        return [_shortened(name, most) for name in names]
-    start, end = _common(names), _common([name[::-1] for name in names])
-    shortest = min(map(len, names))
-    end = min(end, shortest - start) if start < shortest else 0
-    # Words and numbers stay whole: 10 and 11 of a10.png and a11.png, not 0 and 1.
-    while start and any(_within_word(name, start) for name in names):
-        start -= 1
-    while end and any(_within_word(name, len(name) - end) for name in names):
-        end -= 1
-    distinctive = [name[start : len(name) - end] for name in names]
-    if not all(distinctive):
-        distinctive = [name[start:] for name in names] if all(name[start:] for name in names) else list(names)
-    for head in (most // 2, 2, most - 3):
-        short = [_shortened(name, most, head) for name in distinctive]
-        if len(set(short)) == len(set(names)):
-            return short
-    windows = [
-        [_window(name, at, most) for name in distinctive] for at in range(1, max(map(len, distinctive)) - most + 2)
-    ]
-    different = [short for short in windows if all(short) and len(set(short)) == len(set(names))]
-    return different[len(different) // 2] if different else [str(i) for i in range(1, len(names) + 1)]
+    """Return short names that remain distinct: without the words and numbers at both ends that all share, and with an
+    ellipsis for the middle of one of more than ``most`` characters; else numbers from 1."""
+    parts = [re.findall(r"\d+|[^\W\d_]+|[\W_]", name) for name in names]
+    start = _alike(parts)
+    end = _alike([part[start:][::-1] for part in parts])
+    own = ["".join(part[start : len(part) - end]) for part in parts]
+    own = own if all(own) else names
+    short = [name if len(name) <= most else f"{name[: most // 2]}…{name[len(name) - most // 2 + 1 :]}" for name in own]
+    return short if len(set(short)) == len(set(names)) else [str(i) for i in range(1, len(names) + 1)]
 
 
-def _window(name: str, at: int, most: int) -> str:
-    """Return the part of a name from index ``at`` on, with ellipses for omitted characters."""
-    middle = name[at : at + most - 2]
-    return name if len(name) <= most else f"…{middle}{'…' * (at + len(middle) < len(name))}" if middle else ""
-
-
-def _common(names: Sequence[str]) -> int:
-    """Return the number of leading characters that all names share."""
-    first, last = min(names), max(names)
-    return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last)))
-
-
-def _within_word(text: str, at: int) -> bool:
-    """Return True if a cut before this character would split a word or a number."""
-    pair = text[max(at - 1, 0) : at + 1]
-    return 0 < at < len(text) and (pair.isdigit() or pair.isalpha())
-
-
-def _shortened(name: str, most: int, head: int | None = None) -> str:
-    if len(name) <= most:
-        return name
-    head = most // 2 if head is None else head
-    return f"{name[:head]}…{name[len(name) - (most - 1 - head) :]}"
+def _alike(lists: Sequence[Sequence[str]]) -> int:
+    return (
+        sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False))) if len(lists) > 1 else 0
+    )
 
 
 def wrapped(line: str, width: int = WIDTH) -> list[str]:
@@ -110,10 +72,10 @@ def wrapped(line: str, width: int = WIDTH) -> list[str]:
 
 
 def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: int = 2) -> list[str]:
-    """Return the lines of a table without rules or colours; it is the same on any terminal, and no cell is wrapped.
+    """Return the lines of a table without rules or colours, alike on any terminal; no cell is wrapped.
 
-    ``rows`` : cells; the first row holds the heads, and a ``<`` before a head aligns its column to the left; ``least``
-    : smallest width of each column, characters; no limit if empty; ``gap`` : number of characters between columns.
+    ``rows`` : cells, the heads first; ``<`` before one aligns its column to the left; ``least`` : smallest width of
+    each column; ``gap`` : between columns, in characters.
     """
     from rich.console import Console
     from rich.table import Table

@@ -21,13 +21,12 @@ ADDRESS = re.compile(r"((tcp|tls)://)?([\w.-]+|\[[\da-fA-F:]+\]):\d{1,5}")
 
 @contextlib.contextmanager
 def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
-    """Hand the work on single images to a Dask cluster for the duration of the context.
+    """Hand the work on single images to the Dask cluster at ``tcp://host:8786`` for the duration of the context.
 
-    ``address`` : address of the scheduler, ``tcp://host:8786``; ``send_images`` : whether images are sent by content.
-    Otherwise they are sent by path, on storage that all workers share.
+    ``send_images`` : whether images are sent by content, and not by their path on storage that all workers share.
 
-    Raises InputError: the extra ``dask`` is not installed, no scheduler answers, it has no workers, or a worker has
-    other versions. Raises DetectionError: the scheduler was lost, or an image ended several workers.
+    Raises InputError: the extra ``dask`` is not installed, no scheduler or worker answers, or a worker has other
+    versions. Raises DetectionError: the scheduler was lost, or an image ended several workers.
     """
     with _connected(address) as client:
         from distributed.comm.core import CommClosedError
@@ -45,10 +44,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def executor_of(address: str | None = None) -> Iterator[Executor]:
-    """Yield the workers of a Dask cluster, or, without an address, processes of this machine, one per core.
-
-    Raises InputError: for the reasons given in :func:`dask_cluster`.
-    """
+    """Yield the workers of a Dask cluster as of :func:`dask_cluster`, or processes of this machine, one per core."""
     if address is None:
         with ProcessPoolExecutor() as pool:
             yield pool

@@ -33,7 +33,7 @@ def test_one_turned_photograph_in_front_drops_itself_alone(tmp_path, size, orien
     for i in range(1, 6):
         cv2.imwrite(str(tmp_path / f"{i}.png"), grey)
     files, _ = find_images(tmp_path)
-    model = camera_from_opencv([500, 500, 199.5, 149.5], np.zeros(0), False, *size, "camera")
+    model = camera_from_opencv([500, 500, 199.5, 149.5], np.zeros(0), False, *size)
     found = detect_boards(files, model, BOARD, workers=1)
     turned_back = orientation == 6
     assert (found.camera.width, found.camera.height) == (WIDTH, HEIGHT)

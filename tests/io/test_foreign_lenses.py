@@ -255,7 +255,7 @@ def turned_lens(angle_deg, region=None) -> tuple[ForeignLens, Camera, Rigid]:
         xy = camera.project(turn @ rays)
         return xy if region is None else np.where(inside(region, xy)[:, None], xy, xy + 3000)
 
-    return ForeignLens("a turned lens", project, WIDTH, HEIGHT, "file", region), camera, turn
+    return ForeignLens("a turned lens", project, WIDTH, HEIGHT, region), camera, turn
 
 
 def inside(polygon: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -270,7 +270,7 @@ def test_a_fit_turns_the_camera_where_that_helps():
     assert found.rms_px < 1e-3
     np.testing.assert_allclose(found.camera_from_lens.rotation, turn.rotation, atol=1e-5)
     np.testing.assert_allclose(found.camera.centre, camera.centre, atol=0.1)
-    straight = fit_lens(ForeignLens("", camera.project, WIDTH, HEIGHT, "file"), WIDTH, HEIGHT)
+    straight = fit_lens(ForeignLens("", camera.project, WIDTH, HEIGHT), WIDTH, HEIGHT)
     assert straight.camera_from_lens.angle_rad() == 0
 
 

@@ -4,8 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.io.files import json_text, keep_apart, save
@@ -65,22 +63,6 @@ def test_outputs_are_kept_apart(tmp_path, monkeypatch):
         keep_apart([("--out", tmp_path / "a"), ("--json", Path("a"))], [("data", given)])
     with pytest.raises(InputError, match="is a folder; the name of a file needed"):
         keep_apart([("--out", tmp_path)], [("data", given)])
-
-
-PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False)
-LISTS = st.lists(PLAIN) | st.lists(st.lists(PLAIN, max_size=4), max_size=4)
-VALUES = st.recursive(
-    PLAIN | st.text() | st.sampled_from(["],[", "a, b", "\n"]) | LISTS,
-    lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers() | st.none(), inner),
-    max_leaves=12,
-)
-
-
-@pytest.mark.slow
-@given(st.dictionaries(st.text(), VALUES))
-def test_json_is_that_of_the_standard_library(content):
-    """Whose writer takes a number at a time: of a hundred thousand rows seconds."""
-    assert json_text(content) == json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
 @pytest.mark.parametrize("value", [float("nan"), [1.0, float("inf")], [[1.0], [float("-inf")]]])

@@ -47,10 +47,7 @@ def export_run(
         "1), .yml (OpenCV), .csv, .gltf or .glb.",
         Arg("FILE", writes=True),
     ],
-    form: Annotated[
-        str,
-        "Write this form, whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, gltf or glb.",
-    ] = "",
+    form: Annotated[str, "Write this form: urdf, xacro, tf2, ros2, ros1, opencv, csv, gltf or glb."] = "",
     name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles for robots and viewers, with σ and cameras if the form can hold them."""
@@ -65,21 +62,19 @@ def crosscheck(
     run: Run,
     colmap: Annotated[Path | None, "Run this native program; `colmap` on the PATH if not given."] = None,
     tolerance_sigma: Annotated[
-        float,
-        "Accept differences between our result and the native models up to this, in σ of faces and circles.",
-        Opt(min=0, max=1e6),
+        float, "Accept differences of faces and circles up to this, in σ.", Opt(min=0, max=1e6)
     ] = 0.5,
     tolerance_um: Annotated[
-        float | None, "Accept differences of faces and circles up to this, µm; any if not given.", Opt(min=0, max=1e6)
+        float | None, "Accept differences of faces and circles up to this, µm.", Opt(min=0, max=1e6)
     ] = None,
     tolerance_mdeg: Annotated[
-        float | None, "Accept differences of faces up to this, millidegrees; any if not given.", Opt(min=0, max=1e6)
+        float | None, "Accept differences of faces up to this, millidegrees.", Opt(min=0, max=1e6)
     ] = None,
     camera_tolerance_um: Annotated[
-        float | None, "Accept differences of camera positions up to this, µm; any if not given.", Opt(min=0, max=1e6)
+        float | None, "Accept differences of camera positions up to this, µm.", Opt(min=0, max=1e6)
     ] = None,
     camera_tolerance_mdeg: Annotated[
-        float | None, "Accept differences of camera attitudes up to this, mdeg; any if not given.", Opt(min=0, max=1e6)
+        float | None, "Accept differences of camera attitudes up to this, mdeg.", Opt(min=0, max=1e6)
     ] = None,
     timeout: Annotated[float, "Stop the native mapper after this time for a group, s.", Opt(min=1, max=1e6)] = 600.0,
 ) -> None:
@@ -108,9 +103,7 @@ def faces(
     run: Annotated[Path, "Read the run in this folder, from whose database the model was mapped."],
     out: Annotated[Path | None, "Also write the faces to this file, in the form of faces.json.", WRITES] = None,
     solve: Annotated[
-        Literal["chain", "paper"],
-        "Solve by chain, a weighted mean over all chains to a face; or as in the paper, λ by rows, three-point "
-        "frames and single transforms.",
+        Literal["chain", "paper"], "Solve by the mean over all chains to a face, or as in the paper, by single ones."
     ] = "chain",
 ) -> None:
     """Find scale and faces of a COLMAP model made or edited elsewhere; its labels are found by image and keypoint."""

@@ -2,6 +2,7 @@
 ``compare`` and ``demo``: data with known truth."""
 
 import tempfile
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,27 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from stcal.cli.options import (
-    MOST_SEED,
-    WRITES,
-    Arg,
-    BoardFile,
-    Distance,
-    JsonFile,
-    Opt,
-    PlateMargin,
-    TargetFile,
-    Workers,
-    board_in_words,
-    designs_told,
-)
+from stcal.cli import options as shared
+from stcal.cli.options import MOST_SEED, WRITES, Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import COMPARISON, RUN_MARKER, json_text, real_place, save
 
 if TYPE_CHECKING:
-    from stcal.design import BoardDesign, TargetDesign
-    from stcal.synthetic.body import BodyOptions
     from stcal.synthetic.optics import ThinLens
     from stcal.synthetic.scene import Scene, SceneOptions
 
@@ -58,72 +45,56 @@ def simulate(
     folder: Annotated[Path, "Write the data set to this new folder.", Arg()],
     width: Annotated[int, "Render images of this width, px, in the ratio 3:2.", Opt(min=320, max=50_000)] = 2592,
     images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
-    distance: Distance = 1000.0,
+    distance: shared.Distance = 1000.0,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
-        float | None,
-        "Use an equidistant lens with this field over the diagonal, degrees, that is not centred on the target.",
-        Opt(min=60, max=170),
+        float | None, "Use an equidistant lens of this diagonal field, degrees.", Opt(min=60, max=170)
     ] = None,
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[
-        float | None,
-        "Use a thin lens of this f-number, with --focal-mm if there is a --camera; without it, all is in focus.",
-        Opt(min=0.5, max=100),
+        float | None, "Use a thin lens of this f-number; if not given, all is in focus.", Opt(min=0.5, max=100)
     ] = None,
     focus: Annotated[
-        float | None,
-        "Set the lens's plane of focus at this depth; at --distance if not given.",
-        Opt("--focus-mm", min=10, max=1e7),
+        float | None, "Focus at this depth; at --distance if not given.", Opt("--focus-mm", min=10, max=1e7)
     ] = None,
     focal: Annotated[
         float | None,
-        "Set the focal length of the thin lens; if not given, it follows from a sensor 22.3 mm wide.",
+        "Set the focal length; if not given, that of a sensor 22.3 mm wide.",
         Opt("--focal-mm", min=0.5, max=5000),
     ] = None,
     rim: Annotated[
-        float,
-        "Set the height of rims in front of the faces' circles; with < 0 the circles are raised.",
-        Opt("--rim-mm", min=-20, max=20),
+        float, "Set the height of rims before circles of faces; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)
     ] = 0.0,
-    slope: Annotated[
-        float, "Let the light of each circle of the faces rise by this fraction from side to side.", Opt(min=0, max=1)
-    ] = 0.0,
+    slope: Annotated[float, "Let the light of circles rise by this fraction across.", Opt(min=0, max=1)] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
-        float | None,
-        "Add a table below that reflects target and board with this reflectance.",
-        Opt("--table-reflectance", min=0, max=1),
+        float | None, "Add a table below that reflects this fraction.", Opt("--table-reflectance", min=0, max=1)
     ] = None,
-    target: TargetFile = None,
-    board: BoardFile = None,
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     groups: Annotated[
-        str | None,
-        "Photograph these pairs of faces together, such as 12,14 or front-right,front-top; if not given, all pairs "
-        "that are visible together.",
+        str | None, "Photograph these pairs of faces, such as 12,14; all that are visible together if not given."
     ] = None,
     camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
-    one_board: Annotated[
-        bool, "Photograph the same board with all groups, as `plan` assumes, instead of another copy with each."
-    ] = False,
+    one_board: Annotated[bool, "Photograph one board with all groups, as `plan` assumes."] = False,
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
     png: Annotated[bool, "Write PNG instead of JPEG."] = False,
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     body_seed: Annotated[
         int | None,
-        "Draw the errors of target, camera and the board of --one-board with this seed, to photograph the same ones "
-        "again with another --seed. If not given, it is that of --seed.",
+        "Draw errors of target, camera and board with this seed; with --seed if not given.",
         Opt(min=0, max=MOST_SEED),
     ] = None,
-    margin: PlateMargin = 15.0,
-    workers: Workers = None,
+    margin: shared.PlateMargin = 15.0,
+    workers: shared.Workers = None,
 ) -> None:
     """Write a simulated data set with known truth, of the reference design or your own: images, cameras.txt,
     target.toml, board.toml, truth.json."""
     from stcal.boards.target import body_of
-    from stcal.synthetic.body import BodyOptions
+    from stcal.io.cameras.read import read_camera
+    from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.render import RenderOptions
     from stcal.synthetic.scene import SceneOptions
@@ -141,15 +112,9 @@ def simulate(
     )
     kind = "png" if png or sixteen_bit else "jpg"
     if target is not None and (body := body_of(target)).with_faces(printed=True).faces:
-        others = {"--groups": groups, "--fisheye": fisheye, "--f-number": f_number, "--rim-mm": rim, "--board": board}
-        others |= {
-            "--slope": slope,
-            "--second-design": second_design,
-            "--one-board": one_board,
-            "--clutter": clutter,
-            "--16-bit": sixteen_bit,
-        }
-        if unfit := [name for name, value in others.items() if value]:
+        names = "--groups --fisheye --f-number --rim-mm --board --slope --second-design --one-board --clutter --16-bit"
+        others = groups, fisheye, f_number, rim, board, slope, second_design, one_board, clutter, sixteen_bit
+        if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
             raise InputError(
                 "E-OPTION-CONFLICT",
                 f"{unfit[0]}: not for photographs of a body with boards or tags on its faces; leave it out",
@@ -157,13 +122,20 @@ def simulate(
         shape = BodyOptions(
             images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1.0, body_seed=body_seed
         )
-        _body(folder, body, camera, shape, width, kind, workers)
+        file = None if camera is None else read_camera(camera)
+        if file is not None and not (file.width and file.height):
+            raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
+        held = make_body_scene(body, body_camera(width) if file is None else file.calibrated(0, 0), shape)
+        with StageProgress() as progress:
+            paths = write_body(folder, held, kind, workers=workers, progress=partial(progress, "render"))
+        say(f"{len(paths)} images: {folder}")
+        print_each("note", filter(None, [held.hardly_seen()]))
         return
     if second_design and (target or board):
         raise InputError("E-OPTION-CONFLICT", "--second-design and --target or --board: two designs; give one of them")
     one_given = (target is None) != (board is None)  # both are the reference's if neither is given
-    with designs_told(target, board, with_target=one_given, with_board=one_given):
-        scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
+    with shared.designs_told(target, board, with_target=one_given, with_board=one_given):
+        scene = _scene(options, target, board, second_design, groups, camera, fisheye)
     rendering = RenderOptions(
         noise=noise,
         blur_px=blur,
@@ -179,33 +151,6 @@ def simulate(
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
     say(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
-
-
-def _body(
-    folder: Path,
-    target: "TargetDesign",
-    camera: Path | None,
-    options: "BodyOptions",
-    width: int,
-    kind: str,
-    workers: int | None,
-) -> None:
-    """Writes photographs of a body that is held before a camera in changing poses."""
-    from stcal.io.cameras.read import read_camera
-    from stcal.synthetic.body import body_camera, make_body_scene, write_body
-
-    if camera is None:
-        seen_by = body_camera(width)
-    else:
-        file = read_camera(camera)
-        if not (file.width and file.height):
-            raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
-        seen_by = file.calibrated(0, 0)
-    scene = make_body_scene(target, seen_by, options)
-    with StageProgress() as progress:
-        paths = write_body(folder, scene, kind, workers=workers, progress=partial(progress, "render"))
-    say(f"{len(paths)} images: {folder}")
-    print_each("note", filter(None, [scene.hardly_seen()]))
 
 
 def _lens(
@@ -237,56 +182,48 @@ def _lens(
     return ThinLens(f_number, usual_mm if focal_mm is None else focal_mm, distance_mm if focus_mm is None else focus_mm)
 
 
-def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
-    """Returns the designs of the files, the reference designs, or the second designs."""
+def _scene(
+    options: "SceneOptions",
+    target: Path | None,
+    board: Path | None,
+    second_design: bool,
+    groups: str | None,
+    camera: Path | None,
+    fisheye: float | None,
+) -> "Scene":
+    """Returns a scene of the files' designs, or the second ones, before the camera of a file or the options."""
     from stcal.boards.design import CornerBoard
-    from stcal.boards.file import run_board_of as board_of
+    from stcal.boards.file import run_board_of
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import target_of
-    from stcal.synthetic.scene import second_design as other
+    from stcal.sfm.planning.forecast import nominal_poses
+    from stcal.sfm.planning.session import pairs_of_faces
+    from stcal.synthetic import scene
 
-    if second_design:
-        return other()[:2]
-    board_design = board_of(board)
-    if isinstance(board_design, CornerBoard):
+    designs = scene.second_design()[:2] if second_design else (target_of(target), run_board_of(board))
+    if isinstance(designs[1], CornerBoard):
         raise InputError(
             "E-BOARD-TYPE",
             f"--board {board}: squares or tags, which are not drawn beside a target; a board of dots, asymmetric "
             "or hexagonal circles needed here (`run` takes this one)",
         )
-    return target_of(target), board_design
-
-
-def _scene(
-    options: "SceneOptions",
-    designs: "tuple[TargetDesign, BoardDesign]",
-    groups: str | None,
-    camera: Path | None,
-    fisheye: float | None,
-) -> "Scene":
-    """Returns a scene of the designs, with faces at their rough poses, before the camera of a file or the options."""
-    from stcal.io.cameras.read import read_camera
-    from stcal.sfm.planning.forecast import nominal_poses
-    from stcal.sfm.planning.session import pairs_of_faces
-    from stcal.synthetic.scene import make_scene
-
-    target, board = designs
-    poses = nominal_poses(target, None)
+    poses = nominal_poses(designs[0], None)
     if groups:
-        options = replace(options, groups=pairs_of_faces(groups, target))
+        options = replace(options, groups=pairs_of_faces(groups, designs[0]))
     if camera is None:
-        return make_scene(replace(options, fisheye_deg=fisheye), target, board, poses)
+        return scene.make_scene(replace(options, fisheye_deg=fisheye), *designs, poses)
     if fisheye is not None:
         raise InputError(
             "E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them"
         )
-    return make_scene(options, target, board, poses, read_camera(camera))
+    return scene.make_scene(options, *designs, poses, read_camera(camera))
 
 
 @app.command()
 def compare(
     run: Annotated[Path, "Read this finished run, its faces.json, or poses.csv of measure.", Arg("RUN")],
     truth: Annotated[Path, "Read the truth from this truth.json.", Arg()],
-    out: JsonFile = None,
+    out: shared.JsonFile = None,
 ) -> None:
     """Compare a run, or measured poses, with the known truth, as a table and as JSON."""
     from stcal.sfm.report.compare import compare as against
@@ -300,24 +237,22 @@ def compare(
         return
 
     into_run = run / COMPARISON
-    if (run / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run)):
-        with added_results(run) as stage:
-            comparison = against(run, truth)
+    is_added = (run / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run))
+    with added_results(run) if is_added else nullcontext() as stage:
+        comparison = against(run, truth)
+        if stage is not None:
             save(stage / COMPARISON, json_text(comparison))
-        say(f"{comparison_table(comparison)}\nas JSON: {into_run}")
-        return
-    comparison = against(run, truth)
     say(comparison_table(comparison))
-    target = out or (into_run if run.is_dir() else None)
-    write_if(target, lambda: comparison, "as JSON")
+    if is_added:
+        say(f"as JSON: {into_run}")
+    else:
+        write_if(out or (into_run if run.is_dir() else None), lambda: comparison, "as JSON")
 
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path | None, "Keep data set and run in this folder; if not given, a temporary folder is used."
-    ] = None,
-    workers: Workers = None,
+    out: Annotated[Path | None, "Keep data set and run in this folder, in place of a temporary one."] = None,
+    workers: shared.Workers = None,
 ) -> None:
     """Render a small data set with known truth, calibrate it, and compare the faces with the truth."""
     from stcal.sfm.pipeline import run
@@ -353,9 +288,7 @@ def draw(
         "Print on as many sheets of this paper as needed: A5 … A0, Letter, Legal or Tabloid. With own, a page is as "
         "large as its content. If not given, A4 for .pdf and own for the others.",
     ] = "",
-    margin: Annotated[
-        float, "Add this margin around the outermost circles, mm.", Opt("--margin-mm", min=0, max=1e4)
-    ] = 10.0,
+    margin: Annotated[float, "Add this margin around the circles, mm.", Opt("--margin-mm", min=0, max=1e4)] = 10.0,
     net: Annotated[bool, "Draw a target's plates as one net to fold, using outline_mm and rough_pose."] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
@@ -372,13 +305,9 @@ def draw(
 @app.command()
 def design(
     folder: Annotated[Path, "Write target.toml to this folder, and board.toml if there is none.", Arg()],
-    size: Annotated[
-        str,
-        "Make it for a box of this width, height and depth, W,H,D in mm; with --tags, give the width between "
-        "opposite faces.",
-    ],
+    size: Annotated[str, "Make it for a box of W,H,D mm; for --tags, give the width between opposite faces."],
     tags: Annotated[
-        Literal["cube", "dodecahedron"] | None, "Make a cube or dodecahedron with a tag on each face and no board."
+        Literal["cube", "dodecahedron"] | None, "Make this body with a tag on each face and no board."
     ] = None,
     dictionary: Annotated[str, "Take the tags of --tags from this dictionary."] = DICTIONARY,
     first_id: Annotated[int, "Number the tags of --tags from this id.", Opt(min=0, max=100_000)] = 0,
@@ -390,13 +319,11 @@ def design(
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
         float | None,
-        "Draw the smaller circles with this radius; if not given, it is chosen for box and camera.",
+        "Draw the smaller circles with this radius; chosen if not given.",
         Opt("--radius-mm", min=0.01, max=1e4),
     ] = None,
-    distance: Distance = 1000.0,
-    width: Annotated[
-        int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
-    ] = 5184,
+    distance: shared.Distance = 1000.0,
+    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     bright: Annotated[
         bool, "Make bright circles on dark plates, or dark ones on bright.", Opt("--bright/--dark")
@@ -435,7 +362,7 @@ def design(
         print_each("note", likeness_notes(made.target))
         say(made_text(made.made))
         if made.board is not None:
-            say(f"board: {board_in_words(made.board)}")
+            say(f"board: {shared.board_in_words(made.board)}")
     elif made.forecast is not None:
         say(body_text(made.target, made.forecast.setup.camera, distance))
     if tags is not None:

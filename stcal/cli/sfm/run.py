@@ -35,22 +35,16 @@ def run(
     ] = None,
     eccentricity: Annotated[
         bool,
-        "Correct the eccentricity of circles. Without the correction, groups are chained as in the paper, as a "
-        "control.",
+        "Correct the eccentricity of circles; without it, as a control, groups are chained.",
         Opt("--eccentricity/--no-eccentricity"),
     ] = True,
     max_angle: Annotated[
         float | None,
-        "Reject an initial pair with a larger median ray angle, degrees. If not given, it is 60, or the smallest "
-        "angle if all are larger.",
+        "Reject an initial pair with a larger median ray angle, degrees; 60, or the smallest, if not given.",
         Opt(min=2, max=170),
     ] = None,
-    flatness: Annotated[
-        str, "Set the σ of circles about the plane of their face, mm, for --solve joint; or off."
-    ] = "0.02",
-    refine_camera: Annotated[
-        bool, "Adjust the intrinsics too, starting from the given ones and weighted by their σ."
-    ] = False,
+    flatness: Annotated[str, "Set the σ of circles about the plane of their face, mm, or off."] = "0.02",
+    refine_camera: Annotated[bool, "Adjust the given intrinsics too, weighted by their σ."] = False,
     rim: Annotated[
         bool | None,
         "Compute the height of rims in front of the circles, and give the faces of the surface behind them; if not "
@@ -59,8 +53,7 @@ def run(
     ] = None,
     board_only: Annotated[bool, "Use only the board, even if other circles are in view: λ and residuals."] = False,
     compare: Annotated[
-        Literal["paper"] | None,
-        "Solve the same photographs as published too (paper), and show what each later step improves.",
+        Literal["paper"] | None, "Solve as published too (paper), and show what each later step improves."
     ] = None,
     exclude: shared.Exclude = None,
     every: Annotated[
@@ -133,9 +126,7 @@ def detect(
     out: Annotated[Path, "Write detections.csv and overlays/ to this folder."] = Path("detect"),
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    solve: Annotated[
-        Solve | None, "Detect as `run` does with this option; paper detects by the published rules."
-    ] = None,
+    solve: Annotated[Solve | None, "Detect as `run` does with this option."] = None,
     exclude: shared.Exclude = None,
     min_diameter: shared.MinDiameter = None,
     max_diameter: shared.MaxDiameter = 450.0,
@@ -193,20 +184,16 @@ def _flatness(text: str) -> float | None:
 def budget(
     run: shared.Run,
     statement: Annotated[
-        Path | None,
-        "Read temperatures, expansion, the σ of the board's pitch and fields of the header from this file (TOML).",
+        Path | None, "Read temperatures, expansion, σ of the pitch and header from this file (TOML)."
     ] = None,
     field: Annotated[
-        list[str] | None, "Write NAME=VALUE into the header, such as operator='A. Smith'; may be given several times."
+        list[str] | None, "Write NAME=VALUE into the header, such as operator='A. Smith'; repeat it."
     ] = None,
     check_lengths: Annotated[
-        Path | None,
-        "Compare distances between circles with the lengths in this file (CSV: from, to, length_mm, sigma_mm).",
+        Path | None, "Compare distances with the lengths in this file (CSV: from, to, length_mm, sigma_mm)."
     ] = None,
     lengths: Annotated[Path | None, "Compare the longest distances with the second calibration in this folder."] = None,
-    lengths_statement: Annotated[
-        Path | None, "Read the statement of that second calibration from this file; if not given, --statement is used."
-    ] = None,
+    lengths_statement: Annotated[Path | None, "Read the statement of that second calibration from this file."] = None,
     page: shared.ReportFile = None,
     pdf: Annotated[bool, "Also write the page as PDF beside it (needs the extra `pdf`)."] = False,
     out: shared.JsonFile = None,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import ConvergenceError, DegenerateError, InputError, named
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid, align_rigid
@@ -27,11 +27,8 @@ LEAST_POINTS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraDifference:
-    """The difference between two cameras over the image.
-
-    ``pixels`` : (r, c, 2) of the first camera; ``apart`` : (r, c, 2) px, offsets of the second camera's pixels for the
-    same rays, nan where one of the cameras has no ray; ``second_from_first`` : the best rotation.
-    """
+    """The difference between two cameras over the image: ``pixels`` (r, c, 2) of the first one; for the same rays,
+    offsets ``apart`` (r, c, 2) px of the second one's, nan where one has none; and the best rotation between them."""
 
     pixels: np.ndarray
     apart: np.ndarray
@@ -44,10 +41,8 @@ class CameraDifference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizedLens:
-    """A lens of an unsupported model over an image, by its own projection.
-
-    ``lens`` ; ``width``, ``height`` : px; ``near`` : the model that was fitted to it, from which its rays are sought.
-    """
+    """A lens of an unsupported model over an image, by its own projection; ``near`` : the model that was fitted to it,
+    from which its rays are sought."""
 
     lens: ForeignLens
     width: int
@@ -90,18 +85,7 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
     one, two : Camera
         Cameras of the same image size. Of a lens with a region only this is compared.
 
-    Returns
-    -------
-    CameraDifference
-        ``pixels`` (r, c, 2) of the first camera and offsets ``apart`` (r, c, 2) of the second, px;
-        ``second_from_first``, the turn.
-
-    Raises
-    ------
-    InputError
-        The image sizes differ.
-    DegenerateError
-        Too few pixels have a ray in both cameras.
+    Raises DegenerateError: too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
@@ -117,18 +101,15 @@ def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraD
             "E-CAMERA-NO-RAYS", f"{good.sum()} of {len(flat)} pixels have a ray in both cameras, {LEAST_POINTS} needed"
         )
     unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (first[good], second[good])]
-    turn = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
-    for _ in range(STEPS):
-        offset = two.project(turn @ first[good]) - flat[good]
-        rotations = [Rigid.exp([*step, 0, 0, 0]) @ turn for step in STEP_RAD * np.eye(3)]
-        slope = (
-            np.stack([two.project(rotated @ first[good]) - flat[good] - offset for rotated in rotations], axis=2)
-            / STEP_RAD
-        )
-        step = -np.linalg.lstsq(slope.reshape(-1, 3), offset.ravel())[0]
-        turn = Rigid.exp([*step, 0, 0, 0]) @ turn
-        if np.abs(step).max() < STEP_RAD**2:
-            break
+    near = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
+
+    def turned(step: np.ndarray) -> Rigid:
+        return Rigid.exp([*step, 0, 0, 0]) @ near
+
+    def off(step: np.ndarray) -> np.ndarray:
+        return (two.project(turned(step) @ first[good]) - flat[good]).ravel()
+
+    turn = turned(least_squares(off, np.zeros(3), diff_step=STEP_RAD, method="lm", xtol=SETTLED, ftol=SETTLED).x)
     apart = np.full(flat.shape, np.nan)
     seen = two.project(turn @ first[good])
     if isinstance(two, SizedLens):
@@ -178,11 +159,10 @@ SMALL = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLens:
-    """Result of fitting a lens.
+    """The camera that was fitted to a lens, and its RMS and largest residual where the lens was determined.
 
-    ``camera`` : the fitted camera; ``rms_px``, ``most_px`` : RMS and largest residual over the image, or over the
-    region in which the lens was determined; ``share`` : share of the azimuths in which the image, or the region, ends
-    within 89° of the axis; ``camera_from_lens`` : the rotation of the camera's axes, the identity unless it helps much.
+    ``share`` : of the azimuths in which that ends within 89° of the axis; ``camera_from_lens`` : the rotation of the
+    camera's axes, the identity unless it helps much.
     """
 
     camera: Camera
@@ -194,11 +174,8 @@ class FittedLens:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedLens:
-    """The lens of a file.
-
-    ``lens`` : the camera, or a lens of another model over its image, as :func:`compare_cameras` takes it; ``told`` :
-    what a photograph's EXIF says of it, empty for a camera file.
-    """
+    """The lens of a file: the camera, or another model's lens over its image; ``told`` : what a photograph's EXIF says
+    of it."""
 
     lens: Camera | SizedLens
     told: str = ""
@@ -227,17 +204,8 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     size : (int, int), optional
         Width and height of the images, px, for a file that does not state them.
 
-    Returns
-    -------
-    LoadedLens
-        ``camera``, with the residuals ``fitted`` of a lens of another model, px.
-
-    Raises
-    ------
-    InputError
-        The file is missing or malformed, holds more than one camera, or no size is known.
-    ConvergenceError, DegenerateError
-        No supported model comes near the lens.
+    Raises InputError: the file is missing or malformed, holds more than one camera, or no size is known.
+    Raises ConvergenceError, DegenerateError: no supported model comes near the lens.
     """
     if is_photograph(path):
         found = camera_of_photograph(path)
@@ -246,14 +214,12 @@ def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = N
     width, height = lens.width or across, lens.height or up
     if isinstance(lens, CameraModel) or not (width and height):
         return LoadedLens(sized_camera(lens, path, (width, height)))
-    return LoadedLens(SizedLens(lens, width, height, fit_lens(lens, width, height)))
+    with named(f"camera file {path}"):
+        return LoadedLens(SizedLens(lens, width, height, fit_lens(lens, width, height)))
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
-    """Return the supported camera model that is nearest to a lens over the image.
-
-    ``lens`` : lens to approximate; ``width``, ``height`` : image size, px.
-    """
+    """Return the supported camera model that is nearest to a lens over an image of this size, px."""
     rays, pixels, share = _rays(lens, width, height)
     straight = _best(lens, rays, pixels, share, (width, height), False)
     if straight.most_px <= GOOD_PX:
@@ -305,8 +271,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
             pixels.append(pixels_of_azimuth[np.unique(np.minimum(at, count - 1))])
     if sum(map(len, rays)) < AZIMUTHS:
         raise InputError(
-            "E-CAMERA-NO-FIELD",
-            f"camera file {lens.source}: {lens.called} projects almost no point into {width}×{height} px; check it",
+            "E-CAMERA-NO-FIELD", f"{lens.called} projects almost no point into {width}×{height} px; check it"
         )
     return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
 

@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera, opencv_lens
+from stcal.geometry.plane import inside
 from stcal.io.cameras.keys import pass_over
 from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
@@ -46,66 +47,49 @@ MARGIN = {2: 1, 3: 2}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignLens:
-    """A lens that is known by its projection only.
+    """A lens that is known by its projection only, of a model that is ``called`` so.
 
-    ``called`` : name of its model; ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel
-    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``source`` : the file; ``region`` : polygon
-    (n, 2), px, within which the lens was determined, or None if the file states none.
+    ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0); ``width``,
+    ``height`` : px, or None if the file states none; ``region`` : polygon (n, 2), px, within which it was determined,
+    or None.
     """
 
     called: str
     project: Callable[[np.ndarray], np.ndarray]
     width: int | None
     height: int | None
-    source: str
     region: np.ndarray | None = None
 
     def determined(self, pixels: np.ndarray) -> np.ndarray:
         """Return which pixels (n, 2) lie in the region, (n,) bool; all of them if the file states none."""
-        if self.region is None:
-            return np.ones(len(pixels), bool)
-        inside = np.zeros(len(pixels), bool)
-        for (x0, y0), (x1, y1) in zip(self.region, np.roll(self.region, -1, axis=0), strict=True):
-            crosses = (pixels[:, 1] < y0) != (pixels[:, 1] < y1)
-            if y0 != y1:
-                inside ^= crosses & (pixels[:, 0] < x0 + (pixels[:, 1] - y0) * (x1 - x0) / (y1 - y0))
-        return inside
+        return np.ones(len(pixels), bool) if self.region is None else inside(self.region, pixels)
 
 
-def of_colmap(model: str, width: float, height: float, params, source: str) -> CameraModel | ForeignLens:
+def of_colmap(model: str, width: float, height: float, params) -> CameraModel | ForeignLens:
     """Return the camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
 
-    Raises
-    ------
-    InputError
-        The model is unknown, the number of parameters is wrong, or values are impossible.
-
-    References
-    ----------
     COLMAP 4, ``sensor/models.h``. A. Fitzgibbon, "Simultaneous linear estimation of multiple view geometry and lens
     distortion", CVPR 2001 (DIVISION). J. Engel et al., "Project Aria", 2023 (RAD_TAN_THIN_PRISM_FISHEYE).
     """
     numbers = [float(value) for value in params]
     if model not in COLMAP_FOREIGN:
-        return camera_from_colmap(model, width, height, numbers, source)
+        return camera_from_colmap(model, width, height, numbers)
     _, count = COLMAP_FOREIGN[model]
     if len(numbers) != count:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {len(numbers)} parameters for {model}, {count} needed"
-        )
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{len(numbers)} parameters for {model}, {count} needed")
     double = model.startswith("SIMPLE_")
     focal, others = (numbers[:1] * 2, numbers[1:]) if double else (numbers[:2], numbers[2:])
     if model in ("SIMPLE_FISHEYE", "FISHEYE"):  # without distortion
-        return camera_from_colmap("OPENCV_FISHEYE", width, height, [*focal, *others, 0, 0, 0, 0], source)
-    camera_from_colmap("PINHOLE", width, height, [*focal, *others[:2]], source)  # refuses impossible values
+        return camera_from_colmap("OPENCV_FISHEYE", width, height, [*focal, *others, 0, 0, 0, 0])
+    camera_from_colmap("PINHOLE", width, height, [*focal, *others[:2]])  # refuses impossible values
     coefficients, centre = np.array(others[2:]), np.array(others[:2]) - COLMAP_PIXEL_ORIGIN
-    require_finite(coefficients, source)
+    require_finite(coefficients)
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
             return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), coefficients)
 
-    return ForeignLens(f"COLMAP's {model}", project, int(width), int(height), source)
+    return ForeignLens(f"COLMAP's {model}", project, int(width), int(height))
 
 
 def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndarray:
@@ -137,8 +121,8 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
                 raise sqlite3.DatabaseError("no such table: cameras")
             rows = database.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
         cameras = {str(number): (NUMBERS[model], *rest) for number, model, *rest in rows}
-        model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), str(path))]
-        return of_colmap(model, width, height, np.frombuffer(params, "<f8"), str(path))
+        model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice))]
+        return of_colmap(model, width, height, np.frombuffer(params, "<f8"))
     except (sqlite3.Error, KeyError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:100]
         with open(path, "rb") as stream:
@@ -146,12 +130,10 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         if isinstance(error, sqlite3.Error) and head[18:] == WRITE_AHEAD and not _has_log(path):
             raise InputError(
                 "E-CAMERA-UNREADABLE",
-                f"camera file {path}: a database whose newest content is in {path.name}-wal, which is missing or empty "
+                f"a database whose newest content is in {path.name}-wal, which is missing or empty "
                 f"({reason}); copy both, or close the program that has it open and copy again",
             ) from error
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {path}: no database of COLMAP ({reason}); check it"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", f"no database of COLMAP ({reason}); check it") from error
 
 
 STORED_TABLE = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'cameras' AND sql NOT LIKE '%VIRTUAL%'"
@@ -169,43 +151,36 @@ def numbered(cameras: Collection[str], choice: str) -> str:
     return choice if choice.isdigit() or len(cameras) > 1 else ""
 
 
-def one_of(names: list[str], choice: str, source: str) -> str:
+def one_of(names: list[str], choice: str) -> str:
     """Return the name of the camera ``choice`` of a file, or of its only camera."""
     if not names:
-        raise InputError("E-CAMERA-NONE", f"camera file {source}: no camera in it, 1 needed")
+        raise InputError("E-CAMERA-NONE", "no camera in it, 1 needed")
     if choice not in names and (choice or len(names) > 1):
         asked = f"no camera {choice}" if choice else f"{len(names)} cameras, 1 needed"
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
         raise InputError(
-            "E-CAMERA-SEVERAL",
-            f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name",
+            "E-CAMERA-SEVERAL", f"{asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name"
         )
     others = [name for name in names if name != (choice or names[0])]
     pass_over(others, "the other cameras, " if len(others) > 1 else "the other camera, ")
     return choice or names[0]
 
 
-def require_finite(numbers, source: str) -> None:
+def require_finite(numbers) -> None:
     """Refuse parameters of a camera that are not finite."""
     if not np.isfinite(numbers).all():
-        raise InputError(
-            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
-        )
+        raise InputError("E-CAMERA-NOT-FINITE", "a camera parameter is not a finite number; correct it")
 
 
-def of_opencv(
-    lens, given: np.ndarray, width: float, height: float, source: str, skew: float = 0.0
-) -> CameraModel | ForeignLens:
-    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
-
-    ``skew`` : px, u = fx x + skew y + cx.
-    """
+def of_opencv(lens, given: np.ndarray, width: float, height: float, skew: float = 0.0) -> CameraModel | ForeignLens:
+    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor;
+    with ``skew``, px, u = fx x + skew y + cx."""
     if not abs(skew) <= SQUARE * abs(lens[0]):
-        return of_parts(lens, skew, given, "perspective", width, height, source)
+        return of_parts(lens, skew, given, "perspective", width, height)
     if len(given) not in (12, 14) or not given[8:].any():
-        return camera_from_opencv(lens, given, False, width, height, source)
-    camera_from_opencv(lens, given[:8], False, width, height, source)  # refuses impossible values
-    require_finite(given, source)
+        return camera_from_opencv(lens, given, False, width, height)
+    camera_from_opencv(lens, given[:8], False, width, height)  # refuses impossible values
+    require_finite(given)
     fx, fy, cx, cy = lens
     matrix, still = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.zeros(3)
 
@@ -214,28 +189,23 @@ def of_opencv(
 
     tilted = len(given) == 14 and given[12:].any()
     called = "OpenCV's lens with a tilted sensor" if tilted else "OpenCV's lens with thin prisms"
-    return ForeignLens(called, project, int(width) or None, int(height) or None, source)
+    return ForeignLens(called, project, int(width) or None, int(height) or None)
 
 
 def of_parts(
-    lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, source: str, xi: float = 0.0
+    lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, xi: float = 0.0
 ) -> ForeignLens:
-    """Return a lens of a projection, OpenCV's distortion, and a matrix with skew.
+    """Return a lens of a projection, OpenCV's distortion (k,), and a matrix of fx, fy, cx, cy with skew as of
+    :func:`of_opencv`.
 
-    Parameters
-    ----------
-    lens : fx, fy, cx, cy, px
-    skew : px, u = fx x + skew y + cx
-    given : (k,) coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens
-    kind : perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
-        camodocal's MEI
-    width, height : image size, px; 0 if the file states none
+    ``kind`` : perspective, equidistant (k1 to k4), or unified: Mei's projection with ``xi``, of OpenCV's omnidir,
+    Kalibr's omni and camodocal's MEI; sides of 0 px if the file states none.
     """
-    camera = camera_from_opencv(lens, given, kind == "equidistant", width, height, source)
+    camera = camera_from_opencv(lens, given, kind == "equidistant", width, height)
     if not abs(skew) < abs(camera.focal[0]):
-        raise InputError("E-CAMERA-SKEW", f"camera file {source}: skew {skew:g} px, less than fx needed; correct it")
+        raise InputError("E-CAMERA-SKEW", f"skew {skew:g} px, less than fx needed; correct it")
     if not (np.isfinite(xi) and xi >= 0):
-        raise InputError("E-CAMERA-CONTENT", f"camera file {source}: xi {xi:g}; a number from 0 needed")
+        raise InputError("E-CAMERA-CONTENT", f"xi {xi:g}; a number from 0 needed")
     (fx, fy), (cx, cy) = camera.focal, camera.centre
     matrix = np.array([[fx, skew, cx], [0, fy, cy]])
     flat = Camera(1, 1, [1, 1], [0, 0], camera.distortion, kind == "equidistant")
@@ -246,19 +216,12 @@ def of_parts(
         return np.column_stack([distorted, np.ones(len(distorted))]) @ matrix.T
 
     called = f"a unified lens with ξ = {xi:g}" if kind == "unified" else "a lens with skewed axes"
-    return ForeignLens(called, project, camera.width, camera.height, source)
+    return ForeignLens(called, project, camera.width, camera.height)
 
 
-def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size, source: str) -> ForeignLens:
+def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray, size) -> ForeignLens:
     """Return the lens of Kalibr's models omni, eucm, ds or pinhole with radtan, equidistant, fov or no distortion.
 
-    Raises
-    ------
-    InputError
-        Numbers are missing or impossible.
-
-    References
-    ----------
     C. Mei, P. Rives, "Single View Point Omnidirectional Camera Calibration from Planar Grids", ICRA 2007. B. Khomutenko
     et al., "An Enhanced Unified Camera Model", RA-L 2016. V. Usenko et al., "The Double Sphere Camera Model", 3DV 2018.
     F. Devernay, O. Faugeras, "Straight lines have to be straight", Machine Vision and Applications 13, 2001.
@@ -273,17 +236,15 @@ def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray
     ):
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
-            f"camera file {source}: {lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
+            f"{lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
             f"finite numbers; {numbers.size} and {coefficients.size} found",
         )
     shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
     if (focal <= 0).any():
-        raise InputError(
-            "E-CAMERA-FOCAL", f"camera file {source}: focal length {focal.tolist()}; positive numbers needed"
-        )
+        raise InputError("E-CAMERA-FOCAL", f"focal length {focal.tolist()}; positive numbers needed")
     width, height = map(int, size)
     fisheye = distortion == "equidistant"
-    in_opencv_order = opencv_lens(np.zeros(0) if distortion == "fov" else coefficients, fisheye, source)[0]
+    in_opencv_order = opencv_lens(np.zeros(0) if distortion == "fov" else coefficients, fisheye)[0]
     flat = Camera(1, 1, [1, 1], [0, 0], in_opencv_order, fisheye)
 
     def project(rays: np.ndarray) -> np.ndarray:
@@ -291,7 +252,7 @@ def of_kalibr(lens: str, distortion: str, numbers: np.ndarray, given: np.ndarray
             xy = _on_plane(rays, lens, shape)
             return centre + focal * (_of_fov(xy, coefficients[0]) if distortion == "fov" else flat.distort(xy))
 
-    return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None, source)
+    return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None)
 
 
 def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
@@ -312,26 +273,22 @@ def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
 
 
 def _of_fov(xy: np.ndarray, omega: float) -> np.ndarray:
-    """Return normalised coordinates (n, 2) with the radial distortion of the model fov."""
     r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius the model is linear
     return xy * (np.arctan(2 * r * np.tan(omega / 2)) / (omega * r))[:, None]
 
 
-def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
+def of_splines(name: str, numbers: list[float], width: float, height: float) -> ForeignLens:
     """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2)."""
     match = SPLINED.fullmatch(name)
     if match is None:
         raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera file {source}: {name[:80]} does not have mrcal's form of a splined model; write it again with "
-            "mrcal",
+            "E-CAMERA-MODEL", f"{name[:80]} does not have mrcal's form of a splined model; write it again with mrcal"
         )
     order, columns, rows, wide = (int(word) for word in match.groups())
     if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
-            f"camera file {source}: {len(numbers)} intrinsics of {columns}×{rows} points; "
-            f"{4 + 2 * columns * rows} needed",
+            f"{len(numbers)} intrinsics of {columns}×{rows} points; {4 + 2 * columns * rows} needed",
         )
     focal, centre = np.array(numbers[:2]), np.array(numbers[2:4])
     control = np.array(numbers[4:]).reshape(rows, columns, 2)
@@ -347,7 +304,7 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
         return centre + focal * (u + np.column_stack(moved))
 
     called = f"mrcal's splines of {columns}×{rows} points"
-    return ForeignLens(called, project, int(width), int(height), source)
+    return ForeignLens(called, project, int(width), int(height))
 
 
 def refused(camera: Camera, form: str, why: str) -> InputError:
@@ -355,32 +312,22 @@ def refused(camera: Camera, form: str, why: str) -> InputError:
     return InputError("E-CAMERA-FORM", f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
 
 
-def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2.
+def of_cahvor(numbers, width: float, height: float) -> CameraModel | ForeignLens:
+    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2; a
+    supported model if both angles are zero.
 
-    If both angles are zero, it is a supported model.
-
-    Raises
-    ------
-    InputError
-        The number of parameters is wrong, or values are impossible.
-
-    References
-    ----------
-    D. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006: a ray P is bent to
-    P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ².
+    A ray P is bent to P + μ (P − ζ o), with ζ = P · o, τ = |P|² / ζ² − 1 and μ = r0 + r1 τ + r2 τ² (D. Gennery,
+    "Generalized camera calibration including fish-eye lenses", IJCV 68, 2006).
     """
     if len(numbers) != 9:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed"
-        )
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{len(numbers)} intrinsics of LENSMODEL_CAHVOR; 9 needed")
     (fx, fy, cx, cy), (alpha, beta, *r) = numbers[:4], numbers[4:]
-    require_finite(numbers, source)
+    require_finite(numbers)
     if alpha == beta == 0:
         grown = 1 + r[0]
         k1, k2 = (r[1] / grown, r[2] / grown) if grown else (0.0, 0.0)
-        return of_opencv([fx * grown, fy * grown, cx, cy], np.array([k1, k2, 0.0, 0.0]), width, height, source)
-    camera_from_opencv([fx, fy, cx, cy], np.zeros(4), False, width, height, source)  # refuses impossible values
+        return of_opencv([fx * grown, fy * grown, cx, cy], np.array([k1, k2, 0.0, 0.0]), width, height)
+    camera_from_opencv([fx, fy, cx, cy], np.zeros(4), False, width, height)  # refuses impossible values
     axis = np.array([np.sin(alpha) * np.cos(beta), np.sin(beta), np.cos(alpha) * np.cos(beta)])
 
     def project(rays: np.ndarray) -> np.ndarray:
@@ -392,4 +339,4 @@ def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel 
             xy = np.array([cx, cy]) + np.array([fx, fy]) * bent[:, :2] / bent[:, 2:]
         return np.where(inside[:, None], xy, np.nan)
 
-    return ForeignLens("mrcal's CAHVOR", project, int(width), int(height), source)
+    return ForeignLens("mrcal's CAHVOR", project, int(width), int(height))

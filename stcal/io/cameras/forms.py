@@ -15,19 +15,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera, parameter_names
-from stcal.io.cameras import metashape
-from stcal.io.cameras.foreign import (
-    COLMAP_FOREIGN,
-    NUMBERS,
-    ForeignLens,
-    numbered,
-    of_cahvor,
-    of_colmap,
-    of_opencv,
-    of_splines,
-    one_of,
-    refused,
-)
+from stcal.io.cameras import foreign, metashape
 from stcal.io.cameras.keys import pass_over, require_known
 from stcal.io.cameras.matlab import mat
 from stcal.io.cameras.model import CameraModel, cameras_txt
@@ -69,7 +57,7 @@ def is_mrcal(text: str) -> bool:
     return "lensmodel" in text and "imagersize" in text
 
 
-def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
+def from_mrcal(text: str, _: str) -> CameraModel | foreign.ForeignLens:
     """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined."""
     try:
         values = ast.literal_eval(text.strip())
@@ -77,42 +65,38 @@ def from_mrcal(text: str, _: str, source: str) -> CameraModel | ForeignLens:
         width, height = (float(v) for v in values["imagersize"])
     except (SyntaxError, ValueError, TypeError, KeyError, RecursionError, MemoryError) as error:
         reason = " ".join(str(error).split())[:100]
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal"
-        ) from error
-    region = _region(values.get("valid_intrinsics_region"), source)
+        raise InputError("E-CAMERA-UNREADABLE", f"not mrcal's form ({reason}); write it anew with mrcal") from error
+    region = _region(values.get("valid_intrinsics_region"))
     taken = ("lensmodel", "intrinsics", "imagersize", "valid_intrinsics_region")
-    require_known({key: value for key, value in values.items() if key not in taken}, source, MRCAL_HARMLESS)
+    require_known({key: value for key, value in values.items() if key not in taken}, MRCAL_HARMLESS)
     if str(lens).startswith("LENSMODEL_SPLINED"):
-        made = of_splines(lens, numbers, width, height, source)
+        made = foreign.of_splines(lens, numbers, width, height)
     elif lens == "LENSMODEL_CAHVOR":
-        made = of_cahvor(numbers, width, height, source)
+        made = foreign.of_cahvor(numbers, width, height)
     elif lens in MRCAL and len(numbers) == 4 + MRCAL[lens]:
-        made = of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
+        made = foreign.of_opencv(numbers[:4], np.array(numbers[4:]), width, height)
     else:
         raise InputError(
             "E-CAMERA-MODEL",
-            f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
+            f"{lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
             "ones are read: mrcal-convert-lensmodel makes one of another",
         )
-    if isinstance(made, ForeignLens):
+    if isinstance(made, foreign.ForeignLens):
         return replace(made, region=region)
     pass_over([] if region is None else ["valid_intrinsics_region"])
     return made
 
 
-def _region(stated: object, source: str) -> np.ndarray | None:
+def _region(stated: object) -> np.ndarray | None:
     """Return mrcal's polygon (n, 2), px, in which the intrinsics are valid; None if the file states none."""
     try:
         region = None if stated is None else np.array(stated, float)
     except (TypeError, ValueError):
-        region = np.full(1, np.nan)  # refused below
+        region = np.full(1, np.nan)  # foreign.refused below
     if region is not None and not region.size:
         return None
     if region is not None and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
-        raise InputError(
-            "E-CAMERA-CONTENT", f"camera file {source}: valid_intrinsics_region is no list of pixels; remove it"
-        )
+        raise InputError("E-CAMERA-CONTENT", "valid_intrinsics_region is no list of pixels; remove it")
     return region
 
 
@@ -124,34 +108,28 @@ def is_colmap_binary(content: bytes) -> bool:
     return count <= (len(content) - 8) // LEAST_CAMERA_BYTES
 
 
-def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
+def from_colmap_binary(content: bytes, choice: str) -> CameraModel | foreign.ForeignLens:
     """Return the camera of ``cameras.bin``, or the one of number ``choice``."""
     try:
         (count,) = struct.unpack_from("<Q", content, 0)
         at, cameras = 8, {}
         for _ in range(min(count, len(content) // 24)):
             number, kind, width, height = struct.unpack_from("<IiQQ", content, at)
-            model = NUMBERS[kind]
-            length = COLMAP_FOREIGN[model][1] if model in COLMAP_FOREIGN else len(parameter_names(model))
+            model = foreign.NUMBERS[kind]
+            _, length = foreign.COLMAP_FOREIGN.get(model) or (0, len(parameter_names(model)))
             cameras[str(number)] = model, width, height, struct.unpack_from(f"<{length}d", content, at + 24)
             at += 24 + 8 * length
     except (struct.error, KeyError) as error:
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor a cameras.bin of known models; check it"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", "neither text nor a cameras.bin of known models; check it") from error
     if at != len(content) or not cameras:
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor COLMAP's cameras.bin; check it"
-        )
-    model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), source)]
-    return of_colmap(model, width, height, params, source)
+        raise InputError("E-CAMERA-UNREADABLE", "neither text nor COLMAP's cameras.bin; check it")
+    model, width, height, params = cameras[foreign.one_of(list(cameras), foreign.numbered(cameras, choice))]
+    return foreign.of_colmap(model, width, height, params)
 
 
 def name_to_write(name: str) -> str:
-    """Return a name that every form can hold, of the name that chose a camera: ``Cam B (35mm)`` gives ``Cam_B_35mm``.
-
-    A number gets ``cam`` in front; without a name it is ``cam0``.
-    """
+    """Return a name that every form can hold, of the name that chose a camera: ``Cam_B_35mm`` of ``Cam B (35mm)``,
+    ``cam1`` of 1, ``cam0`` of none."""
     word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
     if not word:
         return "cam0"
@@ -159,13 +137,8 @@ def name_to_write(name: str) -> str:
 
 
 def written(camera: Camera, form: str, name: str) -> Written:
-    """Return the file of a camera.
-
-    ``camera`` : camera to write; ``form`` : one of :data:`WRITERS`; ``name`` : name of the camera, for forms that have
-    a place for it.
-
-    Raises InputError: the form cannot hold the lens (the message names one that can), or the name is no word.
-    """
+    """Return the file of a camera in one of :data:`WRITERS`, with its name where the form has a place for it; refuse a
+    lens that the form cannot hold, and a name that is no word."""
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(
             "E-CAMERA-NAME", f"camera name {name}: letters, digits and _ needed, a letter first, such as cam0"
@@ -180,7 +153,7 @@ def written(camera: Camera, form: str, name: str) -> Written:
 
 def _colmap_binary(camera: Camera, _: str) -> bytes:
     params = camera.colmap_params()
-    number = next(number for number, name in NUMBERS.items() if name == camera.colmap_model)
+    number = next(number for number, name in foreign.NUMBERS.items() if name == camera.colmap_model)
     head = struct.pack("<QIiQQ", 1, 1, number, camera.width, camera.height)
     return head + struct.pack(f"<{len(params)}d", *params)
 
@@ -189,7 +162,7 @@ def _fisheye_four(camera: Camera, form: str) -> list[float]:
     """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
     others = [*camera.distortion[2:4], *camera.distortion[8:]]
     if any(others):
-        raise refused(camera, form, "p1, p2 and prisms")
+        raise foreign.refused(camera, form, "p1, p2 and prisms")
     return [float(camera.distortion[i]) for i in (0, 1, 4, 5)]
 
 
@@ -238,7 +211,7 @@ def _kalibr(camera: Camera, name: str) -> str:
     else:
         kind, values = "radtan", [float(k) for k in camera.distortion[:4]]
         if camera.distortion[4:].any():
-            raise refused(camera, "kalibr", "more than k1, k2, p1, p2")
+            raise foreign.refused(camera, "kalibr", "more than k1, k2, p1, p2")
     lens = [*camera.focal.tolist(), *camera.centre.tolist()]
     return (
         f"{name}:\n  camera_model: pinhole\n  intrinsics: {lens}\n  distortion_model: {kind}\n"
@@ -248,7 +221,7 @@ def _kalibr(camera: Camera, name: str) -> str:
 
 def _mrcal(camera: Camera, _: str) -> str:
     if camera.fisheye:
-        raise refused(camera, "mrcal", "the equidistant projection")
+        raise foreign.refused(camera, "mrcal", "the equidistant projection")
     values = _coefficients(camera) if camera.distortion.any() else []
     values = values[:4] if len(values) == 5 and not values[4] else values
     lens = next(name for name, count in MRCAL.items() if count == len(values))

@@ -6,16 +6,14 @@
 
 import json
 import re
-import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import numpy as np
 
-from stcal.errors import InputError, InputNote
+from stcal.errors import InputError
 from stcal.io.cameras.foreign import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
-from stcal.io.cameras.keys import Keys, is_neutral, numbers_of, plain, require_known
+from stcal.io.cameras.keys import Keys, is_neutral, note, numbers_of, plain, require_known
 from stcal.io.cameras.matlab import MARKS, from_structure
 from stcal.io.cameras.model import EQUIDISTANT, CameraModel, camera_from_opencv, camera_model
 from stcal.io.toml import load_documents
@@ -25,11 +23,8 @@ TAB = 4
 
 
 def values_of(text: str) -> dict:
-    """Return the keys and values of a text in JSON, XML or YAML.
-
-    Raises ValueError, yaml.YAMLError, ElementTree.ParseError: the text is none of these, or holds several documents
-    that differ.
-    """
+    """Return the keys and values of a text in JSON, XML or YAML; raise ValueError, YAMLError or ParseError if it is
+    none of these, or holds several documents that differ."""
     if text.lstrip().startswith("<"):
         return _xml_values(ElementTree.fromstring(text))
     try:
@@ -84,10 +79,8 @@ def is_ini(text: str) -> bool:
 
 
 def ini_cameras(text: str) -> dict[str, dict]:
-    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``.
-
-    A key has a line of its own; the lines of its numbers follow. Raises ValueError: a line is neither.
-    """
+    """Return the cameras of ROS's INI by name: every section with a matrix, each with the keys of ``[image]``. A key
+    has a line of its own; the lines of its numbers follow."""
     sections: dict[str, dict] = {}
     section, numbers = {}, []
     for line in (line.split("#")[0].strip() for line in text.splitlines()):
@@ -127,27 +120,22 @@ NEAR = 0.25
 Lens = CameraModel | ForeignLens
 
 
-def from_keys(values: dict, choice: str, source: str) -> Lens:
-    """Return a camera of keys and values; ``choice`` : its name or number if there are several.
-
-    Raises InputError: there is no camera, several and no choice, an unsupported lens, a key that may change the
-    projection, or a value is impossible.
-    """
+def from_keys(values: dict, choice: str) -> Lens:
+    """Return a camera of keys and values; ``choice`` : its name or number if there are several."""
     for cameras_of, read in FORMATS:
         if cameras := cameras_of(values):
             names = list(cameras)
-            return read(Keys(dict(cameras["" if names == [""] else one_of(names, choice, source)]), source))
+            return read(Keys(dict(cameras["" if names == [""] else one_of(names, choice)])))
     raise InputError(
         "E-CAMERA-CONTENT",
-        f"camera file {source}: no camera of {READ}; convert it there, or write camera_matrix and "
-        "distortion_coefficients as OpenCV has them",
+        f"no camera of {READ}; convert it there, or write camera_matrix and distortion_coefficients as OpenCV has them",
     )
 
 
-def from_ini(text: str, choice: str, source: str) -> Lens:
+def from_ini(text: str, choice: str) -> Lens:
     """Return a camera of ROS's INI; errors as :func:`from_keys`."""
     cameras = ini_cameras(text)
-    return of_matrix(Keys(cameras[one_of(list(cameras), choice, source)], source))
+    return of_matrix(Keys(cameras[one_of(list(cameras), choice)]))
 
 
 def of_matrix(keys: Keys) -> Lens:
@@ -158,7 +146,7 @@ def of_matrix(keys: Keys) -> Lens:
     _require_whole_image(keys, width, height)
     if numbers_of(keys.left.get("F")).size == 9:  # the fundamental matrix of a pair
         del keys.left["F"]
-    require_known(keys.left, keys.source, undistorted=given is None)
+    require_known(keys.left, undistorted=given is None)
     given = np.zeros(0) if given is None else given
     kind = _kind(said, xi, given, keys)
     lens, skew = _lens_of(matrix, keys)
@@ -175,17 +163,17 @@ def _camera(
     last = 4 if kind == "equidistant" else 5
     given = given[:last] if last < len(given) < 8 and not given[last:].any() else given  # zeros beyond the model's
     if kind == "equidistant" and len(given) not in (0, 4):
-        raise keys.fault(
+        raise InputError(
             "E-CAMERA-COEFFICIENTS",
             f"{len(given)} coefficients, but by its model, or fisheye_model, the lens is equidistant; k1 to k4 needed",
         )
     if listed:
         _require_order(lens, width, height, keys)
     if kind == "unified" or (kind == "equidistant" and not abs(skew) <= SQUARE * abs(lens[0])):
-        return of_parts(lens, skew, given, kind, width, height, keys.source, xi)
+        return of_parts(lens, skew, given, kind, width, height, xi)
     if kind == "equidistant":
-        return camera_from_opencv(lens, given, True, width, height, keys.source)
-    return of_opencv(lens, given, width, height, keys.source, skew)
+        return camera_from_opencv(lens, given, True, width, height)
+    return of_opencv(lens, given, width, height, skew)
 
 
 SAYS_LENS = {
@@ -207,7 +195,7 @@ def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) 
             kinds[name] = LENSES[word]
         elif word not in UNDISTORTED and not (word in INVERSE and not given.any()):
             why = "its coefficients are those of another formula; " if word in INVERSE else ""
-            raise keys.fault(
+            raise InputError(
                 "E-CAMERA-MODEL",
                 f"{name} {' '.join(str(value).split())[:60]!r} is not supported; {why}calibrate anew with plumb_bob or "
                 "equidistant",
@@ -215,9 +203,9 @@ def _kind(said: Mapping[str, object], xi: float, given: np.ndarray, keys: Keys) 
     both = set(kinds.values()) - ({"perspective"} if "unified" in kinds.values() else set())
     if len(both) > 1:
         words = ", ".join(f"{name} says {kind}" for name, kind in kinds.items())
-        raise keys.fault("E-CAMERA-MODEL", f"{words}; correct one of them")
+        raise InputError("E-CAMERA-MODEL", f"{words}; correct one of them")
     if "unified" in both and not xi:
-        raise keys.fault("E-CAMERA-CONTENT", "a unified lens without xi; add it")
+        raise InputError("E-CAMERA-CONTENT", "a unified lens without xi; add it")
     return both.pop() if both else "perspective"
 
 
@@ -229,7 +217,7 @@ def _require_whole_image(keys: Keys, width: float, height: float) -> None:
     whole = {"binning_x": 1, "binning_y": 1, "roi.width": width, "roi.height": height}
     for key, value in stated.items():
         if not is_neutral(value) and value != whole.get(key):
-            raise keys.fault(
+            raise InputError(
                 "E-CAMERA-KEY",
                 f"{key} = {value}, so that K is for a larger image of which yours is a part; set it to 0 if your "
                 "images have the file's full size, else calibrate at their size",
@@ -240,23 +228,23 @@ def _lens_of(matrix: np.ndarray | None, keys: Keys) -> tuple[list[float], float]
     """Return fx, fy, cx, cy and the skew, px, of a matrix by rows."""
     if matrix is None or matrix.size != 9:
         count = 0 if matrix is None else matrix.size
-        raise keys.fault("E-CAMERA-COEFFICIENTS", f"camera_matrix of {count} numbers; 3×3 needed")
+        raise InputError("E-CAMERA-COEFFICIENTS", f"camera_matrix of {count} numbers; 3×3 needed")
     matrix = matrix.reshape(3, 3)
     if not matrix.any():
-        raise keys.fault(
+        raise InputError(
             "E-CAMERA-UNCALIBRATED",
             "camera_matrix is all zero, as published by a driver for an uncalibrated camera; calibrate it with "
             "`stcal-sfm calibrate-camera`, or load its calibration into the driver",
         )
     if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
         turned = (matrix.T[[1, 2, 2, 2], [0, 0, 1, 2]] == [0, 0, 0, 1]).all()
-        raise keys.fault(
+        raise InputError(
             "E-CAMERA-MATRIX",
             "camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; "
             + ("it is transposed: write it row by row" if turned else "write it row by row, with 0 0 1 last"),
         )
     if np.isnan(matrix[0, 1]):
-        raise keys.fault("E-CAMERA-SKEW", "skew nan; a finite number needed")
+        raise InputError("E-CAMERA-SKEW", "skew nan; a finite number needed")
     return [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], float(matrix[0, 1])
 
 
@@ -264,15 +252,14 @@ def _say_no_model(given: np.ndarray, keys: Keys) -> None:
     """Name four coefficients without a model, as OpenCV's fisheye has; refuse those that must be a fisheye's."""
     model = "distortion_model: equidistant"
     if np.abs(given[2:]).max() > MOST_TANGENTIAL:
-        raise keys.fault(
+        raise InputError(
             "E-CAMERA-MODEL",
             f"4 coefficients D without a lens model: for a perspective lens, the tangential ones {given[2]:g} and "
             f"{given[3]:g} are larger than {MOST_TANGENTIAL:g}; add {model} if the lens is OpenCV's fisheye, else "
             "distortion_model: plumb_bob",
         )
     if given.any():
-        said = f"4 coefficients without a model, taken as k1, k2, p1, p2; of OpenCV's fisheye, add {model}"
-        warnings.warn(f"camera file {keys.source}: {said}", InputNote, stacklevel=2)
+        note(f"4 coefficients without a model, taken as k1, k2, p1, p2; of OpenCV's fisheye, add {model}")
 
 
 def _require_order(lens: list[float], width: float, height: float, keys: Keys) -> None:
@@ -280,7 +267,7 @@ def _require_order(lens: list[float], width: float, height: float, keys: Keys) -
     size = np.array([width, height])
     near = [(np.abs(np.array(lens[2:]) - each / 2) < NEAR * each).all() for each in (size, size[::-1])]
     if not near[0] and near[1]:
-        raise keys.fault(
+        raise InputError(
             "E-CAMERA-SIZE",
             f"size {width:g}×{height:g} px, but the principal point ({lens[2]:g}, {lens[3]:g}) px is near the middle "
             "of the sides exchanged; width first needed",
@@ -293,11 +280,11 @@ def _of_kalibr(keys: Keys) -> Lens:
     lens = plain(keys.take("camera_model", "type") or "pinhole")
     word = plain(keys.take("distortion_model") or "none")
     size = keys.size()
-    require_known(keys.left, keys.source, undistorted=given is None)
+    require_known(keys.left, undistorted=given is None)
     kind = LENSES.get(word, word)
     distortion = "radtan" if kind == "perspective" else kind
     if lens not in ("pinhole", "omni", "eucm", "ds") or distortion not in ("radtan", "equidistant", "fov", "none"):
-        raise keys.fault(
+        raise InputError(
             "E-CAMERA-MODEL",
             f"{lens[:40]} with {distortion[:40]}; pinhole, omni, eucm, ds with radtan, equidistant, fov or none are "
             "read",
@@ -305,11 +292,11 @@ def _of_kalibr(keys: Keys) -> Lens:
     assert numbers is not None  # by which the format is recognised
     given = np.zeros(0) if given is None else given
     if lens != "pinhole" or distortion == "fov":
-        return of_kalibr(lens, distortion, numbers, given, size[:2], keys.source)
+        return of_kalibr(lens, distortion, numbers, given, size[:2])
     if numbers.size != 4:
-        raise keys.fault("E-CAMERA-COEFFICIENTS", f"intrinsics of {numbers.size} numbers; 4 needed")
+        raise InputError("E-CAMERA-COEFFICIENTS", f"intrinsics of {numbers.size} numbers; 4 needed")
     if distortion == "none" and given.any():
-        raise keys.fault("E-CAMERA-MODEL", "distortion_coeffs without a distortion model; add distortion_model")
+        raise InputError("E-CAMERA-MODEL", "distortion_coeffs without a distortion model; add distortion_model")
     return _camera(keys, numbers.tolist(), np.zeros(0) if distortion == "none" else given, kind, size)
 
 
@@ -326,30 +313,30 @@ def _of_camodocal(keys: Keys) -> Lens:
     """Return the camera of camodocal's keys, which VINS has, too."""
     named = keys.take("model_type", "type")
     if plain(named) not in CAMODOCAL:
-        raise keys.fault("E-CAMERA-MODEL", f"model_type {str(named)[:40]!r}; PINHOLE, MEI, KANNALA_BRANDT are read")
+        raise InputError("E-CAMERA-MODEL", f"model_type {str(named)[:40]!r}; PINHOLE, MEI, KANNALA_BRANDT are read")
     kind, lens_keys, names = CAMODOCAL[plain(named)]
     if kind == "equidistant":
         keys.take("fisheye")  # a setting of VINS
     for part in ("projection_parameters", "distortion_parameters", "mirror_parameters"):
         stated = keys.left.pop(part, {})
         if not isinstance(stated, Mapping) or not keys.left.keys().isdisjoint(stated):
-            raise keys.fault("E-CAMERA-CONTENT", f"{part} is no list of new keys; correct it")
+            raise InputError("E-CAMERA-CONTENT", f"{part} is no list of new keys; correct it")
         keys.left.update(stated)
     lens = [keys.number(name) for name in lens_keys.split()]
     given = np.array([keys.number(name, 0.0) for name in names.split()])
     xi = keys.number("xi") if kind == "unified" else 0.0
     size = keys.size()
-    require_known(keys.left, keys.source)
+    require_known(keys.left)
     return _camera(keys, lens, given, kind, size, xi=xi)
 
 
 def _of_industrial(keys: Keys) -> CameraModel:
     """Return the camera of ROS-Industrial; its lens may have distortion, though the form has none."""
-    own = Keys(dict(keys.left.pop("intrinsics")), keys.source)  # type: ignore[call-overload]
+    own = Keys(dict(keys.left.pop("intrinsics")))  # type: ignore[call-overload]
     lens = [own.number(name) for name in ("fx", "fy", "cx", "cy")]
     width, height, _ = keys.size()
-    require_known(keys.left | own.left, keys.source, undistorted=True)
-    return camera_model(np.array([*lens, *[0.0] * 8]), "OPENCV", width or None, height or None, Path(keys.source))
+    require_known(keys.left | own.left, undistorted=True)
+    return camera_model(np.array([*lens, *[0.0] * 8]), "OPENCV", width or None, height or None)
 
 
 def _matrix_cameras(values: dict) -> dict[str, dict]:
@@ -379,7 +366,7 @@ def _if(test: Callable[[dict], bool]) -> Callable[[dict], dict[str, dict]]:
 
 
 FORMATS: tuple[tuple[Callable[[dict], dict[str, dict]], Callable[[Keys], Lens]], ...] = (
-    (_if(lambda values: not values.keys().isdisjoint(MARKS)), lambda keys: from_structure(keys.left, keys.source)),
+    (_if(lambda values: not values.keys().isdisjoint(MARKS)), lambda keys: from_structure(keys.left)),
     (_if(lambda values: "model_type" in values), _of_camodocal),
     (_kalibr_cameras, _of_kalibr),
     (

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.errors import InputError, InputNote
+from stcal.errors import InputError, InputNote, named
 
 _HARMLESS = """
 cameraid cameraindex cameraname cameraserial camname camoverlaps comment createdat createdby data description
@@ -51,6 +51,24 @@ UNIT_WITHIN = 1e-3
 SHOWN = 6
 """Largest number of keys that a message names."""
 _passed_over: ContextVar[list[str] | None] = ContextVar("_passed_over", default=None)
+_file: ContextVar[str] = ContextVar("_file", default="")
+"""The camera file that is read, as messages name it."""
+
+
+@contextmanager
+def reading(file: str) -> Iterator[None]:
+    """Let errors and notes name the camera file that is read in the context."""
+    token = _file.set(file)
+    try:
+        with named(file):
+            yield
+    finally:
+        _file.reset(token)
+
+
+def note(text: str) -> None:
+    """Warn of something in the camera file that is read."""
+    warnings.warn(f"{_file.get()}: {text}", InputNote, stacklevel=3)
 
 
 @contextmanager
@@ -122,15 +140,12 @@ def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
             yield inner, value
 
 
-def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), undistorted: bool = False) -> None:
-    """Report the keys of a camera file that its reader did not use. Harmless keys are ignored silently, others with an
-    :class:`InputNote`.
+def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: bool = False) -> None:
+    """Report the keys that a reader did not use: harmless ones are ignored silently, others with an :class:`InputNote`;
+    one that may change the projection is refused unless its value is 0 or empty.
 
-    ``unread`` : keys and values; values may hold further keys; ``source`` : camera file, for messages; ``harmless`` :
-    further harmless keys of the format, or beginnings of them that end in ``*``; as :func:`plain` writes them;
-    ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it.
-
-    Raises InputError: a key may change the projection, and its value is not 0 or empty.
+    ``harmless`` : further harmless keys of the format, as :func:`plain` writes them, or beginnings of them that end in
+    ``*``; ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it.
     """
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []
@@ -152,13 +167,13 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
             taken = "call it distortion_coefficients if it is OpenCV's k1, k2, p1, p2, k3 …; " if coefficients else ""
             raise InputError(
                 "E-CAMERA-KEY",
-                f"camera file {source}: {'.'.join(path)[:80]} = {_short(value)} may change the projection and is not "
+                f"{'.'.join(path)[:80]} = {_short(value)} may change the projection and is not "
                 f"supported; {taken}remove it if the lens is right without it, or calibrate without it",
             )
     if unknown:
         more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""
-        named = ", ".join(key[:40] for key in unknown[:SHOWN])
-        warnings.warn(f"camera file {source}: not known, and passed over: {named}{more}", InputNote, stacklevel=2)
+        first = ", ".join(key[:40] for key in unknown[:SHOWN])
+        note(f"not known, and passed over: {first}{more}")
 
 
 def _with_numbers(unread: Mapping) -> list[str]:
@@ -180,14 +195,9 @@ def _short(value: object) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keys:
-    """The keys of one camera. What a reader takes is removed from ``left``; ``source`` : camera file, for messages."""
+    """The keys of one camera. What a reader takes is removed from ``left``."""
 
     left: dict[str, object]
-    source: str
-
-    def fault(self, code: str, text: str) -> InputError:
-        """Return an error that names the file."""
-        return InputError(code, f"camera file {self.source}: {text}")
 
     def has(self, *names: str) -> bool:
         """Return True if a key of these names is left."""
@@ -202,43 +212,40 @@ class Keys:
         for key in found:
             del self.left[key]
         if len({repr(value) for value in found.values()}) > 1:
-            raise self.fault("E-CAMERA-REPEATED", f"{' and '.join(found)} mean the same and differ; leave one in")
+            raise InputError("E-CAMERA-REPEATED", f"{' and '.join(found)} mean the same and differ; leave one in")
         return next(iter(found.values()), None)
 
     def numbers(self, *names: str) -> np.ndarray | None:
-        """Return the numbers of a key, flat; None if there is no such key.
-
-        Raises ValueError: a word is no number.
-        """
+        """Return the numbers of a key, flat; None if there is no such key; ValueError if a word is no number."""
         if not self.has(*names):
             return None
         value = self.take(*names)
         if isinstance(value, bool):
-            raise self.fault("E-CAMERA-CONTENT", f"{names[0]} is {value}; numbers needed")
+            raise InputError("E-CAMERA-CONTENT", f"{names[0]} is {value}; numbers needed")
         return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
 
     def number(self, name: str, default: float | None = None) -> float:
         """Return one number; ``default`` where there is no such key."""
         numbers = self.numbers(name)
         if numbers is None and default is None:
-            raise self.fault("E-CAMERA-CONTENT", f"no {name}; add it")
+            raise InputError("E-CAMERA-CONTENT", f"no {name}; add it")
         if numbers is not None and numbers.size != 1:
-            raise self.fault("E-CAMERA-COEFFICIENTS", f"{name} of {numbers.size} numbers; 1 needed")
+            raise InputError("E-CAMERA-COEFFICIENTS", f"{name} of {numbers.size} numbers; 1 needed")
         return float(default if numbers is None else numbers[0])  # type: ignore[arg-type]
 
     def size(self) -> tuple[float, float, bool]:
         """Return width and height, px, 0 if the file states none; and whether they are from a list of both."""
         stated = [self.take(f"image_{side}", side) for side in ("width", "height")]
         if any(isinstance(side, bool) for side in stated):
-            raise self.fault("E-CAMERA-SIZE", f"image_width and image_height are {stated}; numbers of pixels needed")
+            raise InputError("E-CAMERA-SIZE", f"image_width and image_height are {stated}; numbers of pixels needed")
         width, height = (float(side or 0) for side in stated)  # type: ignore[arg-type]
         both = self.numbers("image_size", "resolution", "camera_resolution", "img_size")
         if both is None or not both.any():
             return width, height, False
         if both.size != 2:
-            raise self.fault("E-CAMERA-SIZE", f"size of {both.size} numbers; width and height needed")
+            raise InputError("E-CAMERA-SIZE", f"size of {both.size} numbers; width and height needed")
         if width and height and (width, height) != tuple(both):
-            raise self.fault(
+            raise InputError(
                 "E-CAMERA-SIZE",
                 f"size {both[0]:g}×{both[1]:g} px, but image_width and image_height {width:g}×{height:g} px; correct "
                 "one of them",

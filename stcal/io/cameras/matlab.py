@@ -68,10 +68,10 @@ def is_mat(content: bytes) -> bool:
     return content.startswith(HEADS)
 
 
-def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
+def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
     """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras."""
     if content.startswith(HEADS[1]):
-        raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
+        raise InputError("E-CAMERA-UNREADABLE", "of MATLAB 7.3 (HDF5); save it with '-v7'")
     try:
         _require_elements(content[128:], "<" if content[126:128] == b"IM" else ">")
         with warnings.catch_warnings():
@@ -79,26 +79,23 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
             values = loadmat(io.BytesIO(content), simplify_cells=True)
     except Exception as error:  # damaged files fail in many ways, also with unbound names
         reason = " ".join(str(error).split())[:150]
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {source}: not readable as a .mat file ({reason}); save it again"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", f"not readable as a .mat file ({reason}); save it again") from error
     if all(name in values for name in BOUGUET):
-        return _from_bouguet(values, source)
+        return _from_bouguet(values)
     structures = dict(_structures({key: value for key, value in values.items() if not key.startswith("__")}, ""))
     if not structures:
         raise InputError(
             "E-CAMERA-CONTENT",
-            f"camera file {source}: no structure of a camera; save toStruct(cameraParams), since only MATLAB can read "
-            "its objects",
+            "no structure of a camera; save toStruct(cameraParams), since only MATLAB can read its objects",
         )
-    return from_structure(structures[one_of(list(structures), choice, source)], source)
+    return from_structure(structures[one_of(list(structures), choice)])
 
 
 def _require_elements(data: bytes, order: str, arrays: bool = True) -> int:
-    """Return the number of elements, each of which has a type that exists and a size that is there.
+    """Return the number of elements in a row, each of which must have a type that exists and a size that is there.
 
-    SciPy follows any other type into foreign memory, which ends the process. ``data`` : elements in a row; ``order`` :
-    ``<`` or ``>`` for the order of bytes; ``arrays`` : whether arrays may be among them.
+    SciPy follows any other type into foreign memory, which ends the process. ``order`` : ``<`` or ``>`` for the order
+    of bytes; ``arrays`` : whether arrays may be among them.
     """
     at = count = 0
     while at < len(data):
@@ -139,37 +136,32 @@ def _require_array(data: bytes, order: str) -> None:
         raise ValueError("damaged")
 
 
-def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
+def from_structure(values: Mapping) -> CameraModel | ForeignLens:
     """Return the camera of ``toStruct`` of cameraParameters or cameraIntrinsics, as a structure or as JSON."""
     unread = {key: _plain_value(value) for key, value in values.items() if key not in TAKEN}
-    require_known(unread, source, HARMLESS)
+    require_known(unread, HARMLESS)
     if "MappingCoefficients" in values:
-        raise InputError(
-            "E-CAMERA-MODEL", f"camera file {source}: MATLAB's fisheye model is not supported; calibrate with another"
-        )
-    matrix = _numbers(values, "K", source)
+        raise InputError("E-CAMERA-MODEL", "MATLAB's fisheye model is not supported; calibrate with another")
+    matrix = _numbers(values, "K")
     if matrix is None:
-        turned = _numbers(values, "IntrinsicMatrix", source)  # with the principal point in its last row
+        turned = _numbers(values, "IntrinsicMatrix")  # with the principal point in its last row
         matrix = None if turned is None else turned.reshape(3, 3).T
     if matrix is not None:
         (fx, skew, cx), (_, fy, cy) = matrix.reshape(3, 3)[:2]
     else:
-        focal, centre = (_numbers(values, key, source, 2) for key in ("FocalLength", "PrincipalPoint"))
+        focal, centre = (_numbers(values, key, 2) for key in ("FocalLength", "PrincipalPoint"))
         if focal is None or centre is None:
-            raise InputError(
-                "E-CAMERA-CONTENT",
-                f"camera file {source}: no K, IntrinsicMatrix or FocalLength; save toStruct(cameraParams)",
-            )
-        (fx, fy), (cx, cy), skews = focal, centre, _numbers(values, "Skew", source, 1)
+            raise InputError("E-CAMERA-CONTENT", "no K, IntrinsicMatrix or FocalLength; save toStruct(cameraParams)")
+        (fx, fy), (cx, cy), skews = focal, centre, _numbers(values, "Skew", 1)
         skew = 0.0 if skews is None else skews[0]
-    size = _numbers(values, "ImageSize", source)
+    size = _numbers(values, "ImageSize")
     height, width = (0.0, 0.0) if size is None or not size.size else size[:2]
-    radial = _numbers(values, STRUCTURE, source)
-    tangential = _numbers(values, "TangentialDistortion", source, 2)
+    radial = _numbers(values, STRUCTURE)
+    tangential = _numbers(values, "TangentialDistortion", 2)
     k = [0.0, 0.0] if radial is None else [*radial, 0.0, 0.0][: max(len(radial), 2)]
     p = [0.0, 0.0] if tangential is None else tangential
     lens = [fx, fy, cx - PIXEL_ORIGIN, cy - PIXEL_ORIGIN]
-    return of_opencv(lens, np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source, float(skew))
+    return of_opencv(lens, np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), float(skew))
 
 
 def _plain_value(value: object) -> object:
@@ -187,42 +179,38 @@ def _structures(values: Mapping, where: str):
             yield from _structures(value, f"{where}.{key}" if where else str(key))
 
 
-def _numbers(values: Mapping, key: str, source: str, count: int = 0) -> np.ndarray | None:
+def _numbers(values: Mapping, key: str, count: int = 0) -> np.ndarray | None:
     if values.get(key) is None:
         return None
     try:
         numbers = np.asarray(values[key], float)
     except (TypeError, ValueError) as error:
-        raise InputError(
-            "E-CAMERA-CONTENT", f"camera file {source}: {key} is no list of numbers; save it again"
-        ) from error
+        raise InputError("E-CAMERA-CONTENT", f"{key} is no list of numbers; save it again") from error
     if (count and numbers.size != count) or (key in ("K", "IntrinsicMatrix") and numbers.size != 9):
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {key} of {numbers.size} numbers; {count or 9} needed"
-        )
+        raise InputError("E-CAMERA-COEFFICIENTS", f"{key} of {numbers.size} numbers; {count or 9} needed")
     return numbers.ravel() if key not in ("K", "IntrinsicMatrix") else numbers
 
 
-def _known(values: Mapping, key: str, source: str, count: int) -> np.ndarray:
-    numbers = _numbers(values, key, source, count)
+def _known(values: Mapping, key: str, count: int) -> np.ndarray:
+    numbers = _numbers(values, key, count)
     if numbers is None:
-        raise InputError("E-CAMERA-CONTENT", f"camera file {source}: {key} is empty; {count} numbers needed")
+        raise InputError("E-CAMERA-CONTENT", f"{key} is empty; {count} numbers needed")
     return numbers
 
 
-def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
+def _from_bouguet(values: Mapping) -> CameraModel | ForeignLens:
     own = {key: value for key, value in values.items() if not key.startswith("__")}
     unread = {key: _plain_value(value) for key, value in own.items() if key not in BOUGUET_TAKEN}
-    require_known(unread, source, BOUGUET_HARMLESS)
-    focal, centre, k = (_known(values, key, source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
+    require_known(unread, BOUGUET_HARMLESS)
+    focal, centre, k = (_known(values, key, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
     width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
     skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
-    lens = of_opencv([*focal, *centre], k, width, height, source, skew)
+    lens = of_opencv([*focal, *centre], k, width, height, skew)
     if isinstance(lens, ForeignLens) or lens.colmap_model != "OPENCV":
         return lens
     if not all(f"{key}_error" in values for key in BOUGUET):
         return lens
-    errors = [_known(values, f"{key}_error", source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
+    errors = [_known(values, f"{key}_error", n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
     sigma = np.concatenate(errors)[:8] / BOUGUET_SIGMAS
     return replace(lens, covariance=np.diag(sigma**2)) if (sigma > 0).all() and np.isfinite(sigma).all() else lens
 
@@ -232,7 +220,7 @@ def is_script(text: str) -> bool:
     return all(re.search(rf"(?m)^\s*{key}\s*=\s*\[", text) for key in BOUGUET[:2])
 
 
-def from_script(text: str, _: str, source: str) -> CameraModel | ForeignLens:
+def from_script(text: str, _: str) -> CameraModel | ForeignLens:
     """Return the camera of Bouguet's ``Calib_Results.m``; errors as :func:`from_mat`."""
     lines = "\n".join(line.split("%")[0] for line in text.splitlines())
     values: dict[str, object] = {}
@@ -241,11 +229,11 @@ def from_script(text: str, _: str, source: str) -> CameraModel | ForeignLens:
         with contextlib.suppress(ValueError):  # settings in words
             numbers = np.array(words, float) if words != [""] else np.zeros(0)
             if name in values and not np.array_equal(np.asarray(values[name]), numbers):
-                raise InputError("E-CAMERA-REPEATED", f"camera file {source}: {name} twice; leave one in")
+                raise InputError("E-CAMERA-REPEATED", f"{name} twice; leave one in")
             values[name] = numbers
     if BOUGUET[2] not in values:
-        raise InputError("E-CAMERA-CONTENT", f"camera file {source}: no kc; 5 numbers needed")
-    return _from_bouguet(values, source)
+        raise InputError("E-CAMERA-CONTENT", "no kc; 5 numbers needed")
+    return _from_bouguet(values)
 
 
 def mat(camera: Camera, name: str) -> bytes:

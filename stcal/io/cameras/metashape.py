@@ -34,35 +34,30 @@ OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy",
 
 
 def is_metashape(text: str) -> bool:
-    """Return True if a text is XML with an element of Metashape around it.
-
-    Raises ElementTree.ParseError: it is broken XML.
-    """
+    """Return True if a text is XML with an element of Metashape around it; ParseError if it is broken XML."""
     return text.lstrip().startswith("<") and ElementTree.fromstring(text).tag in ("calibration", *ROOTS)
 
 
-def from_metashape(text: str, choice: str, source: str) -> CameraModel | ForeignLens:
+def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:
     """Return the camera of a calibration, or of exported cameras; errors as of the functions for them."""
     root = ElementTree.fromstring(text)
-    return from_calibration(root, source) if root.tag == "calibration" else from_cameras(root, choice, source)
+    return from_calibration(root) if root.tag == "calibration" else from_cameras(root, choice)
 
 
-def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | ForeignLens:
-    """Return the camera of a ``<calibration>`` with frame or fisheye projection.
-
-    With ``b2``, ``p3`` or ``p4``, and a frame camera with ``k4``, it is a foreign lens.
-    """
+def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
+    """Return the camera of a ``<calibration>``; a foreign lens with ``b2``, ``p3``, ``p4``, or a frame camera with
+    ``k4``."""
     texts: dict[str, str] = {}
     for child in root:
         if child.tag in texts:
-            raise InputError("E-CAMERA-REPEATED", f"camera file {source}: {child.tag[:40]} twice; leave one in")
+            raise InputError("E-CAMERA-REPEATED", f"{child.tag[:40]} twice; leave one in")
         texts[child.tag] = (child.text or "").strip()
     kind = texts.get("projection", root.get("type", "frame"))
     if kind not in KINDS:
-        raise InputError("E-CAMERA-MODEL", f"camera file {source}: projection {kind}; frame and fisheye are read")
+        raise InputError("E-CAMERA-MODEL", f"projection {kind}; frame and fisheye are read")
     names = (*NAMES, *MORE_NAMES)
     require_known(
-        {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, source, HARMLESS
+        {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, HARMLESS
     )
     v = {name: float(texts.get(name, 0) or 0) for name in names}
     size = root.find("resolution")
@@ -72,16 +67,16 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | Fo
     distortion = np.array([v["k1"], v["k2"], v["p2"], v["p1"], v["k3"], v["k4"]])
     lens = [v["f"] + v["b1"], v["f"], *centre]
     if v["b2"] or v["p3"] or v["p4"] or (v["k4"] and kind == "frame"):
-        return _foreign(v, lens, kind, width, height, source)
+        return _foreign(v, lens, kind, width, height)
     if kind == "frame":
-        return camera_from_opencv(lens, distortion[:5], False, width, height, source)
-    return camera_from_opencv(lens, distortion, True, width, height, source, tangential=True)
+        return camera_from_opencv(lens, distortion[:5], False, width, height)
+    return camera_from_opencv(lens, distortion, True, width, height, tangential=True)
 
 
-def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: float, source: str) -> ForeignLens:
+def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: float) -> ForeignLens:
     """Return the lens by Metashape's formula (PhotoScan's manual, version 1.2, appendix C, with ``p3`` and ``p4``)."""
-    camera = camera_from_opencv(lens, np.array([v["k1"], v["k2"], 0, 0]), False, width, height, source)
-    require_finite([v[name] for name in (*NAMES, *MORE_NAMES)], source)
+    camera = camera_from_opencv(lens, np.array([v["k1"], v["k2"], 0, 0]), False, width, height)
+    require_finite([v[name] for name in (*NAMES, *MORE_NAMES)])
     matrix = np.array([[lens[0], v["b2"], lens[2]], [0, lens[1], lens[3]]])
     flat = Camera(1, 1, [1, 1], [0, 0], np.zeros(12), kind != "frame")
 
@@ -95,10 +90,10 @@ def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: floa
         return np.column_stack([x * radial + across * grown, y * radial + up * grown, np.ones(len(x))]) @ matrix.T
 
     own = ", ".join(f"{name} = {v[name]:g}" for name in ("b2", "k4", "p3", "p4") if v[name])
-    return ForeignLens(f"Metashape's lens with {own}", project, camera.width, camera.height, source)
+    return ForeignLens(f"Metashape's lens with {own}", project, camera.width, camera.height)
 
 
-def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraModel | ForeignLens:
+def from_cameras(root: ElementTree.Element, choice: str) -> CameraModel | ForeignLens:
     """Return a sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance."""
     sensors = {}
     for number, sensor in enumerate(root.iter("sensor")):
@@ -108,21 +103,19 @@ def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraM
             name = sensor.get("label") or sensor.get("id") or str(number)
             sensors[name if name not in sensors else f"{name} {number}"] = (adjusted[-1], sensor.find("covariance"))
     if not sensors:
-        raise InputError(
-            "E-CAMERA-NONE", f"camera file {source}: no sensor with a calibration; export the cameras after alignment"
-        )
-    chosen, covariance = sensors[one_of(list(sensors), choice, source)]
+        raise InputError("E-CAMERA-NONE", "no sensor with a calibration; export the cameras after alignment")
+    chosen, covariance = sensors[one_of(list(sensors), choice)]
     pass_over(["poses of the photographs"] if root.find(".//camera/transform") is not None else [])
-    camera = from_calibration(chosen, source)
+    camera = from_calibration(chosen)
     if covariance is None:
         return camera
     if isinstance(camera, ForeignLens):
         pass_over(["σ and correlations of the parameters"])
         return camera
-    return _with_covariance(camera, covariance, source)
+    return _with_covariance(camera, covariance)
 
 
-def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: str) -> CameraModel:
+def _with_covariance(camera: CameraModel, stated: ElementTree.Element) -> CameraModel:
     names = (stated.findtext("params") or "").split()
     try:
         matrix = np.array((stated.findtext("coeffs") or "").split(), float)
@@ -131,21 +124,11 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: s
         matrix = matrix.reshape(len(names), -1)
         require_covariance(matrix, len(names), Rows(tuple(names)))
     except (InputError, ValueError) as error:
-        raise InputError(
-            "E-CAMERA-COVARIANCE", f"camera file {source}: <covariance>: {error}; export the cameras again"
-        ) from error
+        raise InputError("E-CAMERA-COVARIANCE", f"<covariance>: {error}; export the cameras again") from error
     if "b2" in names:
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera file {source}: b2 was adjusted, but OpenCV's model does not have it; fit without it",
-        )
+        raise InputError("E-CAMERA-MODEL", "b2 was adjusted, but OpenCV's model does not have it; fit without it")
     camera = replace(camera, colmap_model=_model(camera.colmap_model, names))
-    by_theirs = np.zeros((len(PARAMETER_NAMES), len(names)))
-    for column, name in enumerate(names):
-        if name in OWN:
-            by_theirs[PARAMETER_NAMES.index(OWN[name]), column] = 1
-        if name in ("f", "b1"):
-            by_theirs[PARAMETER_NAMES.index("fx"), column] = 1
+    by_theirs = np.linalg.pinv(_theirs_by_ours())[:, [NAMES.index(name) for name in names]]
     basis = intrinsic_basis(camera.colmap_model)
     to_model = np.linalg.pinv(basis)
     covariance = to_model @ by_theirs @ matrix @ by_theirs.T @ to_model.T
@@ -158,13 +141,19 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: s
 
 
 def _model(colmap_model: str, names: list[str]) -> str:
-    """Return the COLMAP model that has these parameters of Metashape, and those of ``colmap_model``."""
     if FISHEYE in colmap_model:
         return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & set(names) else colmap_model
     if "k3" in names or "k4" in names:
         return "FULL_OPENCV"
     distorted = {"k1", "k2", "p1", "p2"} & set(names)
     return "OPENCV" if distorted and colmap_model != "FULL_OPENCV" else colmap_model
+
+
+def _theirs_by_ours() -> np.ndarray:
+    """Return the derivative (11, 16) of :data:`NAMES` by :data:`PARAMETER_NAMES`."""
+    rows = np.array([[float(OWN.get(theirs) == ours) for ours in PARAMETER_NAMES] for theirs in NAMES])
+    rows[NAMES.index("b1"), :2] = [1, -1]
+    return rows
 
 
 def _edge(camera: CameraModel) -> np.ndarray:
@@ -188,13 +177,7 @@ def _values(camera: Camera, form: str) -> dict[str, float]:
 
 
 def calibration(camera: Camera) -> str:
-    """Return the text of a ``<calibration>`` : the lens only.
-
-    Raises
-    ------
-    InputError
-        Metashape has no model for the lens.
-    """
+    """Return the text of a ``<calibration>`` : the lens only; refuse one that Metashape has no model for."""
     root = ElementTree.Element("calibration")
     parts = {"projection": _kind(camera), "width": camera.width, "height": camera.height}
     for tag, value in (parts | _values(camera, "metashape")).items():
@@ -224,13 +207,8 @@ def cameras(camera: Camera, name: str) -> str:
 
 
 def _covariance(camera: Camera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Return Metashape's names of the parameters of the camera's model, and their covariance."""
     basis = intrinsic_basis(camera.colmap_model)
-    rows = np.zeros((len(NAMES), len(PARAMETER_NAMES)))
-    for row, name in enumerate(NAMES):
-        if name in OWN:
-            rows[row, PARAMETER_NAMES.index(OWN[name])] = 1
-    rows[NAMES.index("b1"), [PARAMETER_NAMES.index("fx"), PARAMETER_NAMES.index("fy")]] = [1, -1]
+    rows = _theirs_by_ours()
     if not camera.fisheye:
         rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
     by_model = rows @ basis

@@ -4,12 +4,13 @@
 """
 
 import warnings
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from stcal.errors import InputError, InputNote
+from stcal.errors import InputError, InputNote, named
 from stcal.geometry.arrays import ByValue, require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
@@ -39,12 +40,9 @@ OF_IMAGES = "the images"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel(ByValue):
-    """A camera as its file states it.
+    """A camera as its file states it: a :class:`Camera`, but ``width`` and ``height`` are None if the file states none.
 
-    ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, with OpenCV's pixel origin;
-    ``colmap_model`` : the COLMAP model that represents the camera exactly;
-    ``width``, ``height`` : px, or None if the file states none (see :meth:`sized`);
-    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None if the file states none.
+    ``colmap_model`` : the COLMAP model that represents it exactly; ``covariance`` : (q, q) of that model's parameters.
     """
 
     focal: np.ndarray
@@ -67,11 +65,8 @@ class CameraModel(ByValue):
         return replace(self.sized(width, height), covariance=self.covariance)
 
     def of_video(self, width: int, height: int) -> "CameraModel":
-        """Return the camera of pictures of this size.
-
-        It is the camera itself, unless only the last row or column of an odd number is missing: most formats of video
-        have even numbers alone, and their writers drop it. An :class:`InputNote` says so.
-        """
+        """Return the camera of pictures of this size: itself, unless the last row or column of an odd number is
+        missing, which writers of videos drop; an :class:`InputNote` says so."""
         stated = self.width or width, self.height or height
         if (width, height) == stated or (width, height) != tuple(side // 2 * 2 for side in stated):
             return self
@@ -132,17 +127,12 @@ PRIOR_TANGENTIAL = 1e-3
 
 
 def camera_prior(camera: Camera) -> CameraPrior:
-    """Return a prior of the intrinsics, with the covariance of the camera or else of an old calibration.
+    """Return a prior of the intrinsics, for hand-eye: the camera's covariance, or that of an old calibration.
 
     Parameters
     ----------
     camera : Camera
-        The camera, from :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
-
-    Returns
-    -------
-    CameraPrior
-        Prior for :class:`stcal.handeye.HandEyeOptions`.
+        From :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
     """
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)
@@ -154,11 +144,7 @@ def camera_prior(camera: Camera) -> CameraPrior:
 
 
 def refinable(camera: Camera) -> Camera:
-    """Return the camera with the model to refine.
-
-    A camera without distortion and without covariance is refined as OPENCV, starting from zero distortion: its file
-    says nothing of the lens's distortion.
-    """
+    """Return the camera with the model to refine: OPENCV where its file says nothing of distortion."""
     if camera.covariance is None and camera.colmap_model in WITHOUT_DISTORTION:
         return replace(camera, colmap_model="OPENCV")
     return camera
@@ -191,65 +177,50 @@ AT_CORNER = 0.02
 """Share of each side within which a principal point is at the image's corner, as one relative to the middle is."""
 
 
-def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
+def camera_model(flat: np.ndarray, colmap_model: str, width, height) -> CameraModel:
+    """Return the camera of :data:`PARAMETER_NAMES`, of which the last ones may be missing."""
     flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
-    require_lens(flat, width, height, f"camera file {path}")
+    require_lens(flat, width, height)
     longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
     if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
         size = f" of an image of {width:g}×{height:g} px" if width and height else ""
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; "
+            f"focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; "
             "pixels needed; check that they are not mm, or shares of a side",
         )
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         raise InputError(
             "E-CAMERA-CENTRE",
-            f"camera file {path}: principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×"
+            f"principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×"
             f"{height:g} px; pixels from the image's corner needed; check that they are not from its middle",
         )
     width, height = (None if side is None else int(side) for side in (width, height))
-    return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))
+    return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, "")
 
 
-def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
-    """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : file, for messages."""
-    if colmap_model not in COLMAP_LAYOUT:
-        known = ", ".join(COLMAP_LAYOUT)
-        raise InputError(
-            "E-CAMERA-MODEL", f"camera file {source}: model {colmap_model} is not supported; use one of {known}"
-        )
-    layout = COLMAP_LAYOUT[colmap_model]
-    if len(params) != len(layout):
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed",
-        )
-    flat = np.zeros(len(PARAMETER_NAMES))
-    for place, value in zip(layout, params, strict=True):
-        flat[list(place) if isinstance(place, tuple) else place] = value
-    flat[2:4] -= COLMAP_PIXEL_ORIGIN
-    return camera_model(flat, colmap_model, width, height, Path(source))
+def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path = "") -> CameraModel:
+    """Return the camera of COLMAP's ``params``, in its order and pixel origin; ``source`` : file, for messages."""
+    with named(f"camera file {source}") if source else nullcontext():
+        if colmap_model not in COLMAP_LAYOUT:
+            known = ", ".join(COLMAP_LAYOUT)
+            raise InputError("E-CAMERA-MODEL", f"model {colmap_model} is not supported; use one of {known}")
+        layout = COLMAP_LAYOUT[colmap_model]
+        if len(params) != len(layout):
+            raise InputError(
+                "E-CAMERA-COEFFICIENTS", f"{len(params)} parameters for {colmap_model}, {len(layout)} needed"
+            )
+        flat = np.zeros(len(PARAMETER_NAMES))
+        for place, value in zip(layout, params, strict=True):
+            flat[list(place) if isinstance(place, tuple) else place] = value
+        flat[2:4] -= COLMAP_PIXEL_ORIGIN
+        return replace(camera_model(flat, colmap_model, width, height), source=str(source))
 
 
 def camera_from_opencv(
-    lens,
-    given: np.ndarray,
-    fisheye: bool,
-    width: float,
-    height: float,
-    path: str | Path,
-    tangential: bool = False,
+    lens, given: np.ndarray, fisheye: bool, width: float, height: float, tangential: bool = False
 ) -> CameraModel:
-    """Return the camera of fx, fy, cx, cy and OpenCV's coefficients.
-
-    Parameters
-    ----------
-    lens : fx, fy, cx, cy, px, with OpenCV's pixel origin
-    given : (k,) k1, k2, p1, p2, k3 …; for an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4
-    fisheye, tangential : equidistant projection; and whether ``given`` has p1, p2
-    width, height : image size, px; 0 if the file states none
-    path : camera file, for messages
-    """
-    distortion, kind = opencv_lens(given, fisheye, f"camera file {path}", tangential)
-    return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None, Path(path))
+    """Return the camera of fx, fy, cx, cy, px, and OpenCV's coefficients (k,) as of :func:`opencv_lens`; sides of 0 px
+    if the file states none."""
+    distortion, kind = opencv_lens(given, fisheye, tangential)
+    return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None)

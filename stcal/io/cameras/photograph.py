@@ -30,11 +30,8 @@ SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photograph:
-    """The camera of a photograph.
-
-    ``camera`` : OPENCV model without distortion, with a covariance for what EXIF leaves open; ``told`` : the EXIF
-    entries that were used, in words.
-    """
+    """The camera of a photograph, OPENCV without distortion and with a covariance for what EXIF leaves open, and
+    ``told``, the EXIF entries that were used, in words."""
 
     camera: Camera
     told: str
@@ -51,10 +48,7 @@ def is_photograph(path: str | Path) -> bool:
 
 
 def camera_of_photograph(path: str | Path) -> Photograph:
-    """Return the camera that a photograph's EXIF describes.
-
-    ``path`` : JPEG, TIFF or PNG file.
-    """
+    """Return the camera that the EXIF of a JPEG, TIFF, PNG or HEIC describes."""
     try:
         data = read_bytes(path, IMAGE_BYTES)
         if is_heic(data):
@@ -87,7 +81,7 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
         source += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
     centre = [(width - 1) / 2, (height - 1) / 2]
-    camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height, path).sized(width, height)
+    camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height).sized(width, height)
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)

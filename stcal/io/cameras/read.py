@@ -19,6 +19,7 @@ from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
 from stcal.io.cameras.forms import SUFFIXES, WRITERS, CameraForm, name_to_write, written
 from stcal.io.cameras.keyed import READ, from_ini, from_keys, is_ini, values_of
+from stcal.io.cameras.keys import reading
 from stcal.io.cameras.model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
 from stcal.io.cameras.photograph import is_photograph
 from stcal.io.covariance import Rows, require_covariance
@@ -44,11 +45,7 @@ def camera_chosen(name: str) -> Iterator[None]:
 
 
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
-    """Read a camera file of any supported kind, which is recognised by the content.
-
-    ``path`` : of COLMAP, OpenCV, ROS, Kalibr and others (``data_layout.md``); ``name`` : name of the camera in a file
-    of several.
-    """
+    """Read a camera file of any kind (``data_layout.md``), recognised by its content; ``name`` : chooses of several."""
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
         return lens
@@ -73,7 +70,7 @@ def camera_model(camera: str | Path | Camera | CameraModel) -> CameraModel:
 
 @require_arguments
 def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> Camera:
-    """Load a camera from a file of any supported kind, which is recognised by the content.
+    """Load a camera from a file of any supported kind, which is recognised by the content, with any covariance.
 
     Parameters
     ----------
@@ -85,15 +82,7 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
     size : (int, int), optional
         Width and height of the images, px, for a file that does not state them.
 
-    Returns
-    -------
-    Camera
-        With its covariance if the file states one.
-
-    Raises
-    ------
-    InputError
-        The file is missing or malformed, holds more than one camera, a lens of an unsupported model, or no size.
+    Raises InputError: no such file, a malformed one, one of several cameras or an unsupported lens, or no size.
     """
     return sized_camera(read_camera(path, name), path, size)
 
@@ -110,20 +99,7 @@ def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple
     return model.calibrated(width, height)
 
 
-def _no_text(path: Path) -> InputError:
-    if is_photograph(path):
-        return InputError(
-            "E-CAMERA-UNREADABLE",
-            f"camera file {path}: a photograph; `stcal camera convert {path.name} cameras.txt` makes a start for "
-            "--refine-camera from its EXIF",
-        )
-    return InputError(
-        "E-CAMERA-UNREADABLE",
-        f"camera file {path}: neither text nor a binary file of COLMAP or MATLAB; give a camera file of {READ}",
-    )
-
-
-def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray | None:
+def _stated_covariance(text: str, names: list[str]) -> np.ndarray | None:
     """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
     stated = {
         key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
@@ -132,9 +108,7 @@ def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray |
         return None
     count = len(names)
     try:
-        if [len(row) for row in stated[SIGMA]] != [count] or [len(row) for row in stated[CORRELATION]] != [
-            count
-        ] * count:
+        if list(map(len, stated[SIGMA])) != [count] or list(map(len, stated[CORRELATION])) != [count] * count:
             raise InputError("E-CAMERA-COVARIANCE", f"a line of {count} σ and {count}×{count} correlations needed")
         sigma, correlation = np.array(stated[SIGMA][0], float), np.array(stated[CORRELATION], float)
         for name, sigma_of_name, with_itself in zip(names, sigma, np.diagonal(correlation), strict=True):
@@ -150,33 +124,37 @@ def _stated_covariance(text: str, names: list[str], source: str) -> np.ndarray |
     except (InputError, ValueError) as error:
         raise InputError(
             "E-CAMERA-COVARIANCE",
-            f"camera file {source}: SIGMA and CORRELATION state no covariance of its parameters: {error}; write it "
-            "again, or remove these comments",
+            f"SIGMA and CORRELATION state no covariance of its parameters: {error}; write it again, or remove these "
+            "comments",
         ) from error
     return covariance
 
 
-def _from_colmap(text: str, name: str, source: str) -> CameraModel | ForeignLens:
+def _from_colmap(text: str, name: str) -> CameraModel | ForeignLens:
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     cameras = {row[0]: row[1:] for row in rows}
     if len(cameras) < len(rows):
-        raise InputError("E-CAMERA-REPEATED", f"camera file {source}: two cameras of one number; correct it")
-    model, *values = cameras[one_of(list(cameras), numbered(cameras, name), source)]
+        raise InputError("E-CAMERA-REPEATED", "two cameras of one number; correct it")
+    model, *values = cameras[one_of(list(cameras), numbered(cameras, name))]
     try:
         width, height, *params = (float(value) for value in values)
     except ValueError as error:
-        raise InputError(
-            "E-CAMERA-CONTENT", f"camera file {source}: {' '.join(str(error).split())[:150]}; numbers needed"
-        ) from error
-    lens = of_colmap(model, width, height, params, source)
+        raise InputError("E-CAMERA-CONTENT", f"{' '.join(str(error).split())[:150]}; numbers needed") from error
+    lens = of_colmap(model, width, height, params)
     if isinstance(lens, ForeignLens):
         return lens
-    return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model), source))
+    return replace(lens, covariance=_stated_covariance(text, parameter_names(lens.colmap_model)))
 
 
 def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     """Read the lens of a camera file, also of an unsupported model; arguments and errors as :func:`read_camera`."""
-    path, name = Path(path), name or _chosen.get()
+    path = Path(path)
+    with reading(f"camera file {path}"):
+        lens = _read(path, name or _chosen.get())
+    return replace(lens, source=str(path)) if isinstance(lens, CameraModel) else lens
+
+
+def _read(path: Path, name: str) -> CameraModel | ForeignLens:
     try:
         if path.is_file():
             with open(path, "rb") as stream:
@@ -186,34 +164,33 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         content = read_bytes(path, SETTINGS_BYTES)
         for recognised, read in BINARY_FORMATS:
             if recognised(content):
-                return read(content, name, str(path))
+                return read(content, name)
         text = text_of(content)
-        return next(read for recognised, read in TEXT_FORMATS if recognised(text))(text, name, str(path))
-    except InputError:
-        raise
+        return next(read for recognised, read in TEXT_FORMATS if recognised(text))(text, name)
     except OSError as error:
-        raise InputError(
-            "E-CAMERA-UNREADABLE", f"camera file {path}: {error.strerror or error}; give a readable file"
-        ) from error
+        raise InputError("E-CAMERA-UNREADABLE", f"{error.strerror or error}; give a readable file") from error
     except UnicodeDecodeError as error:
-        raise _no_text(path) from error
+        reason = f"neither text nor a binary file of COLMAP or MATLAB; give a camera file of {READ}"
+        if is_photograph(path):
+            convert = f"`stcal camera convert {path.name} cameras.txt`"
+            reason = f"a photograph; {convert} makes a start for --refine-camera from its EXIF"
+        raise InputError("E-CAMERA-UNREADABLE", reason) from error
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
         raise InputError(
-            "E-CAMERA-UNREADABLE",
-            f"camera file {path}: no camera of {READ} ({reason}); check its form, or convert it",
+            "E-CAMERA-UNREADABLE", f"no camera of {READ} ({reason}); check its form, or convert it"
         ) from error
 
 
 BINARY_FORMATS = ((matlab.is_mat, matlab.from_mat), (forms.is_colmap_binary, forms.from_colmap_binary))
-"""For each binary format a test of the content and a reader, which is given the content, a name, and the file."""
-TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str, str], CameraModel | ForeignLens]], ...] = (
+"""For each binary format a test of the content and a reader, which is given the content and a name."""
+TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str], CameraModel | ForeignLens]], ...] = (
     (lambda text: COLMAP_LINE.search(text) is not None, _from_colmap),
     (metashape.is_metashape, metashape.from_metashape),
     (forms.is_mrcal, forms.from_mrcal),
     (matlab.is_script, matlab.from_script),
     (is_ini, from_ini),
-    (lambda text: True, lambda text, name, source: from_keys(values_of(text), name, source)),
+    (lambda text: True, lambda text, name: from_keys(values_of(text), name)),
 )
 """For each text format the same; what no other test recognises has keys and values."""
 
@@ -226,12 +203,12 @@ ACROSS = 9
 
 @require_arguments
 def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None, name: str = "") -> tuple[str, ...]:
-    """Save a camera to a file of this or another program, and require that it is read as the same camera.
+    """Save a camera in a form of this or another program, and return what it has no place for, such as σ.
 
     Parameters
     ----------
     path : str or Path
-        File to write.
+        File to write; it is required to be read as the same camera.
     camera : Camera
         Camera to save, with its covariance if it has one.
     form : str, optional
@@ -240,15 +217,7 @@ def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None
     name : str
         Name of the camera, for forms that have a place for it.
 
-    Returns
-    -------
-    tuple of str
-        What the form has no place for, such as σ; nothing for ``colmap``.
-
-    Raises
-    ------
-    InputError
-        No form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
+    Raises InputError: no form of this suffix, a form that cannot hold the lens, or a file that cannot be written.
     """
     converted = written(camera, form_of(path, form), name_to_write(name))
     save(Path(path), converted.content)

@@ -15,7 +15,6 @@ from stcal.io.poses.rotations import (
     proper,
     rotations,
     said_convention,
-    turned_values,
 )
 from stcal.io.table import ANGLES, Table
 
@@ -27,25 +26,18 @@ TRIPLES = {
     ("theta_x", "theta_y", "theta_z"): {"deg": "kinova"},
     ("roll", "pitch", "yaw"): {"deg": "rpy", "rad": "rpy"},
     ("rpy_roll", "rpy_pitch", "rpy_yaw"): {"deg": "rpy", "rad": "rpy"},
+    ("q1", "q2", "q3", "q4"): {},
 }
-"""Default conventions of columns with these three names, by the unit that follows the names; with another unit, or
+"""Default conventions of columns with these names, by the unit that follows the names; with another unit, or
 none, the convention is open."""
-BY_AXIS = (
-    ("rx", "ry", "rz"),
-    ("theta_x", "theta_y", "theta_z"),
-    ("roll", "pitch", "yaw"),
-    ("rpy_roll", "rpy_pitch", "rpy_yaw"),
-)
+NAMED_BY_AXES = [names for names in TRIPLES if names[0] in ("rx", "theta_x", "roll", "rpy_roll")]
 _EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """Rotations that were read from a table.
-
-    ``rotation`` : (m, 3, 3); ``words`` : the convention; ``columns`` : names of the columns; ``stated`` : True if the
-    columns alone define the convention, without an option.
-    """
+    """Rotations (m, 3, 3) of a table's columns, and the convention in words; ``stated`` : True if the columns alone
+    define it, without an option."""
 
     rotation: np.ndarray
     words: str
@@ -68,10 +60,8 @@ def find_column(table: Table, prefix: str, name: str) -> str | None:
 
 
 def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) -> Turned | None:
-    """Return the rotations in the columns that begin with a prefix; None if there are none.
-
-    ``rotation`` : name of the convention, from ``--rotation``, for angles whose columns leave it open.
-    """
+    """Return the rotations in the columns that begin with a prefix; None if there are none. ``rotation`` : name of the
+    convention, from ``--rotation``, for angles whose columns leave it open."""
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:
         table.has_rotation(prefix)
@@ -92,7 +82,7 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
     matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
     if (values := _all(table, matrix)) is not None:
         return Turned(proper(values.reshape(-1, 3, 3), places, where), "3×3 matrices", tuple(matrix))
-    return _triple(table, prefix, rotation) or _four(table, prefix, rotation)
+    return _by_convention(table, prefix, rotation)
 
 
 def _all(table: Table, columns: list[str]) -> np.ndarray | None:
@@ -115,18 +105,18 @@ def _columns(table: Table, prefix: str, names: list[str]) -> tuple[str, ...]:
     return columns if len(columns) == len(names) else ()
 
 
-def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
-    """Return rotations of three angles, or a rotation vector, by the convention of their names or of the user."""
-    for triple, named in TRIPLES.items():
+def _by_convention(table: Table, prefix: str, rotation: str | None) -> Turned | None:
+    """Return rotations of three angles, a rotation vector or q1 … q4, by the convention of their names or the user."""
+    for triple, stated in TRIPLES.items():
         for unit in (*ANGLES, ""):
             names = _columns(table, prefix, [f"{name}_{unit}" if unit else name for name in triple])
             if not names:
                 continue
-            what = ", ".join(triple) if triple in BY_AXIS else "".join(triple)
-            if rotation is None and unit in named:
-                convention = convention_of(named[unit])
+            what = "".join(triple) if len(triple[0]) == 1 else ", ".join(triple)
+            if rotation is None and unit in stated:
+                convention = convention_of(stated[unit])
             else:
-                convention = said_convention(rotation, what, table.where)
+                convention = said_convention(rotation, what, table.where, len(triple))
             says_unit = (rotation or "").endswith(tuple(f"-{name}" for name in ANGLES))  # a robot's name implies one
             if unit and says_unit and convention.unit not in ("", unit):
                 raise InputError(
@@ -135,19 +125,9 @@ def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
                 )
             convention = Convention(convention.order, unit or convention.unit)
             values = np.column_stack([table.numbers(column) for column in names])
-            turned, words = rotations(values, convention, places_of(table), table.where, triple in BY_AXIS)
+            turned, words = rotations(values, convention, places_of(table), table.where, triple in NAMED_BY_AXES)
             return Turned(turned, f"{', '.join(names)} as {words}", names, stated=False)
     return None
-
-
-def _four(table: Table, prefix: str, rotation: str | None) -> Turned | None:
-    """Return the rotations of quaternions q1 … q4, whose order the user must give."""
-    names = _columns(table, prefix, [f"q{i}" for i in (1, 2, 3, 4)])
-    if not names:
-        return None
-    values = np.column_stack([table.numbers(column) for column in names])
-    turned, words = turned_values(values, rotation, "q1, q2, q3, q4", places_of(table), table.where)
-    return Turned(turned, words, names, stated=False)
 
 
 def fixed(value: float, digits: int) -> str:

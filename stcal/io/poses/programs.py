@@ -49,7 +49,18 @@ def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
 
 def messages(statics: Iterable[Static]) -> str:
     """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
-    return "---\n".join(yaml.safe_dump(_message(static), sort_keys=False, allow_unicode=True) for static in statics)
+    documents = [
+        {
+            "header": {"frame_id": each.parent},
+            "child_frame_id": each.child,
+            "transform": {
+                "translation": dict(zip("xyz", metres(each.pose), strict=True)),
+                "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
+            },
+        }
+        for each in statics
+    ]
+    return "---\n".join(yaml.safe_dump(each, sort_keys=False, allow_unicode=True) for each in documents)
 
 
 def read_messages(text: str) -> list[Static]:
@@ -60,17 +71,6 @@ def read_messages(text: str) -> list[Static]:
         pose = pose_of_metres([transform["translation"][c] for c in "xyz"], [transform["rotation"][c] for c in "xyzw"])
         statics.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
     return statics
-
-
-def _message(each: Static) -> dict:
-    return {
-        "header": {"frame_id": each.parent},
-        "child_frame_id": each.child,
-        "transform": {
-            "translation": dict(zip("xyz", metres(each.pose), strict=True)),
-            "rotation": dict(zip("xyzw", xyzw(each.pose), strict=True)),
-        },
-    }
 
 
 def fixed_joint(each: Static) -> str:
@@ -96,10 +96,8 @@ def static_of_joint(joint: ElementTree.Element) -> Static:
 
 
 def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """Return a shell script with a call of ``ros2 run tf2_ros static_transform_publisher`` for each transform.
-
-    All calls but the last one continue in the background. ``said`` : lines of a comment.
-    """
+    """Return a shell script, with lines of a comment, that calls ``ros2 run tf2_ros static_transform_publisher`` for
+    each transform, all but the last one in the background."""
     calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
     head = ["#!/bin/sh", *(f"# {line}" for line in said)]
     return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
@@ -186,9 +184,7 @@ METRE_MM = 1000.0
 def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
     """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order.
 
-    At a pitch of ±90° only the sum or difference of roll and yaw is determined. Roll is therefore computed from the
-    rotation that remains after pitch and yaw. This keeps full precision at and near ±90°, where angles computed from
-    single matrix elements lose half of their digits.
+    Roll is computed from what remains after pitch and yaw, which keeps full precision at a pitch of ±90°.
     """
     r = pose.rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
@@ -216,14 +212,9 @@ POINT_CELLS = 3
 
 @dataclass(frozen=True, slots=True)
 class ImageLine:
-    """The first line of an image.
-
-    ``number`` : of the line; ``pose`` : qw, qx, qy, qz, tx, ty, tz; ``name`` : of the image; ``followed`` : whether its
-    second line is there. Programs that remove empty lines also remove those.
-    """
+    """The first line of an image, by number, and whether its second one is there: empty ones may have been removed."""
 
     number: int
-    pose: list[float]
     name: str
     followed: bool
 
@@ -231,50 +222,44 @@ class ImageLine:
 def image_lines(text: str, where: str) -> list[ImageLine]:
     """Return the images of ``images.txt``, also of one from which empty lines were removed."""
     images: list[ImageLine] = []
-    pending: tuple[int, list[float], str] | None = None  # an image whose second line is to come
-    for number, line in enumerate(text.splitlines(), 1):
-        record = _record(line)
-        if pending is not None:
-            images.append(ImageLine(*pending, followed=record is None))
-            pending = None
-            if record is None:
-                if not _are_points(line):
-                    raise InputError(
-                        "E-MODEL-UNREADABLE",
-                        f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
-                        "model anew",
-                    )
-                continue
-        elif not line.strip() or line.lstrip().startswith("#"):
+    lines = iter([*enumerate(text.splitlines(), 1), (0, "")])
+    number, line = next(lines)
+    while number:
+        if not line.strip() or line.lstrip().startswith("#"):
+            number, line = next(lines)
             continue
-        if record is None:
+        if not _is_image(line):
             raise InputError(
                 "E-MODEL-UNREADABLE",
                 f"{where}: line {number}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
             )
-        pending = (number, *record)
-    if pending is not None:
-        images.append(ImageLine(*pending, followed=False))
+        first, name = number, line.split(maxsplit=CELLS - 1)[-1].strip()
+        number, line = next(lines)
+        followed = number > 0 and not _is_image(line)
+        images.append(ImageLine(first, name, followed))
+        if followed and not _are_points(line):
+            raise InputError(
+                "E-MODEL-UNREADABLE",
+                f"{where}: line {number}: {len(line.split())} cells, not points of `x y id` each; export the "
+                "model anew",
+            )
+        if followed:
+            number, line = next(lines)
     return images
 
 
-def _record(line: str) -> tuple[list[float], str] | None:
-    """Return pose and name of an image's first line; None for any other line."""
+def _is_image(line: str) -> bool:
     cells = line.split(maxsplit=CELLS - 1)
-    pose = floats_of(cells[1:8])
-    if len(cells) < CELLS or pose is None or floats_of([cells[0], cells[8]]) is None or _are_points(line):
-        return None
-    return pose, cells[9].strip()
+    return len(cells) == CELLS and _are_numbers(cells[:9]) and not _are_points(line)
 
 
 def _are_points(line: str) -> bool:
     cells = line.split()
-    return len(cells) % POINT_CELLS == 0 and floats_of(cells) is not None
+    return len(cells) % POINT_CELLS == 0 and _are_numbers(cells)
 
 
-def floats_of(cells: list[str]) -> list[float] | None:
-    """Return the numbers of the cells; None if a cell is no number."""
+def _are_numbers(cells: list[str]) -> bool:
     try:
-        return [float(cell) for cell in cells]
+        return all(float(cell) is not None for cell in cells)
     except ValueError:
-        return None
+        return False

@@ -46,18 +46,15 @@ _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """A convention for rotations.
-
-    ``order`` : :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; ``unit`` : unit of the angles,
-    empty if it is open.
-    """
+    """A convention for rotations: :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; and the
+    unit of the angles, empty if it is open."""
 
     order: str
     unit: str = ""
 
     @property
     def count(self) -> int:
-        """The count of numbers that state a rotation, and mistakes in the order of quaternions."""
+        """The count of numbers that state a rotation."""
         return 4 if self.order in QUATERNIONS else 3
 
     def words(self) -> str:
@@ -104,10 +101,11 @@ def said_convention(rotation: str | None, what: str, where: str, count: int = 3)
 def rotations(
     values: np.ndarray, convention: Convention, places: tuple[str, ...], where: str, by_axis: bool = False
 ) -> tuple[np.ndarray, str]:
-    """Return matrices (m, 3, 3) of Euler angles or rotation vectors (m, 3), and the convention used, in words.
-
-    ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations.
-    """
+    """Return matrices (m, 3, 3) of Euler angles or rotation vectors (m, 3), and the convention used, in words;
+    ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations."""
+    if convention.order in QUATERNIONS:
+        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
+        return of_quaternions(values[:, order], places, where), convention.words()
     require_finite(values, places, where)
     unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
     if not unit:
@@ -138,11 +136,7 @@ def turned_values(
     values: np.ndarray, rotation: str | None, what: str, places: tuple[str, ...], where: str
 ) -> tuple[np.ndarray, str]:
     """Return rotations (m, 3, 3) of numbers (m, 3) or (m, 4) in the user's convention, and the convention in words."""
-    convention = said_convention(rotation, what, where, values.shape[1])
-    if convention.order in QUATERNIONS:
-        order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
-        return of_quaternions(values[:, order], places, where), convention.words()
-    return rotations(values, convention, places, where)
+    return rotations(values, said_convention(rotation, what, where, values.shape[1]), places, where)
 
 
 def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
@@ -191,11 +185,8 @@ EXPLAINS = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A hypothesis on the true content of columns that were read as w, x, y, z.
-
-    ``held`` : True content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
-    among the components read; ``conjugated`` : True if the sign of the vector part is inverted.
-    """
+    """What columns that were read as w, x, y, z may truly hold, in words, with the remedy: w, x, y, z at the indices
+    ``order`` among the components read, with the sign of the vector part inverted if ``conjugated``."""
 
     held: str
     remedy: str
@@ -231,11 +222,8 @@ READINGS = (
 
 
 def explaining(read: np.ndarray, misfit: Callable[[np.ndarray], float]) -> tuple[Reading, float] | None:
-    """Return the reading of rotations (m, 3, 3) that explains their misfit, and its misfit; None if no reading does.
-
-    ``misfit`` : returns one number for rotations (m, 3, 3). A reading explains the misfit if it reduces it below the
-    share :data:`EXPLAINS`. No reading does if all fit alike, as with the same orientation in all rows.
-    """
+    """Return the reading of rotations (m, 3, 3) that brings a misfit of theirs below the share :data:`EXPLAINS`, and
+    its misfit; None if no reading does, as with the same orientation in all rows."""
     misfit_of = {reading: misfit(reading.rotations(read)) for reading in READINGS}
     best = min(misfit_of, key=misfit_of.__getitem__)
     return (best, misfit_of[best]) if misfit_of[best] < EXPLAINS * misfit(read) else None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import InputError, InputNote
-from stcal.geometry.arrays import Brief, ByValue, freeze, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
 from stcal.robot.kinematics.conditions import loaded
@@ -222,7 +222,7 @@ class Tree:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Robot(ByValue, Brief):
+class Robot(Brief):
     """An arm of n joints, one after the other, or a tree of such arms.
 
     Parameters

@@ -16,7 +16,7 @@ from stcal.boards.design import CornerBoard
 from stcal.boards.file import run_board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import ByValue, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
@@ -90,7 +90,7 @@ def labelled_image(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Detection:
+class Detection(ByValue):
     """The labelled circles of one image.
 
     Parameters

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, rms
+from stcal.geometry.arrays import Brief, ByValue, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Rigid
@@ -137,7 +137,7 @@ def _pose_cells(pose: Rigid, sigma: np.ndarray) -> dict[str, float]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RunResult:
+class RunResult(ByValue):
     """All results of a run; :attr:`target` is the calibrated target.
 
     Parameters
