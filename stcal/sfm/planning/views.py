@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.design import TargetDesign
-from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel, Label
@@ -39,6 +38,15 @@ class PlannedView:
     nearest: str  # photograph, at the angle ``nearest_deg``
     nearest_deg: float
 
+    @property
+    def camera_from_target(self) -> Rigid:
+        return self.model.camera_from_model[0]
+
+    @property
+    def labels(self) -> list[Label]:
+        """The labels in view."""
+        return [self.model.labels[i] for i in self.model.point_index]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stand:
@@ -49,10 +57,6 @@ class _Stand:
     distance_mm: float  # median, of the cameras from the centre
     directions: np.ndarray  # (m, 3) unit vectors from the centre to the cameras
     middle: str  # image in the middle of the views
-
-    def __post_init__(self):
-        for name, shape in (("centre", (3,)), ("axes", (3, 3)), ("directions", (None, 3))):
-            freeze(self, name, shape, name)
 
     @classmethod
     def of(cls, model: MetricModel) -> "_Stand":
@@ -133,10 +137,11 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
     scene = replace(scene, groups={model.group: group})
     limit = _largest_tilt(scene, model)
+    members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
     views = []
     for i, place in enumerate(places):
         labels = set(model.labels) & shown(scene, model.group, i, limit)
-        if not _worth_it(labels, model):
+        if not (members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board")):
             continue
         view_model = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
         position = poses[i].inverse().translation
@@ -187,11 +192,6 @@ def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
         from_corner = depth_ratio[..., None] * xyz_camera - origin[:, None]
         u, v = ((from_corner @ side[..., None])[..., 0] / (side * side).sum(1)[:, None] for side in (a, b))
         return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
-
-
-def _worth_it(seen: set[Label], model: MetricModel) -> bool:
-    members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
-    return members["board"] <= seen and any(labels <= seen for key, labels in members.items() if key != "board")
 
 
 def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
