@@ -64,10 +64,10 @@ class ImagePose(Part):
     circles: list[CircleRow] = Field(
         description="`label`, `residual_px` measured minus projected ellipse centre, Huber's `weight`"
     )
-    outliers: tuple[OutlierRow, ...] = Field(
+    outliers: list[OutlierRow] = Field(
         description="`label`, `residual_px`, `limit_px` of circles that contradict the others and are left out"
     )
-    notes: tuple[str, ...] = Field(description="what detection saw and left out")
+    notes: list[str] = Field(description="what detection saw and left out")
 
 
 class PosesFile(ResultFile):
