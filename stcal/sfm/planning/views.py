@@ -143,13 +143,12 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         labels = set(model.labels) & shown(scene, model.group, i, limit)
         if not (members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board")):
             continue
-        view_model = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
         views.append(
             PlannedView(
                 model.group,
-                noise.applied(view_model, setup.camera, setup.radius_mm()),
+                single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup, noise),
                 *place,
                 stand.distance_mm,
                 _tilts_deg(scene, model.group, position, labels),
@@ -213,19 +212,20 @@ def angle_deg(cosine: ArrayLike) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
-    """Returns the model of one image of the group that shows these points."""
-    place = {label: i for i, label in enumerate(model.labels)}
-    points = np.array([place[label] for label in labels])
-    n = len(points)
-    return replace(
+def single(
+    model: MetricModel, name: str, pose: Rigid, labels: list[Label], setup: Setup, noise: CentreNoise
+) -> MetricModel:
+    """Returns the model of one image of the group that shows these points, with the σ that they will have."""
+    points, n = np.array([model.labels.index(label) for label in labels]), len(labels)
+    image = replace(
         model,
         images=(name,),
         camera_from_model=(pose,),
         image_index=np.zeros(n, int),
         point_index=points,
         keypoint=np.arange(n),
-        measured_px=camera.project(pose @ model.xyz_model[points]),
+        measured_px=setup.camera.project(pose @ model.xyz_model[points]),
         shift_px=np.zeros((n, 2)),
         covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
     )
+    return noise.applied(image, setup.camera, setup.radius_mm())
