@@ -96,7 +96,8 @@ def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
     ``fit`` : whether the fit is what is used, so that its quality is printed, or the lens itself.
     """
     from stcal.io.cameras.difference import SizedLens, load_lens
-    from stcal.report.camera import exif_text, fitted_text
+    from stcal.io.cameras.photograph import SIGMA_FOCAL
+    from stcal.report.camera import fitted_text
 
     sides = size.lower().split("x") if size else ["0", "0"]
     if len(sides) != 2 or not all(side.isdigit() for side in sides):
@@ -109,5 +110,7 @@ def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
         where = ", within its valid_intrinsics_region" if lens.lens.region is not None else ""
         print_each("note", [f"{path}: {lens.lens.called} is compared by its own projection{where}, not by a fit to it"])
     elif found.told:
-        print_each("note", [exif_text(found.told)])
+        accuracy = f"f to {SIGMA_FOCAL:.0%}, distortion unknown"
+        start = "a start for `run --refine-camera`, not for measuring"
+        print_each("note", [f"from EXIF: {found.told}; {accuracy}: {start}"])
     return found

@@ -4,9 +4,8 @@ import numpy as np
 
 from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, FittedLens, image_grid, rays
-from stcal.io.cameras.photograph import SIGMA_FOCAL
 from stcal.report.svg import SMALL, VIRIDIS, Axes, Drawing
-from stcal.report.text import NONE, text_table
+from stcal.report.text import join, number, text_table
 
 POOR_PX = 0.05
 """Largest residual, px, of an adequately fitted lens; beyond it the fit limits the accuracy of centres, which is a few
@@ -16,38 +15,27 @@ LENGTHS = ("f", "fx", "fy", "cx", "cy")
 
 def shown(camera: Camera) -> list[str]:
     """Return lines with model, parameters with σ (OpenCV's pixel origin), field of view, and largest distortion."""
-    names, values = parameter_names(camera.colmap_model), camera.colmap_params()
-    sigma = None if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
     rows = [["<parameter", "value", "±"]]
-    for i, (name, value) in enumerate(zip(names, values, strict=True)):
-        shown_value = value - 0.5 if name in ("cx", "cy") else value
+    sigmas = [None] * 16 if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
+    for name, value, sigma in zip(parameter_names(camera.colmap_model), camera.colmap_params(), sigmas, strict=False):
         digits = 4 if name in LENGTHS else 7
-        rows.append([name, f"{shown_value:.{digits}f}", NONE if sigma is None else f"{sigma[i]:.{digits}f}"])
-    lines = [f"{camera.colmap_model}, {camera.width}×{camera.height} px; first pixel's centre at (0, 0)"]
-    lines += text_table(rows, (10, 14, 12))
+        rows.append([name, number(value - 0.5 * (name in ("cx", "cy")), digits), number(sigma, digits)])
     (right, low), (x, y) = (camera.width - 0.5, camera.height - 0.5), camera.centre
     opposite = (((-0.5, y), (right, y)), ((x, -0.5), (x, low)), ((-0.5, -0.5), (right, low)))
-    wide = [field_deg(camera, *ends) for ends in opposite]
-    fields = ["–" if np.isnan(angle) else f"{angle:.2f}°" for angle in wide]
-    lines.append(f"field of view: {fields[0]} across, {fields[1]} up, {fields[2]} over the diagonal")
+    fields = ["–" if np.isnan(angle) else f"{angle:.2f}°" for angle in (field_deg(camera, *ends) for ends in opposite)]
+    lines = [
+        f"{camera.colmap_model}, {camera.width}×{camera.height} px; first pixel's centre at (0, 0)",
+        *text_table(rows, (10, 14, 12)),
+        f"field of view: {fields[0]} across, {fields[1]} up, {fields[2]} over the diagonal",
+    ]
     moved = moved_px(camera)[1]
-    if np.isnan(moved).any():
-        share = np.isnan(moved).any(axis=2).mean()
+    if share := np.isnan(moved).any(axis=2).mean():
         lines.append(
             f"warning: {share:.1%} of the image has no ray: the distortion folds over there, or leads beyond 89°"
         )
-        if share == 1:
-            return lines
-    lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
+    if share < 1:
+        lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
     return lines
-
-
-def exif_text(told: str) -> str:
-    """Return a note on the accuracy of a camera from a photograph's EXIF."""
-    return (
-        f"from EXIF: {told}; f to {SIGMA_FOCAL:.0%}, distortion unknown: a start for `run --refine-camera`, not for "
-        "measuring"
-    )
 
 
 def fitted_text(called: str, found: FittedLens, region: bool = False) -> list[str]:
@@ -92,8 +80,7 @@ def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def distortion_figure(camera: Camera) -> Drawing:
     """Return a figure of the distortion over the image: its direction and size."""
-    pixels, moved = moved_px(camera)
-    return _field(pixels, moved, "moved by the lens, px")
+    return _field(*moved_px(camera), "moved by the lens, px")
 
 
 def comparison_text(found: CameraDifference) -> list[str]:
@@ -106,7 +93,7 @@ def comparison_text(found: CameraDifference) -> list[str]:
     lines = [
         f"apart: {np.sqrt(np.nanmean(length**2)):.4f} px RMS over the image, {np.nanmax(length):.4f} px at most; "
         f"{np.sqrt(np.nanmean(middle**2)):.4f} px RMS in its middle half",
-        f"corners: {', '.join(NONE if np.isnan(v) else f'{v:.4f}' for v in corners)} px",
+        f"corners: {join(number(v, 4) for v in corners)} px",
         f"the second camera is turned by {np.linalg.norm(turn):.5f}° ({', '.join(f'{v:.5f}' for v in turn)})",
     ]
     if np.isnan(length).any():

@@ -1,7 +1,7 @@
 """Calibration of a camera from photographs of a board with corners or circles."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.cameras.model import OF_IMAGES, CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
-from stcal.labels import DotLabel, Label
+from stcal.labels import DotLabel
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
     MAX_RESIDUAL_PX,
@@ -99,60 +99,47 @@ def calibrate_camera_by_corners(
         require_views(views, files, skipped)
         result = adjust_intrinsics(views, grid, camera if done > 1 else closed_form(views, grid, camera), colmap_model)
         camera = result.camera
-    gated = _without_gross_errors(views, grid, result)
-    if gated.corners or gated.skipped:
-        views, skipped = gated.views, (*skipped, *gated.skipped)
+    kept, without, warnings = without_gross_errors(views, grid, result)
+    if without or warnings:
+        views, skipped = kept, (*skipped, *without)
         require_views(views, files, skipped)
         result = replace(adjust_intrinsics(views, grid, result.camera, colmap_model), restarted=result.restarted)
     require_determined(result, views)
     calibration = judged(result, views, skipped, rounds, True, grid)
-    return replace(calibration, warnings=(*calibration.warnings, *gated.warnings()))
+    return replace(calibration, warnings=(*calibration.warnings, *warnings))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Gated:
-    """``views`` : views without gross errors; ``skipped`` : views that consist of them, and why; ``corners`` : the
-    other gross errors, by image."""
-
-    views: list[ImageObservations]
-    skipped: tuple[Skipped, ...]
-    corners: dict[str, tuple[Label, ...]]
-
-    def warnings(self) -> list[str]:
-        """Returns a warning about gross errors, if there are any."""
-        if not self.corners:
-            return []
-        count, (image, labels) = sum(map(len, self.corners.values())), next(iter(self.corners.items()))
-        return [
-            f"{count} corners in {len(self.corners)} views are left out, first {image} {labels[0]}: they lie more than "
-            f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px from where the camera and all views put them; look whether "
-            "something hides the board there"
-        ]
-
-
-def _without_gross_errors(views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics) -> _Gated:
-    """Returns the views without gross errors: their weights in the adjustment would be small, but not zero."""
-    lengths = [np.linalg.norm(m.residuals_px(result.camera), axis=1) for m in result.models]
+def without_gross_errors(
+    views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics
+) -> tuple[list[ImageObservations], list[Skipped], list[str]]:
+    """Returns the views without gross errors, whose weights in the adjustment would be small, but not zero; the views
+    that consist of them; and a warning about the others."""
     suspects = {
         model.images[image]
-        for model, length in zip(result.models, lengths, strict=True)
-        for image in model.image_index[length > MAX_RESIDUAL_PX].tolist()
+        for model in result.models
+        for image in model.image_index[np.linalg.norm(model.residuals_px(result.camera), axis=1) > MAX_RESIDUAL_PX]
     }
-    kept, skipped, corners = [], [], {}
+    limits = f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px"
+    kept, skipped, off = [], [], []
     for view in views:
         own = _gated(view, grid, result) if view.name in suspects else view
-        off = tuple(label for label in view.labels if label not in own.labels)
         if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
             reason = (
-                f"{len(off)} of {len(view)} corners lie more than {GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px from "
-                "where the camera and the other views put them"
+                f"{len(view) - len(own)} of {len(view)} corners lie more than {limits} from where the camera and the "
+                "other views put them"
             )
             skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
             continue
         kept.append(own)
-        if off:
-            corners[view.name] = off
-    return _Gated(kept, tuple(skipped), corners)
+        off += [(view.name, label) for label in view.labels if label not in own.labels]
+    if not off:
+        return kept, skipped, []
+    image, label = off[0]
+    warning = (
+        f"{len(off)} corners in {len(dict(off))} views are left out, first {image} {label}: they lie more than "
+        f"{limits} from where the camera and all views put them; look whether something hides the board there"
+    )
+    return kept, skipped, [warning]
 
 
 def _gated(view: ImageObservations, grid: BoardDesign, result: Intrinsics) -> ImageObservations:

@@ -167,25 +167,20 @@ def measure(
     ellipses = shared.ellipse_options(min_diameter, max_diameter)
     target = _design_beside(faces) if target is None else target
     if serve or live:
-        mode = "--live" if live else "--serve"
-        alone = {"--serve": serve and live, "--report": report, "--joints": joints}
+        mode, source = (
+            ("--live", "from a camera, as it takes them") if live else ("--serve", "over HTTP, one answer each")
+        )
+        alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--out": out != TABLE}
         alone |= {
-            "--out": out != TABLE,
             "IMAGES": images if serve else None,
-            "--json": json_file if serve or json_file != STANDARD_OUTPUT else None,
-            "--previous": previous,
-            "--sequence": sequence,
-            "--scheduler": scheduler,
-            "--send-images": send_images,
-            "--strict": strict,
-            "--workers": workers,
+            "--json": json_file if serve or json_file != STANDARD_OUTPUT else 0,
         }
-        if conflicting := [name for name, value in alone.items() if value]:
-            source = "from a camera, as it takes them" if live else "over HTTP, one answer each"
+        alone |= {"--previous": previous, "--sequence": sequence, "--scheduler": scheduler}
+        alone |= {"--send-images": send_images, "--strict": strict, "--workers": workers}
+        if conflict := next((name for name, value in alone.items() if value), None):
+            lines = ", or give --json -, a line each" if live and conflict in ("--json", "--out") else ""
             raise InputError(
-                "E-OPTION-CONFLICT",
-                f"{mode} and {conflicting[0]}: images come {source}; leave {conflicting[0]} out"
-                + (", or give --json -, a line each" if live and conflicting[0] in ("--json", "--out") else ""),
+                "E-OPTION-CONFLICT", f"{mode} and {conflict}: images come {source}; leave {conflict} out{lines}"
             )
     elif images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")

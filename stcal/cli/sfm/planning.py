@@ -50,11 +50,6 @@ def plan(
     from stcal.sfm.runs.saved import load_run
 
     design = body_of(target)
-    printed = bool(design.with_faces(printed=True).faces)
-    if printed and (unfit := [name for name, value in {"--groups": groups, "--board": board}.items() if value]):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
-        )
     if noise is not None and run is not None:
         raise InputError(
             "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
@@ -67,7 +62,7 @@ def plan(
         if failures := failures_of(saved):
             print_each("warning", [f"{failures}: the σ of its centres have in them what failed"])
     else:
-        centre_noise, source = expected_noise(of_corners=printed)
+        centre_noise, source = expected_noise(of_corners=bool(design.with_faces(printed=True).faces))
         source = f"{source} (--noise, --run)"
     options = PlanOptions(
         images,

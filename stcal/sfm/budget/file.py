@@ -1,21 +1,20 @@
 """Form of the JSON file of ``budget``, which its page and PDF show too."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, Literal
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 import stcal
-from stcal.design import BoardDesign, StatedSize
-from stcal.geometry.rigid import Rigid
+from stcal.design import StatedSize
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
-from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
+from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row, View
 from stcal.sfm.budget.lengths import LengthTest
-from stcal.sfm.budget.sources import REFERENCE_C, Statement
+from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
 from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun, Verified
 
@@ -24,7 +23,8 @@ MILLIDEGREES = 1e3 * float(np.degrees(1.0))
 PPM = 1e6
 
 
-class RunOfBudget(Part):
+@dataclass(frozen=True, slots=True)
+class RunOfBudget:
     folder: str
     images: str
     target: str
@@ -38,27 +38,32 @@ class SourceRow(Part):
     key: str
     title: str
     evaluation: Literal["A", "B"]
-    origin: Literal["estimated", "stated", "assumed", "not stated", "not known"]
+    origin: Origin
     sigma: float | None
     unit: str
     words: str
 
 
-class ViewsRow(Part):
-    group: str
-    images: int
-    spread_deg: float
-
-
 class Uncertainty(Part):
     """Uncertainty of one measurand."""
 
+    axes: list[float]
     contributions: dict[str, float]
-    sensitivities: dict[str, float]
     standard: float
     expanded: float
     coverage: float
     degrees_of_freedom: Finite
+
+    @classmethod
+    def of(cls, row: Row, unit: float) -> "Uncertainty":
+        return cls(
+            axes=(unit * np.sqrt(np.diag(row.covariance))).tolist(),
+            contributions={key: unit * contribution for key, contribution in row.contributions.items()},
+            standard=unit * row.standard,
+            expanded=unit * row.expanded,
+            coverage=row.coverage,
+            degrees_of_freedom=row.freedom,
+        )
 
     def share(self, key: str) -> float:
         """Returns the share of one source in the variance."""
@@ -69,9 +74,7 @@ class FaceUncertainty(Part):
     position_mm: list[float] | None
     rotation_vector_deg: list[float]
     position_um: Uncertainty | None
-    position_xyz_um: list[float] | None
     rotation_mdeg: Uncertainty
-    rotation_xyz_mdeg: list[float]
 
 
 class DistanceUncertainty(Part):
@@ -81,20 +84,22 @@ class DistanceUncertainty(Part):
     distance_um: Uncertainty
 
 
-class CircleUncertainty(Part):
+@dataclass(frozen=True, slots=True)
+class CircleUncertainty:
     position_mm: list[float]
     position_xyz_um: list[float]
 
 
-class StatedRow(Part):
-    body: Literal["board", "target"]
+@dataclass(frozen=True, slots=True)
+class StatedRow:
+    body: str
     key: str
     value: float
     origin: str
 
 
 class LengthRow(Part):
-    circles: list[str]
+    circles: tuple[str, ...]
     measured_mm: float
     reference_mm: float
     error_um: float
@@ -107,33 +112,12 @@ class LengthTestPart(Part):
 
     reference: str
     lengths: list[LengthRow]
+    largest_e_n: Finite
     beyond: int | None
     limit: float
     agrees: bool | None
-    notes: list[str]
-
-    @classmethod
-    def of(cls, test: LengthTest, refused: bool = False) -> "LengthTestPart":
-        """Returns the part of the file for a test. ``refused`` : True if a run must not be used, so that no U holds."""
-        rows = [
-            LengthRow(
-                circles=list(length.circles),
-                measured_mm=length.measured_mm,
-                reference_mm=length.reference_mm,
-                error_um=MICRO * length.error_mm,
-                expanded_um=None if refused else MICRO * length.expanded_mm,
-                e_n=None if refused else length.e_n,
-            )
-            for length in test.lengths
-        ]
-        return cls(
-            reference=test.reference,
-            lengths=rows,
-            beyond=None if refused else test.beyond,
-            limit=test.limit,
-            agrees=None if refused else test.agrees,
-            notes=list(test.notes),
-        )
+    verdict: str
+    notes: tuple[str, ...]
 
 
 class BudgetFile(ResultFile):
@@ -172,7 +156,7 @@ class BudgetFile(ResultFile):
         description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
     )
     redundancy: int = Field(description="degrees of freedom of the adjustment")
-    views: list[ViewsRow] = Field(
+    views: list[View] = Field(
         description="of each `group`: `images`, and `spread_deg`, the largest angle between two camera axes"
     )
     sources: list[SourceRow] = Field(
@@ -192,16 +176,15 @@ class BudgetFile(ResultFile):
     faces: dict[ByName, FaceUncertainty] = Field(
         description="against the reference face: `position_mm`, x, y, z of the face's origin in the target frame, with "
         "`correction_ppm`, and `rotation_vector_deg` of the run; `position_um` (root of the summed variances of x, y, "
-        "z) and "
-        "`rotation_mdeg` likewise, each with `contributions` by key of the source, `sensitivities` (contribution over "
-        "`sigma` of the source), combined `standard` and `expanded` uncertainty, `coverage` of the latter by "
-        "simulation, and effective `degrees_of_freedom`, null for infinitely many; combined standard "
-        "uncertainties of x, y, z: `position_xyz_um`, `rotation_xyz_mdeg`; all of positions null without a known size"
+        "z) and `rotation_mdeg` likewise, each with the combined standard uncertainties of x, y, z (`axes`), "
+        "`contributions` by key of the source, combined `standard` and `expanded` uncertainty, `coverage` of the "
+        "latter by simulation, and effective `degrees_of_freedom`, null for infinitely many; all of positions null "
+        "without a known size"
     )
     distances: list[DistanceUncertainty] = Field(
         description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm` with "
-        "`correction_ppm`, and `distance_um` with `contributions`, `sensitivities`, `standard`, `expanded`, "
-        "`coverage`, `degrees_of_freedom` as of faces"
+        "`correction_ppm`, and `distance_um` with `axes`, `contributions`, `standard`, `expanded`, `coverage`, "
+        "`degrees_of_freedom` as of faces"
     )
     circles: dict[ByName, CircleUncertainty] = Field(
         default={},
@@ -212,9 +195,9 @@ class BudgetFile(ResultFile):
     length_tests: list[LengthTestPart] = Field(
         description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
         "`measured_mm` (corrected) and `reference_mm`, length measurement error `error_um` (VDI/VDE 2634), U of both "
-        "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); how many are `beyond` U, "
-        "the `limit` of the largest |E_n| for so many lengths, whether all `agrees`, and `notes`; U, `e_n`, `beyond` "
-        "and `agrees` null where a run must not be used"
+        "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); `largest_e_n`, how many "
+        "are `beyond` U, the `limit` of the largest |E_n| for so many lengths, whether all `agrees`, the `verdict` in "
+        "words, and `notes`; U, `e_n`, `beyond` and `agrees` null where a run must not be used"
     )
     notes: list[str] = Field(description="what is not in the combined uncertainty, or not known")
 
@@ -223,143 +206,100 @@ class BudgetFile(ResultFile):
         cls, budget: Budget, run: SavedRun, verified: Verified, tests: Sequence[LengthTest] = (), *others: SavedRun
     ) -> "BudgetFile":
         """Returns the file of a run's budget; ``others`` are further runs that the tests compare it with."""
-        refused = any(is_refused(each) for each in (run, *others))
-        parts = [LengthTestPart.of(test, refused) for test in tests]
-        return cls.model_validate(_content(budget, run, verified) | {"length_tests": parts})
+        conditions, refused, known = budget.conditions, is_refused(run), budget.conditions.size_known
+        enlarged, sigma = 1 + conditions.correction, np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2)
+        faces = {}
+        for position, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
+            pose = run.faces.poses()[position.measurand.name]
+            faces[position.measurand.name] = FaceUncertainty(
+                position_mm=(enlarged * pose.translation).tolist() if known else None,
+                rotation_vector_deg=pose.as_scipy().as_rotvec(degrees=True).tolist(),
+                position_um=Uncertainty.of(position, MICRO) if known else None,
+                rotation_mdeg=Uncertainty.of(rotation, MILLIDEGREES),
+            )
+        distances = [
+            DistanceUncertainty(
+                circles=list(row.measurand.circles),
+                length_mm=row.measurand.length_mm or 0.0,
+                corrected_mm=(row.measurand.length_mm or 0.0) * enlarged,
+                distance_um=Uncertainty.of(row, MICRO),
+            )
+            for row in budget.of_kind("distance")
+        ]
+        circles = {
+            str(label): CircleUncertainty(
+                (enlarged * np.asarray(run.faces.circles[label])).tolist(), (MICRO * np.sqrt(own)).tolist()
+            )
+            for label, own in zip(budget.joint.labels, sigma, strict=True)
+        }
+        if any(is_refused(each) for each in (run, *others)):
+            tests = [test.without_u() for test in tests]
+        return cls(
+            format="stcal budget 1",
+            version=stcal.__version__,
+            run=RunOfBudget(
+                folder=str(run.folder),
+                images=str(run.images),
+                target=run.target_design.name,
+                version=verified.version,
+                sha256=run.sha256.get(RUN_MARKER, ""),
+                faces_sha256=run.sha256.get("faces.json", ""),
+                changed=[*verified.missing, *verified.changed, *verified.added],
+            ),
+            fields=budget.statement.fields,
+            reference_face=budget.reference_face,
+            use=(run.report.get("judgement") or {}).get("use", ""),
+            usable=not refused,
+            size_known=known,
+            reference_temperature_c=conditions.temperature_c,
+            holds="" if refused else conditions.words,
+            coverage_factor=COVERAGE_FACTOR,
+            sigma0=budget.joint.sigma_scale,
+            redundancy=budget.joint.redundancy,
+            views=list(budget.views),
+            sources=[SourceRow.model_validate(source) for source in budget.sources],
+            stated=list(_stated(budget.statement, run)),
+            definitions=_definitions(run),
+            correction_ppm=PPM * conditions.correction if known else None,
+            faces={} if refused else faces,
+            distances=[] if refused or not known else distances,
+            circles={} if refused or not known else circles,
+            length_tests=[LengthTestPart.model_validate(test) for test in tests],
+            notes=notes_of(budget, verified, run),
+        )
 
 
-def _content(budget: Budget, run: SavedRun, verified: Verified) -> dict[str, Any]:
-    stated, conditions, refused = budget.statement, budget.conditions, is_refused(run)
-    without_lengths = refused or not conditions.size_known
-    return {
-        "format": "stcal budget 1",
-        "version": stcal.__version__,
-        "run": {
-            "folder": str(run.folder),
-            "images": str(run.images),
-            "target": run.target_design.name,
-            "version": verified.version,
-            "sha256": run.sha256.get(RUN_MARKER, ""),
-            "faces_sha256": run.sha256.get("faces.json", ""),
-            "changed": [*verified.missing, *verified.changed, *verified.added],
-        },
-        "fields": stated.fields,
-        "reference_face": budget.reference_face,
-        "use": (run.report.get("judgement") or {}).get("use", ""),
-        "usable": not refused,
-        "size_known": conditions.size_known,
-        "reference_temperature_c": conditions.temperature_c,
-        "holds": "" if refused else conditions.words,
-        "coverage_factor": COVERAGE_FACTOR,
-        "sigma0": budget.joint.sigma_scale,
-        "redundancy": budget.joint.redundancy,
-        "views": budget.views,
-        "sources": budget.sources,
-        "stated": [*_standard(run.board_design), *_stated(stated)],
-        "definitions": _definitions(run),
-        "correction_ppm": PPM * conditions.correction if conditions.size_known else None,
-        "faces": {} if refused else _faces(budget, run.faces.poses()),
-        "distances": [] if without_lengths else [_distance(row, budget) for row in budget.of_kind("distance")],
-        "circles": {} if without_lengths else _circles(budget, run.faces.circles),
-        "notes": notes_of(budget, verified, run),
-    }
-
-
-def _standard(board: BoardDesign) -> list[dict]:
-    """Returns rows on the board that gives the size: its grid and pitch, as far as it has them."""
-    keys = ("rows", "columns", "pitch_mm") if board.rows else ()
-    values = {key: value for key in keys if (value := getattr(board, key, None))}
-    return [{"body": "board", "key": key, "value": value, "origin": "board.toml"} for key, value in values.items()]
-
-
-def _stated(statement: Statement) -> list[dict]:
-    """Returns rows on what is stated of both bodies, and on a reference temperature that is assumed."""
-    rows = []
+def _stated(statement: Statement, run: SavedRun) -> Iterator[StatedRow]:
+    """Yields the size of the board, what is stated of both bodies, and a reference temperature that is assumed."""
+    board = run.board_design
+    for key in ("rows", "columns", "pitch_mm") if board.rows else ():
+        if value := getattr(board, key, None):
+            yield StatedRow("board", key, value, "board.toml")
     for body, size in (("board", statement.board), ("target", statement.target)):
         values = {key: value for key, value in asdict(size).items() if value is not None}
-        rows += [
-            {"body": body, "key": key, "value": value, "origin": statement.origin[body, key]}
-            for key, value in values.items()
-        ]
+        for key, value in values.items():
+            yield StatedRow(body, key, value, statement.origin[body, key])
         if values.keys() - {"pitch_sigma_ppm"} and size.reference_temperature_c is None:
-            assumed = {"value": REFERENCE_C, "origin": "assumed, ISO 1"}
-            rows.append({"body": body, "key": "reference_temperature_c"} | assumed)
-    return rows
+            yield StatedRow(body, "reference_temperature_c", REFERENCE_C, "assumed, ISO 1")
 
 
 def _definitions(run: SavedRun) -> list[str]:
     """Returns sentences that define the measurands."""
-    faces = []
     plane = run.faces.frame == "plane"
     normal = "normal to the plane of all its circles, " if plane else ""
     foot = ", at its foot on the plane of all circles" if plane else ""
-    for face in run.target_design.faces:
-        drawn = "the frame of its drawing, Z into the body"
-        by_circles = (
-            f"origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of circle {face.y}, Z "
-            f"{normal}out of the body"
-        )
-        faces.append(f"face {face.id}: {drawn if face.printed is not None else by_circles}")
     return [
         f"position of a face: its origin in the frame of face {run.faces.reference_face}; rotation vector: axis, and "
         "angle as its length, of the rotation that takes the axes of that frame to those of the face",
         "a distance a–b is that of the points with the labels a and b, face:circle, as draw numbers them",
-        *faces,
+        *(
+            f"face {face.id}: the frame of its drawing, Z into the body"
+            if face.printed is not None
+            else f"face {face.id}: origin at circle {face.origin}{foot}, X towards circle {face.x}, Y on the side of "
+            f"circle {face.y}, Z {normal}out of the body"
+            for face in run.target_design.faces
+        ),
     ]
-
-
-def _faces(budget: Budget, target_from_face: Mapping[str, Rigid]) -> dict[str, dict]:
-    faces, known = {}, budget.conditions.size_known
-    for row, rotation in zip(budget.of_kind("position"), budget.of_kind("rotation"), strict=True):
-        pose = target_from_face[row.measurand.name]
-        position = pose.translation * (1 + budget.conditions.correction)
-        faces[row.measurand.name] = {
-            "position_mm": position.tolist() if known else None,
-            "rotation_vector_deg": pose.as_scipy().as_rotvec(degrees=True).tolist(),
-            "position_um": _uncertainty(row, budget, MICRO) if known else None,
-            "position_xyz_um": (MICRO * np.sqrt(np.diag(row.covariance))).tolist() if known else None,
-            "rotation_mdeg": _uncertainty(rotation, budget, MILLIDEGREES),
-            "rotation_xyz_mdeg": (MILLIDEGREES * np.sqrt(np.diag(rotation.covariance))).tolist(),
-        }
-    return faces
-
-
-def _circles(budget: Budget, xyz_mm: Mapping[str, np.ndarray]) -> dict[str, dict]:
-    """Returns places of circles with their uncertainties. ``xyz_mm`` : by label, target frame, of the run."""
-    enlarged = 1 + budget.conditions.correction
-    sigma = MICRO * np.sqrt(np.diagonal(budget.circles_covariance_mm2, axis1=1, axis2=2))
-    return {
-        str(label): {
-            "position_mm": (np.asarray(xyz_mm[str(label)]) * enlarged).tolist(),
-            "position_xyz_um": each.tolist(),
-        }
-        for label, each in zip(budget.joint.labels, sigma, strict=True)
-    }
-
-
-def _distance(row: Row, budget: Budget) -> dict:
-    length = row.measurand.length_mm
-    assert length is not None, "of distances only"
-    return {
-        "circles": list(row.measurand.circles),
-        "length_mm": length,
-        "corrected_mm": length * (1 + budget.conditions.correction),
-        "distance_um": _uncertainty(row, budget, MICRO),
-    }
-
-
-def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
-    contributions = {key: unit * contribution for key, contribution in row.contributions.items()}
-    return {
-        "contributions": contributions,
-        "sensitivities": {
-            source.key: contributions[source.key] / source.sigma for source in budget.sources if source.sigma
-        },
-        "standard": unit * row.standard,
-        "expanded": unit * row.expanded,
-        "coverage": row.coverage,
-        "degrees_of_freedom": row.freedom,
-    }
 
 
 def is_refused(run: SavedRun) -> bool:
@@ -370,11 +310,11 @@ def is_refused(run: SavedRun) -> bool:
 def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[str]:
     """Returns why a budget must not be used, in words: the answer of each run, and length tests that differ."""
     reasons = []
-    for run in runs:
-        if is_refused(run):
-            own = (run.report.get("judgement") or {}).get("use", "").removesuffix(".")
-            failed = "failed: " + "; ".join(check["title"] for check in run.failed_checks())
-            reasons.append(f"may run {run.folder} be used? {own if own.startswith('No') else failed}")
+    for run in filter(is_refused, runs):
+        answer = run.report.get("judgement") or {}
+        failed = "failed: " + "; ".join(check["title"] for check in run.failed_checks())
+        own = answer["use"].removesuffix(".") if answer.get("verdict") == "no" else failed
+        reasons.append(f"may run {run.folder} be used? {own}")
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
 
@@ -387,63 +327,52 @@ def _unusual(statement: Statement) -> list[str]:
     """Returns questions about statements that are possible, and as unusual as those in another unit."""
     asked = []
     for body, size in (("board", statement.board), ("target", statement.target)):
-        if size.temperature_c is not None and abs(size.temperature_c - REFERENCE_C) > USUAL_K:
-            fahrenheit = (size.temperature_c - 32) / 1.8
-            asked.append(
-                f"the {body}'s temperature is {size.temperature_c:g} °C: or °F, which were {fahrenheit:.1f} °C?"
-            )
-        if (size.temperature_sigma_k or 0.0) > USUAL_SIGMA_K:
-            asked.append(f"σ of the {body}'s temperature is {size.temperature_sigma_k:g} K: is that its value?")
-        if abs(size.expansion_ppm_per_k or 0.0) > USUAL_EXPANSION:
-            asked.append(
-                f"the {body} expands by {size.expansion_ppm_per_k:g} ppm/K, more than plastics do: is that so?"
-            )
+        warm, sigma, rate = size.temperature_c, size.temperature_sigma_k or 0.0, size.expansion_ppm_per_k or 0.0
+        if warm is not None and abs(warm - REFERENCE_C) > USUAL_K:
+            fahrenheit = (warm - 32) / 1.8
+            asked.append(f"the {body}'s temperature is {warm:g} °C: or °F, which were {fahrenheit:.1f} °C?")
+        if sigma > USUAL_SIGMA_K:
+            asked.append(f"σ of the {body}'s temperature is {sigma:g} K: is that its value?")
+        if abs(rate) > USUAL_EXPANSION:
+            asked.append(f"the {body} expands by {rate:g} ppm/K, more than plastics do: is that so?")
     return asked
 
 
 def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
-    unknown = [source.title for source in budget.sources if source.origin == "not stated"]
-    notes = []
-    if unknown:
-        notes.append(
-            f"taken as exact, since nothing is stated of them: {', '.join(unknown)}; the uncertainties hold as far as "
-            "these are"
-        )
-    if not budget.conditions.size_known:
-        notes.insert(0, f"{budget.conditions.words}; lengths of the run are in the unit of the drawing")
-    elif budget.conditions.correction and not is_refused(run):
-        ppm = PPM * budget.conditions.correction
-        notes.append(
-            f"for the stated expansion, lengths in faces.json are still to be changed by {ppm:+.1f} ppm; the tables "
-            "here have them changed, and U holds for these"
-        )
-    failed = run.failed_checks()
-    if failed:
+    notes, statement, conditions = [], budget.statement, budget.conditions
+    if failed := run.failed_checks():
         invalid = join(invalidated(check["key"] for check in failed))
-        notes.insert(
-            0,
+        notes.append(
             f"failed checks of the run: {len(failed)}, first {failed[0]['title']}; what they found is not among the "
-            f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given",
+            f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given"
         )
     elif is_refused(run):
-        notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
-    if not run.board_design.rows and budget.statement.board != StatedSize():
+        notes.append(f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
+    if not conditions.size_known:
+        notes.append(f"{conditions.words}; lengths of the run are in the unit of the drawing")
+    if unknown := [source.title for source in budget.sources if source.origin == "not stated"]:
+        notes.append(
+            f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
+            "are"
+        )
+    if conditions.size_known and conditions.correction and not is_refused(run):
+        notes.append(
+            f"for the stated expansion, lengths in faces.json are still to be changed by "
+            f"{PPM * conditions.correction:+.1f} ppm; the tables here have them changed, and U holds for these"
+        )
+    if not run.board_design.rows and statement.board != StatedSize():
         notes.append("no board was in view: what is stated of [board] is not used")
-    if (
-        run.board_design.rows
-        and budget.statement.board.temperature_sigma_k
-        and budget.statement.target.temperature_sigma_k
-        and not budget.statement.one_thermometer
-    ):
+    both = statement.board.temperature_sigma_k and statement.target.temperature_sigma_k
+    if run.board_design.rows and both and not statement.one_thermometer:
         notes.append(
             "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured "
             "both (one_thermometer of the statement), U is too large"
         )
-    notes += _unusual(budget.statement)
-    notes += verified.notes()
-    notes.append(
+    return [
+        *notes,
+        *_unusual(statement),
+        *verified.notes(),
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "
-        "the frame is in the poses of the other faces"
-    )
-    return notes
+        "the frame is in the poses of the other faces",
+    ]

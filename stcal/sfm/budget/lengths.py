@@ -2,7 +2,7 @@
 VDI/VDE 2634 part 1 and ISO 10360; E_n is of ISO 13528:2022, 9.7, at most 1 where both agree."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.io.table import LENGTHS, read_table
 from stcal.labels import CircleLabel
+from stcal.report.text import number
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
 from stcal.sfm.budget.sources import reference_temperature_c
 from stcal.sfm.data.model import ImageObservations
@@ -25,24 +26,29 @@ SHARED = ("board_pitch", "board_expansion", "target_expansion")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Length:
-    """A measured and a reference length, mm. ``expanded_mm`` : U of the difference."""
+    """A measured and a reference length, mm. ``expanded_mm`` : U of the difference, None where none holds."""
 
     circles: tuple[CircleLabel, CircleLabel]
     measured_mm: float
     reference_mm: float
-    expanded_mm: float
+    expanded_mm: float | None
 
     @property
-    def error_mm(self) -> float:
-        """Length measurement error, mm."""
-        return self.measured_mm - self.reference_mm
+    def error_um(self) -> float:
+        """Length measurement error."""
+        return 1e3 * (self.measured_mm - self.reference_mm)
 
     @property
-    def e_n(self) -> float:
+    def expanded_um(self) -> float | None:
+        return None if self.expanded_mm is None else 1e3 * self.expanded_mm
+
+    @property
+    def e_n(self) -> float | None:
         """E_n of ISO 13528, with its sign; infinite if both lengths are exact and differ."""
-        if self.expanded_mm:
-            return self.error_mm / self.expanded_mm
-        return np.inf * np.sign(self.error_mm) if self.error_mm else 0.0
+        if self.expanded_um:
+            return self.error_um / self.expanded_um
+        exact = float(np.copysign(np.inf, self.error_um)) if self.error_um else 0.0
+        return None if self.expanded_um is None else exact
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,10 +59,20 @@ class LengthTest:
     lengths: tuple[Length, ...]
     notes: tuple[str, ...]
 
+    def without_u(self) -> "LengthTest":
+        """Returns the test of a run that must not be used, of which no U holds: nothing is judged."""
+        return replace(self, lengths=tuple(replace(length, expanded_mm=None) for length in self.lengths))
+
     @property
-    def beyond(self) -> int:
+    def largest_e_n(self) -> float | None:
+        """Largest magnitude of E_n."""
+        e_n = [abs(length.e_n) for length in self.lengths if length.e_n is not None]
+        return max(e_n, default=None)
+
+    @property
+    def beyond(self) -> int | None:
         """Number of lengths whose error is larger than U."""
-        return sum(abs(length.e_n) > 1 for length in self.lengths)
+        return None if self.largest_e_n is None else sum(abs(length.e_n or 0.0) > 1 for length in self.lengths)
 
     @property
     def limit(self) -> float:
@@ -64,9 +80,23 @@ class LengthTest:
         return float(norm.isf(BY_CHANCE / 2 / len(self.lengths)) / COVERAGE_FACTOR)
 
     @property
-    def agrees(self) -> bool:
+    def agrees(self) -> bool | None:
         """True if no length is beyond the limit."""
-        return all(abs(length.e_n) <= self.limit * (1 + 1e-9) for length in self.lengths)
+        return None if self.largest_e_n is None else self.largest_e_n <= self.limit * (1 + 1e-9)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in words."""
+        count = len(self.lengths)
+        if self.largest_e_n is None:
+            return f"not judged: {count} lengths with their errors, without U, which a run not to be used has not"
+        if not self.beyond:
+            return f"agrees: all {count} lengths within U, largest |E_n| {number(self.largest_e_n, 2)}"
+        return (
+            f"{'may agree' if self.agrees else 'differs'}: {self.beyond} of {count} lengths beyond U, where 1 in 22 is "
+            f"by chance; largest |E_n| {number(self.largest_e_n, 2)}, which reaches {self.limit:.2f} by chance in one "
+            f"of 22 tests of {count}"
+        )
 
 
 def against_stated(budget: Budget, path: Path) -> LengthTest:
@@ -77,25 +107,21 @@ def against_stated(budget: Budget, path: Path) -> LengthTest:
     length = table.quantity("length", LENGTHS)
     known = table.has("sigma", LENGTHS)
     sigma = table.quantity("sigma", LENGTHS) if known else np.zeros(len(length))
-    joint, tested = budget.joint, []
-    places = {str(label): i for i, label in enumerate(joint.labels)}
-    for line, pair, value, sigma_mm in zip(table.lines, ends, length, sigma, strict=True):
+    tested, places = [], {str(label): i for i, label in enumerate(budget.joint.labels)}
+    for line, (a, b), value, sigma_mm in zip(table.lines, ends, length, sigma, strict=True):
         where = f"{table.where}: line {line}"
-        for name in pair:
-            if name not in places:
-                raise InputError(
-                    "E-BUDGET-LENGTHS", f"{where}: no circle {name} in the run; give one such as {joint.labels[0]}"
-                )
-        if pair[0] == pair[1] or value <= 0 or sigma_mm < 0:
+        if unknown := {a, b} - places.keys():
             raise InputError(
                 "E-BUDGET-LENGTHS",
-                f"{where}: {pair[0]} to {pair[1]}, {value:g} ± {sigma_mm:g} mm; a length between two circles needed, "
-                "and a σ of 0 or more",
+                f"{where}: no circle {min(unknown)} in the run; give one such as {budget.joint.labels[0]}",
             )
-        i, j = places[pair[0]], places[pair[1]]
-        measured, standard = _measured(budget, i, j)
-        expanded = COVERAGE_FACTOR * float(np.hypot(standard, sigma_mm))
-        tested.append(Length((joint.labels[i], joint.labels[j]), measured, float(value), expanded))
+        if a == b or value <= 0 or sigma_mm < 0:
+            raise InputError(
+                "E-BUDGET-LENGTHS",
+                f"{where}: {a} to {b}, {value:g} ± {sigma_mm:g} mm; a length between two circles needed, and a σ of 0 "
+                "or more",
+            )
+        tested.append(_length(budget, (places[a], places[b]), float(value), float(sigma_mm)))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
     if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
         notes += (
@@ -117,19 +143,20 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
             "E-BUDGET-LENGTHS",
             f"run {folder}: {len(common)} circles in common, 2 needed; give a run of the same target",
         )
-    shared = SHARED if _same(*boards) else ("target_expansion",)
+    # The two runs may have used one board.
+    same = len({(board.rows, board.columns, board.pitch_mm, board.corner) for board in boards}) == 1
+    shared = SHARED if same else ("target_expansion",)
     tested = []
     for i, j in pairs:
-        measured, standard = _measured(budget, rows[i], rows[j], shared)
-        reference, reference_standard = _measured(other, other_rows[i], other_rows[j], shared)
-        expanded = COVERAGE_FACTOR * float(np.hypot(standard, reference_standard))
-        tested.append(Length((common[i], common[j]), measured, reference, expanded))
+        reference = _length(other, (other_rows[i], other_rows[j]), 0.0, 0.0, shared)
+        sigma_mm = (reference.expanded_mm or 0.0) / COVERAGE_FACTOR
+        tested.append(_length(budget, (rows[i], rows[j]), reference.measured_mm, sigma_mm, shared))
     note = (
         "both calibrations rest on boards of the same description: if it is one board, what its pitch and expansion "
         "are off is in both alike, cannot be seen here, and is not in U of the differences; a length from elsewhere "
         "(--check-lengths) shows it"
     )
-    notes = (note,) if _same(*boards) else ()
+    notes = (note,) if same else ()
     if budget.conditions.temperature_c != other.conditions.temperature_c:
         notes += (
             "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
@@ -173,15 +200,14 @@ def _require_size(budget: Budget) -> None:
         )
 
 
-def _same(a: BoardDesign, b: BoardDesign) -> bool:
-    """True if the two runs may have used one board."""
-    return (a.rows, a.columns, a.pitch_mm, a.corner) == (b.rows, b.columns, b.pitch_mm, b.corner)
-
-
-def _measured(budget: Budget, i: int, j: int, without: Sequence[str] = ()) -> tuple[float, float]:
-    """Returns the corrected length of the run, and its standard uncertainty from all sources except ``without``, mm."""
-    measurand = distance(budget.joint, i, j)
+def _length(
+    budget: Budget, ends: tuple[int, int], reference_mm: float, sigma_mm: float, without: Sequence[str] = ()
+) -> Length:
+    """Returns a corrected length of the run, with U by all sources except ``without`` and by the reference's σ."""
+    measurand = distance(budget.joint, *ends)
     variance = sum(
         float(measurand.covariance(source, 0.0)[0, 0]) for source in budget.sources if source.key not in without
     )
-    return float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction), float(np.sqrt(variance))
+    measured = float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction)
+    one, two = measurand.circles
+    return Length((one, two), measured, reference_mm, COVERAGE_FACTOR * float(np.hypot(np.sqrt(variance), sigma_mm)))

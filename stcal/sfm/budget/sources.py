@@ -67,7 +67,7 @@ class Statement:
     one_thermometer: bool = False  # True if the temperatures of both err alike
 
 
-def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
+def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
     """Statement of a run: ``own`` of its ``board.toml``, overridden by the file, whose fields ``given`` overrides."""
     file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
     sizes, origin = {}, {}
@@ -151,37 +151,42 @@ def sources_of(
     camera_given: bool = True,  # False if the camera was found from the photographs
 ) -> tuple[Source, ...]:
     """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out."""
-    common = contributions.joint.board_common
-    shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
-    by_dots = f"sigma_mm of board.toml × σ₀ {contributions.joint.sigma_scale:.3f}; {shape}"
+    joint, covariance, sigma_px = contributions.joint, contributions.covariance_mm2, contributions.centre_sigma_px
     corners = bool(faces_of_known_shape(board))
-    centres = ("circle_centres", "corners and centres of faces" if corners else "centres of circles", CIRCLES)
-    dots = ("dot_centres", "centres of dots", DOTS)
-    rows = [
-        Source(key, title, "A", "estimated", "residuals; RMS per axis", contributions.centre_sigma_px[kind], "px",
-               contributions.covariance_mm2[kind])
-        for key, title, kind in (centres, dots)[: 2 if board.rows else 1]
-    ]  # fmt: skip
+    title, by_residuals = "corners and centres of faces" if corners else "centres of circles", "residuals; RMS per axis"
+    points = ("estimated", by_residuals, sigma_px[CIRCLES], "px", covariance[CIRCLES])
+    rows = [Source("circle_centres", title, "A", *points)]
     if board.rows:
-        sigma_um = 1e3 * board.sigma_mm * contributions.joint.sigma_scale
-        covariance = contributions.covariance_mm2[BOARD]
-        origin: Origin = "assumed" if board.sigma_mm == DOTS_SIGMA_MM else "stated"
-        by_dots += DEFAULT * (origin == "assumed")
-        rows.append(Source("board_dots", "places of dots", "B", origin, by_dots, sigma_um, "µm", covariance))
+        dots = ("estimated", by_residuals, sigma_px[DOTS], "px", covariance[DOTS])
+        rows.append(Source("dot_centres", "centres of dots", "A", *dots))
+        shape = f"{100 * joint.board_common:.0f} % of it common to all groups"
+        origin, words = _stated_or_default(
+            f"sigma_mm of board.toml × σ₀ {joint.sigma_scale:.3f}; "
+            f"{shape if joint.board_common else 'each group its own'}",
+            board.sigma_mm == DOTS_SIGMA_MM,
+        )
+        sigma_um = 1e3 * board.sigma_mm * joint.sigma_scale
+        rows.append(Source("board_dots", "places of dots", "B", origin, words, sigma_um, "µm", covariance[BOARD]))
     rows += _own_size(contributions, board)
-    if not corners or contributions.covariance_mm2[FLATNESS].any():
+    if not corners or covariance[FLATNESS].any():
         rows.append(_flatness(contributions, flatness_mm))
     rows.append(_intrinsics(contributions, camera, refined, camera_given))
     if board.rows:
-        rows.append(_scale(contributions.by_scale, statement))
-    grown = contributions.joint.xyz_model - contributions.joint.xyz_model.mean(0)
-    bodies = (("board", statement.board, contributions.by_scale), ("target", statement.target, -grown.ravel()))
-    if board.rows:
-        rows += [row for body, stated, effect in bodies for row in _temperature(body, stated, effect, statement)]
+        by_scale, grown = contributions.by_scale, joint.xyz_model - joint.xyz_model.mean(0)
+        name, sigma = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm
+        absent, words = [name] * (sigma is None), f"{name} of {statement.origin['board', name]}"
+        rows.append(_stated("board_pitch", "board's pitch", "ppm", absent, words, sigma, (sigma or 0.0) * by_scale))
+        bodies = (("board", statement.board, by_scale), ("target", statement.target, -grown.ravel()))
+        for body, stated, effect in bodies:
+            rows += _expansion(body, stated, effect, statement)
         if statement.one_thermometer:
-            rows = [row for row in rows if row.key not in ("board_temperature", "target_temperature")]
             rows.append(_one_thermometer(bodies))
     return tuple(rows)
+
+
+def _stated_or_default(words: str, default: bool) -> tuple[Origin, str]:
+    """Returns the origin of a σ, and the words on it: assumed where nobody has changed the default."""
+    return ("assumed", words + DEFAULT) if default else ("stated", words)
 
 
 def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Source]:
@@ -191,9 +196,10 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
         print_factor = contributions.joint.print_factor
         within_stated = max(face.sigma_mm or 0.0 for face in faces)
         within = within_stated * print_factor * factor
-        words = f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness"
-        origin: Origin = "assumed" if within_stated == TAG_SIGMA_MM else "stated"
-        words += DEFAULT * (origin == "assumed")
+        origin, words = _stated_or_default(
+            f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness",
+            within_stated == TAG_SIGMA_MM,
+        )
         yield Source(
             "print", "print of faces", "B", origin, words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
         )
@@ -218,81 +224,70 @@ def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Sour
 
 
 def _flatness(contributions: Contributions, flatness_mm: float | None) -> Source:
-    words = f"--flatness of the run × σ₀ {contributions.joint.sigma_scale:.3f}"
-    if flatness_mm is None:
-        words = "--flatness off: faces need not be flat"
-    sigma = None if flatness_mm is None else 1e3 * flatness_mm * contributions.joint.sigma_scale
-    origin: Origin = "not stated" if flatness_mm is None else "stated"
-    if flatness_mm == FLATNESS_MM:
-        origin, words = "assumed", f"the default of {words}"
-    return Source(
-        "flatness", "flatness of faces", "B", origin, words, sigma, "µm", contributions.covariance_mm2[FLATNESS]
-    )
+    words, factor = f"--flatness of the run × σ₀ {contributions.joint.sigma_scale:.3f}", contributions.joint.sigma_scale
+    row: tuple[Origin, str, float | None] = ("not stated", "--flatness off: faces need not be flat", None)
+    if flatness_mm is not None:
+        row = "stated", words, 1e3 * flatness_mm * factor
+        if flatness_mm == FLATNESS_MM:
+            row = "assumed", f"the default of {words}", row[2]
+    return Source("flatness", "flatness of faces", "B", *row, "µm", contributions.covariance_mm2[FLATNESS])
 
 
 def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> Source:
+    stated, adjusted = camera.covariance is not None, contributions.covariance_mm2[INTRINSICS]
+    row: tuple[Literal["A", "B"], Origin, str, np.ndarray]
     if not camera_given:
-        words = "found from these photographs, without a camera file; adjusted with all else"
-        return _camera_row("estimated", words, contributions.covariance_mm2[INTRINSICS], "A")
-    stated = camera.covariance is not None
-    origin: Origin = "stated" if stated else "assumed" if refined else "not stated"
-    if refined:
-        words = "adjusted; σ before that " + ("of the camera file" if stated else "of a calibration of some age")
-        return _camera_row(origin, words, contributions.covariance_mm2[INTRINSICS])
-    if camera.covariance is None:
-        words = "fixed; no σ in the camera file"
-        return _camera_row(origin, words, np.zeros_like(contributions.joint.covariance_mm2))
-    effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
-    return _camera_row(origin, "fixed; σ of the camera file", effect @ camera.covariance @ effect.T)
-
-
-def _camera_row(origin: Origin, words: str, covariance: np.ndarray, evaluation: Literal["A", "B"] = "B") -> Source:
-    return Source("intrinsics", "intrinsics", evaluation, origin, words, None, "", covariance)
+        row = "A", "estimated", "found from these photographs, without a camera file; adjusted with all else", adjusted
+    elif refined and stated:
+        row = "B", "stated", "adjusted; σ before that of the camera file", adjusted
+    elif refined:
+        row = "B", "assumed", "adjusted; σ before that of a calibration of some age", adjusted
+    elif camera.covariance is not None:
+        effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
+        row = "B", "stated", "fixed; σ of the camera file", effect @ camera.covariance @ effect.T
+    else:
+        row = "B", "not stated", "fixed; no σ in the camera file", np.zeros_like(adjusted)
+    return Source("intrinsics", "intrinsics", *row[:3], None, "", row[3])
 
 
 def _stated(
-    key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma: float | None, covariance: np.ndarray
+    key: str, title: str, unit: str, absent: Sequence[str], words: str, sigma: float | None, effect_ppm: np.ndarray
 ) -> Source:
-    """Returns the row of an input that the user states; where keys are absent from the statement, it is exact."""
+    """Returns the row of an input that the user states; where keys are absent from the statement, it is exact.
+    ``effect_ppm``: (3c,) of one σ on the circles, times a million."""
+    covariance = np.outer(PPM * effect_ppm, PPM * effect_ppm)
     if absent:
-        zero = np.zeros_like(covariance)
-        return Source(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, zero)
+        return Source(key, title, "B", "not stated", f"no {' and '.join(absent)}", None, unit, 0 * covariance)
     return Source(key, title, "B", "stated", words, sigma, unit, covariance)
 
 
-def _scale(by_scale: np.ndarray, statement: Statement) -> Source:
-    name, sigma = "pitch_sigma_ppm", statement.board.pitch_sigma_ppm
-    words = f"{name} of {statement.origin['board', name]}"
-    covariance = ((sigma or 0.0) * PPM) ** 2 * np.outer(by_scale, by_scale)
-    return _stated("board_pitch", "board's pitch", "ppm", [name] * (sigma is None), words, sigma, covariance)
-
-
-def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
+def _expansion(body: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
     """Yields the rows of temperature and expansion; ``effect``: (3c,) of a relative change of size."""
     warmer = warmer_k(stated)
     for key, name, needed, factor, unit in (
         ("temperature", "temperature_sigma_k", "expansion_ppm_per_k", stated.expansion_ppm_per_k, "K"),
         ("expansion", "expansion_sigma_ppm_per_k", "temperature_c", warmer, "ppm/K"),
     ):
+        if key == "temperature" and statement.one_thermometer:
+            continue
         sigma = getattr(stated, name)
         absent = [name] * (sigma is None) + [needed] * (factor is None)
-        words = f"{name} of {statement.origin[what, name]}"
-        covariance = ((sigma or 0.0) * (factor or 0.0) * PPM) ** 2 * np.outer(effect, effect)
-        yield _stated(f"{what}_{key}", f"{what}'s {key}", unit, absent, words, sigma, covariance)
+        words = f"{name} of {statement.origin[body, name]}"
+        by_sigma = (sigma or 0.0) * (factor or 0.0) * effect
+        yield _stated(f"{body}_{key}", f"{body}'s {key}", unit, absent, words, sigma, by_sigma)
 
 
 def _one_thermometer(bodies: Iterable[tuple[str, StatedSize, np.ndarray]]) -> Source:
     """Row of an error common to both temperatures (JCGM 100, 5.2.2, r = 1), nearly nil if bodies expand alike."""
-    total, absent, sigmas = 0.0, [], []
+    total, absent, sigmas = np.zeros(1), [], set()
     for body, stated, effect in bodies:
-        sigma, rate = stated.temperature_sigma_k, stated.expansion_ppm_per_k
-        keys = (("temperature_sigma_k", sigma), ("expansion_ppm_per_k", rate))
-        absent += [f"{key} of [{body}]" for key, value in keys if value is None]
-        sigmas.append(sigma)
-        total = total + (sigma or 0.0) * (rate or 0.0) * PPM * effect
-    sigma = sigmas[0] if sigmas[0] == sigmas[1] else None
+        keys = {"temperature_sigma_k": stated.temperature_sigma_k, "expansion_ppm_per_k": stated.expansion_ppm_per_k}
+        absent += [f"{key} of [{body}]" for key, value in keys.items() if value is None]
+        sigmas.add(stated.temperature_sigma_k)
+        total = total + (stated.temperature_sigma_k or 0.0) * (stated.expansion_ppm_per_k or 0.0) * effect
+    sigma = sigmas.pop() if len(sigmas) == 1 else None
     title, words = "temperature of board and target", "temperature_sigma_k of both, one_thermometer: fully correlated"
-    return _stated("temperature", title, "K", absent, words, sigma, np.outer(total, total))
+    return _stated("temperature", title, "K", absent, words, sigma, total)
 
 
 def warmer_k(stated: StatedSize) -> float | None:

@@ -187,7 +187,13 @@ def _of_one_round(
     views = board_views(detection.images, board, camera)
     if not first:
         views, _ = correct_defocus(views, camera, pattern_of_board(board))
-    skipped = (*not_images, *detection.skipped, *_without_board(detection, views))
+    shown, repeated = {view.name for view in views}, "the board is in view more than once"
+    without = (
+        Skipped(each.file.name, repeated if "board" in each.detection.repeated else "no board recognised")
+        for each in detection.images
+        if each.file.name not in shown
+    )
+    skipped = (*not_images, *detection.skipped, *without)
     require_views(views, files, skipped)
     start = closed_form(views, board, camera) if first else camera
     result = adjust_intrinsics(views, board, start, colmap_model)
@@ -232,8 +238,10 @@ def judged(
     """Returns a calibration with its checks and warnings; ``settled``: whether the detection rounds converged."""
     projection = projection_sigma(result)
     unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
-    warnings = [*unseen, *_of_rounds(result, settled), *_warnings(result, projection, board)]
-    warnings += of_lens_model(result, views, board)
+    moving = f"the camera still moves after {MAX_ROUNDS} rounds of detection; add views, or choose a simpler --model"
+    changing = "the σ of centres and dots still change when the rounds end; look at the outliers"
+    warnings = [*unseen, *([] if settled else [moving]), *([] if result.settled else [changing])]
+    warnings += [*_warnings(result, projection, board), *of_lens_model(result, views, board)]
     try:
         of_held_out = held_out(result, views, board)
     except StcalError as error:
@@ -242,24 +250,12 @@ def judged(
     return CameraCalibration(result, tuple(views), skipped, rounds, projection, of_held_out, tuple(warnings))
 
 
-def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:
-    names_with_board = {view.name for view in views}
-    return [
-        Skipped(
-            image.file.name,
-            "the board is in view more than once" if "board" in image.detection.repeated else "no board recognised",
-        )
-        for image in detection.images
-        if image.file.name not in names_with_board
-    ]
-
-
 def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile], skipped: Sequence[Skipped]) -> None:
     """Checks that there are enough views of the board."""
     if len(views) >= MIN_VIEWS:
         return
     images = {file.name for file in files}  # other files are skipped too, and explain nothing
-    why = "".join(f"; {s.name}: {s.reason}" for s in [s for s in skipped if s.name in images][:1])
+    why = next((f"; {each.name}: {each.reason}" for each in skipped if each.name in images), "")
     if not views:
         raise DetectionError(
             "E-BOARD-NOT-FOUND",
@@ -282,12 +278,14 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
             f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
             "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom",
         )
-    relative = float((result.sigma()[0] / result.camera.focal[0]).max())
+    relative = float(result.sigma()[0] / result.camera.focal[0])
     if relative > MAX_FOCAL_SIGMA:
+        normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_model])
+        spread_deg = np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
         raise DegenerateError(
             "E-CALIBRATE-UNDETERMINED",
             f"camera: focal length determined to {100 * relative:.2g} % by {len(views)} views, "
-            f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {_spread_deg(result):.0f}°); "
+            f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {spread_deg:.0f}°); "
             "add views in which the board is tilted by 20° to 40°, about different axes",
         )
 
@@ -303,12 +301,6 @@ def weighted_rms_px(result: Intrinsics) -> float:
     return float(np.sqrt(np.average((result.residuals_px() ** 2).mean(axis=1), weights=weight)))
 
 
-def _spread_deg(result: Intrinsics) -> float:
-    """Returns the largest angle between the normals of two boards in the camera frame."""
-    normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_model])
-    return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
-
-
 def _next_move(before: Intrinsics, after: Intrinsics) -> float:
     """Returns the predicted largest move of a parameter by another round, in σ, as projections' moves decrease."""
     moved = model_parameters(after.camera, after.colmap_model) - model_parameters(before.camera, before.colmap_model)
@@ -318,45 +310,39 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
     return float(np.abs(moved / after.sigma()).max() * min(1.0, moved_px / max(bent_px, 1e-9)))
 
 
-def _of_rounds(result: Intrinsics, settled: bool) -> list[str]:
-    """Returns warnings about iterations that had not converged after the last round."""
-    warnings = []
-    if not settled:
-        warnings.append(
-            f"the camera still moves after {MAX_ROUNDS} rounds of detection; add views, or choose a simpler --model"
-        )
-    if not result.settled:
-        warnings.append("the σ of centres and dots still change when the rounds end; look at the outliers")
-    return warnings
-
-
 def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesign) -> list[str]:
     """Returns warnings, and what the user should do about them."""
-    warnings = []
-    if result.restarted:
-        warnings.append(
+    centres, dots, differ = result.factors.centres, result.factors.dots, result.differ
+    corners = zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
+    told = [
+        (
+            result.restarted,
             "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
-            "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model"
-        )
-    warnings += [
-        f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, "
-        f"the distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
-        for corner, reach, sigma in zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
-        if reach < MIN_REACH
+            "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model",
+        ),
+        *(
+            (
+                reach < MIN_REACH,
+                f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, "
+                f"the distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in "
+                "it",
+            )
+            for corner, reach, sigma in corners
+        ),
+        (
+            centres > SUSPICIOUS_FACTOR,
+            f"residuals exceed the σ of the centres {centres:.1f} times: σ are scaled by it, but images are blurred or "
+            "moved",
+        ),
+        (
+            dots > SUSPICIOUS_FACTOR,
+            f"dots deviate from the grid {dots:.1f} times as much as the board file says: sigma_mm = "
+            f"{dots * board.sigma_mm:.3g} fits, {board.sigma_mm:g} is stated",
+        ),
+        (
+            differ > SUSPICIOUS_FACTOR,
+            f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that; keep "
+            "focus and zoom fixed, and the light even",
+        ),
     ]
-    if result.factors.centres > SUSPICIOUS_FACTOR:
-        warnings.append(
-            f"residuals exceed the σ of the centres {result.factors.centres:.1f} times: σ are scaled by it, but images "
-            "are blurred or moved"
-        )
-    if result.factors.dots > SUSPICIOUS_FACTOR:
-        warnings.append(
-            f"dots deviate from the grid {result.factors.dots:.1f} times as much as the board file says: "
-            f"sigma_mm = {result.factors.dots * board.sigma_mm:.3g} fits, {board.sigma_mm:g} is stated"
-        )
-    if result.differ > SUSPICIOUS_FACTOR:
-        warnings.append(
-            f"photographs differ {result.differ:.1f} times more than their pixels explain, and σ are larger by that; "
-            "keep focus and zoom fixed, and the light even"
-        )
-    return warnings
+    return [warning for applies, warning in told if applies]

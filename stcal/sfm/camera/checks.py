@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -10,7 +9,6 @@ from scipy.optimize import least_squares
 from stcal.adjust.blocks import Vector
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
-from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.least_squares import PoseStack
 from stcal.labels import Label
@@ -40,10 +38,6 @@ class ProjectionSigma:
     sigma_px: np.ndarray  # (n,) per axis, up to a rotation of the camera, which poses absorb
     reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
     corner_sigma_px: np.ndarray  # (4,)
-
-    def __post_init__(self):
-        for name in ("xy_px", "sigma_px", "reach", "corner_sigma_px"):
-            freeze(self, name, what=name)
 
 
 def image_grid(camera: Camera) -> np.ndarray:
@@ -151,7 +145,6 @@ LIKELY = 2.0
 after the one-standard-error rule, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""
 HOPELESS = 3.0
 """Largest ratio of a model's residuals to those of the model that fits best. Models beyond it are not tried further."""
-T = TypeVar("T")
 POSE_PASSES = 2
 """Number of passes of pose and eccentricity. Few suffice, as eccentricity hardly changes with the pose."""
 CLIP_SIGMAS = 5.0
@@ -235,8 +228,13 @@ def choose_model(
         else:
             why[model] = str(outcome or "too few views")
     if not fared:
-        failed = next((entry for entry in fitted.values() if isinstance(entry, StcalError)), None)
-        raise failed if failed and not jobs else _too_few(len(views))
+        for entry in fitted.values():
+            if isinstance(entry, StcalError) and not jobs:
+                raise entry
+        raise DegenerateError(
+            "E-CALIBRATE-FEW-VIEWS",
+            f"--model auto: {len(views)} views, {MIN_TRAINING + 1} needed; add views, or choose a --model",
+        )
     factor = min(entry.factor for entry in fared.values())  # one σ for all models: that of the model that fits best
     squares = {model: entry.squares(factor) for model, entry in fared.items()}
     best = min(squares, key=lambda model: squares[model].mean())
@@ -244,13 +242,6 @@ def choose_model(
     as_good = [row for row in rows if row.worse is not None and row.worse <= LIKELY * (row.worse_sigma or 0.0)]
     chosen = min(as_good, key=lambda row: (row.parameters, row.worse or 0.0))
     return chosen.model, tuple(rows)
-
-
-def _too_few(count: int) -> StcalError:
-    return DegenerateError(
-        "E-CALIBRATE-FEW-VIEWS",
-        f"--model auto: {count} views, {MIN_TRAINING + 1} needed; add views, or choose a --model",
-    )
 
 
 def _row(model: str, outcome: HeldOut | None, squares: dict[str, np.ndarray], best: str, why: str) -> Candidate:
@@ -284,9 +275,8 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
     camera = result.camera
     ((group, members),) = by_group([view]).items()
     model = model_of_views(group, view.labels, members, board, camera)
-    places = {
-        label: xyz for of_folder in result.models if of_folder.group == group for label, xyz in _places(of_folder)
-    }
+    known = [own for own in result.models if own.group == group]
+    places = {label: xyz for own in known for label, xyz in zip(own.labels, own.xyz_model, strict=True)}
     xyz = np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)])
     model = replace(model, xyz_model=xyz)
     factor = result.factors.centres
@@ -305,7 +295,3 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
         model = placed(begin, poses.moved(solution.x[None]), points)
     residual = model.residuals_px(camera)
     return residual, model.whiten(residual)
-
-
-def _places(model) -> list[tuple[Label, np.ndarray]]:
-    return list(zip(model.labels, model.xyz_model, strict=True))

@@ -113,17 +113,17 @@ def _homography(image: ImageObservations, board: BoardDesign, camera: Camera) ->
 def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Camera) -> list[ImageObservations]:
     """Returns the dots of every image that shows the board, numbered consistently in all images of a folder. A wrong
     numbering only breaks the match to deviations from the grid: by these, as ``camera`` shows them, it is selected."""
-    views = []
+    views, numberings = [], {}
     for image in images:
         sighting = image.detection.board
         if sighting is not None and len(sighting.rows):
             dots = image.detection.centres.select(sighting.rows)
-            labels = tuple(DotLabel(0, i) for i in range(len(dots)))
+            numberings[image.file.name] = sighting.numberings
             views.append(
                 ImageObservations(
                     name=image.file.name,
                     group=image.file.group,
-                    labels=labels,
+                    labels=tuple(DotLabel(0, i) for i in range(len(dots))),
                     centre_px=dots.centre_px,
                     centre=dots.centre,
                     shape=dots.shape,
@@ -131,14 +131,12 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
                     blur_px=dots.blur_px,
                 )
             )
-    numberings = {i.file.name: i.detection.board.numberings for i in images if i.detection.board is not None}
-    settled = {}
+    labels: dict[str, tuple[DotLabel, ...]] = {}
     for members in by_group(views).values():
         fields = [_deviations(numberings[v.name], camera.normalised_from_pixel(v.centre_px), board) for v in members]
-        settled |= {
-            v.name: numberings[v.name][choice] for v, choice in zip(members, _choose_alike(fields), strict=True)
-        }
-    return [replace(v, labels=tuple(DotLabel(row, column) for row, column in settled[v.name].tolist())) for v in views]
+        for view, choice in zip(members, _choose_alike(fields), strict=True):
+            labels[view.name] = tuple(DotLabel(*cell) for cell in numberings[view.name][choice].tolist())
+    return [replace(view, labels=labels[view.name]) for view in views]
 
 
 def _deviations(numberings: np.ndarray, xy_normalised: np.ndarray, board: BoardDesign) -> np.ndarray:
@@ -332,9 +330,7 @@ def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: 
         state = _weighted(state, detected_covariance, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
         setting = replace(setting, sigma_mm=factors.dots * board.sigma_mm)
-        state = minimum(state, setting)
-        robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
-        setting = replace(setting, huber=HUBER * robust)
+        state, setting = _robust_minimum(state, setting)
         last = Normal.of(state, setting)
         updated, boards = _updated_factors(last, factors)
         changes = [updated.centres / factors.centres, updated.dots / factors.dots] + [
@@ -353,10 +349,15 @@ def _with_focal_length(state: State, setting: Setting) -> State:
     basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
     setting = replace(setting, basis=basis, weight=np.full((1, 1), setting.start.focal[0] ** -2.0))
     for _ in range(FOCAL_ROUNDS):
-        state = minimum(state, setting)
-        robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
-        setting = replace(setting, huber=HUBER * robust)
+        state, setting = _robust_minimum(state, setting)
     return state
+
+
+def _robust_minimum(state: State, setting: Setting) -> tuple[State, Setting]:
+    """Returns the state of least cost, and the setting with Huber's limit by its residuals."""
+    state = minimum(state, setting)
+    robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
+    return state, replace(setting, huber=HUBER * robust)
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:

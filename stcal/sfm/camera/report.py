@@ -6,7 +6,7 @@ from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.report.camera import distortion_figure
-from stcal.report.document import Document, Section, Table, alarms, page_only, plot, plots
+from stcal.report.document import Block, Document, Section, Table, alarms, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
 from stcal.sfm.camera.calibrate import CameraCalibration
@@ -20,9 +20,10 @@ ARROW_SHARE = 0.7
 
 def calibration_report(result: CameraCalibration, summary: CalibrationFile, where: str) -> Document:
     """Returns the report of ``calibrate-camera``."""
-    lens = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model)
+    lens, held_out = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model), result.held_out
+    digits = {name: 4 if name[0] in "fc" else 7 for name in summary.parameters}
     parameters = [
-        [name, number(each.value, 4 if name[0] in "fc" else 7), number(each.sigma, 4 if name[0] in "fc" else 7)]
+        [name, number(each.value, digits[name]), number(each.sigma, digits[name])]
         for name, each in summary.parameters.items()
     ]
     models = [
@@ -33,28 +34,28 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     ]
     images = [[each.image, each.dots, number(each.tilt_deg, 1), number(each.rms_px, 4)] for each in summary.images]
     outliers = [[o.image, o.label, number(o.residual_px, 3), number(o.weight, 2)] for o in summary.outliers]
-    held_out = (
-        ""
-        if result.held_out is None
-        else f"views held out, {result.held_out.folds} parts: residual RMS {result.held_out.rms_px():.4f} px after "
-        "their poses were fitted"
-    )
-    sigma = (
-        f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
-        f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
-    )
-    times = summary.photographs_differ
-    differ = (
-        f"photographs differ {times:.1f} times more than their pixels explain; σ are larger by that"
-        if times > NOTED
-        else "photographs differ no more than their pixels explain"
-    )
-    prints = [
-        line
-        for each in summary.prints
-        for line in stretch_in_words(
-            f"the board{'' if each.folder == '.' else f' of {each.folder}'}", each.stretch, each.shear
+    differ = f"{summary.photographs_differ:.1f} times more than their pixels explain; σ are larger by that"
+    blocks: list[Block] = [
+        alarms(summary.warnings),
+        Table(["<parameter", "value, px", "σ"], parameters),
+        "the principal point counts from the centre of the top-left pixel; the camera file, as COLMAP's, counts from "
+        f"that pixel's corner, so that cx, cy are {COLMAP_PIXEL_ORIGIN:g} px larger there",
+        f"σ of a projection: {summary.projection_sigma_px:.4f} px median over the image, "
+        f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner",
+        f"photographs differ {differ if summary.photographs_differ > NOTED else 'no more than their pixels explain'}",
+    ]
+    if held_out is not None:
+        blocks.append(
+            f"views held out, {held_out.folds} parts: residual RMS {held_out.rms_px():.4f} px after their poses were "
+            "fitted"
         )
+    for folder, own in summary.prints.items():
+        board = "the board" if folder == "." else f"the board of {folder}"
+        blocks += stretch_in_words(board, own.stretch, own.shear)
+    chosen: list[Block] = [
+        f"--model auto: {summary.model}, the simplest that foretells views held out as well as the best: not worse "
+        "than it by more than two standard errors",
+        Table(["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"], models),
     ]
     return Document(
         "Calibration of a camera",
@@ -63,28 +64,14 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         f"{result.rounds} rounds of detection",
         [
             Section(
-                "Parameters",
-                [
-                    alarms(summary.warnings),
-                    Table(["<parameter", "value, px", "σ"], parameters),
-                    "the principal point counts from the centre of the top-left pixel; the camera file, as COLMAP's, "
-                    f"counts from that pixel's corner, so that cx, cy are {COLMAP_PIXEL_ORIGIN:g} px larger there",
-                    sigma,
-                    differ,
-                    held_out,
-                    *prints,
-                    plot(lambda: distortion_figure(lens), "What the lens moves"),
-                ],
-                terminal=True,
+                "Parameters", [*blocks, plot(lambda: distortion_figure(lens), "What the lens moves")], terminal=True
             ),
             Section(
                 "Uncertainty over the image",
                 [
                     "How well it is known where the camera sees a known direction, up to a rotation of the camera, "
                     "which poses absorb. White: dots",
-                    plots(
-                        plot(lambda: sigma_map(result), "σ of a projection over the image", "σ, by the covariance", ""),
-                    ),
+                    plots(plot(lambda: sigma_map(result), "σ of a projection over the image", "", "")),
                 ],
             ),
             Section(
@@ -95,20 +82,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
                     plots(plot(lambda: residual_map(result), "Mean residuals, measured minus projected", css="")),
                 ],
             ),
-            Section(
-                "Lens models",
-                [
-                    f"--model auto: {summary.model}, the simplest that foretells views held out as well as the best",
-                    page_only(
-                        "Each model calibrated without a fifth of the views and compared with these, five times. The "
-                        "star is the simplest that is not worse than the best by more than two standard errors"
-                    ),
-                    Table(["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"], models),
-                ]
-                if models
-                else [],
-                terminal=True,
-            ),
+            Section("Lens models", chosen if models else [], terminal=True),
             Section("Views", [Table(["<image", "dots", "tilt °", "RMS px"], images)]),
             Section(
                 "Left out",
@@ -128,24 +102,19 @@ def _image_axes(camera: Camera) -> Axes:
     return Axes(drawing, box, (-0.5, camera.width - 0.5), (camera.height - 0.5, -0.5))
 
 
-def _map(result: CameraCalibration, values: np.ndarray, label: str) -> Drawing:
-    """Returns a figure of values (n,) over the image's grid as shades, with the measured dots."""
-    camera = result.intrinsics.camera
-    axes = _image_axes(camera)
-    shown = values.reshape(GRID[::-1])
-    step = round_below(float(shown.max()) / 8)
-    bands = max(1, int(np.ceil(shown.max() / step)))
-    axes.shade(shown, (0, 0, camera.width - 1, camera.height - 1), 0, bands * step, VIRIDIS, bands)
+def sigma_map(result: CameraCalibration) -> Drawing:
+    """Returns a figure of σ of projections over the image as shades, with the measured dots."""
+    camera, axes = result.intrinsics.camera, _image_axes(result.intrinsics.camera)
+    sigma = result.projection.sigma_px.reshape(GRID[::-1])
+    step = round_below(float(sigma.max()) / 8)
+    bands = max(1, int(np.ceil(sigma.max() / step)))
+    axes.shade(sigma, (0, 0, camera.width - 1, camera.height - 1), 0, bands * step, VIRIDIS, bands)
     for model in result.intrinsics.models:
         axes.marks(*model.measured_px.T, kind="dot", size=0.8, colour="#ffffff", opacity=0.5)
     axes.frame("x, px", "y, px")
     _, top, right, bottom = axes.box
-    axes.drawing.scale((right + 8, top + 16, right + 15, bottom - 10), 0, bands * step, label, VIRIDIS)
+    axes.drawing.scale((right + 8, top + 16, right + 15, bottom - 10), 0, bands * step, "σ, px", VIRIDIS)
     return axes.drawing
-
-
-def sigma_map(result: CameraCalibration) -> Drawing:
-    return _map(result, result.projection.sigma_px, "σ, px")
 
 
 def residual_map(result: CameraCalibration) -> Drawing:

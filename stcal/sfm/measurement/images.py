@@ -21,7 +21,7 @@ from stcal.parallel import Progress, counted, one_thread, scratch_folder
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
+from stcal.sfm.detect.files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
 from stcal.sfm.detect.labels import label_single, without_defocus
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
@@ -138,29 +138,22 @@ def measure(
     design = body_of(design)
     target = read_target(target, design) if isinstance(target, str | Path) else target
     camera = read_camera(camera) if isinstance(camera, str | Path) else camera_model(camera)
+    prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
     files, unreadable = find_images(images)
     step = counted(progress, "detect", len(files))
     shown = True
     if options.sequence:
-        result = follow_files(files, camera, replace(target, design=design), board, options, step)
+        outcomes, searched = _followed(files, camera, replace(target, design=design), board, options, step)
+        result = replace(result_of(outcomes, target, options, prior), searched=searched)
     else:
         with scratch_folder("measure") as cache:
-            detection = detect_files(
-                files,
-                camera,
-                design,
-                board,
-                options.ellipses,
-                cache,
-                options.workers,
-                step,
-                detect_target,
-                forms=False,
-                pictures=False,
-            )
-        observations, notes = _labelled(detection.images, detection.camera, design)
-        shown = any(len(image) for image in observations)
-        prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
+            inputs = files, camera, design, board, options.ellipses, cache, options.workers, step, detect_target
+            detection = detect_files(*inputs, forms=False, pictures=False)
+        labelled = [label_single(i.file.name, i.file.group, i.detection, design) for i in detection.images]
+        labelled = without_defocus(labelled, detection.camera, patterns_of(design, None))
+        shown = any(len(image.observations) for image in labelled)
+        notes = {image.observations.name: image.notes for image in labelled}
+        observations = [image.observations for image in labelled]
         result = measure_labelled(observations, detection.camera, target, options, prior)
         measured = tuple(replace(image, notes=notes[image.name]) for image in result.images)
         result = replace(result, images=measured, left_out=(*detection.skipped, *result.left_out))
@@ -176,13 +169,6 @@ def measure(
             f"{last.reason}; check target.toml (radii, polarity), faces.json and the exposure",
         )
     return result
-
-
-def _labelled(images: Sequence[DetectedImage], camera: Camera, design: TargetDesign):
-    """Returns the observations of all images, and the notes by name of the image."""
-    labelled = [label_single(i.file.name, i.file.group, i.detection, design) for i in images]
-    labelled = without_defocus(labelled, camera, patterns_of(design, None))
-    return [image.observations for image in labelled], {image.observations.name: image.notes for image in labelled}
 
 
 def measure_labelled(
@@ -206,31 +192,24 @@ def measure_labelled(
     return result_of(outcomes, target, options, prior)
 
 
-def follow_files(
-    files: Sequence[ImageFile],
-    camera_model: CameraModel,
-    target: TargetCircles,
-    board: BoardDesign | None,
-    options: MeasureOptions,
-    step: Callable[[object], None],  # called once for each file
-) -> MeasureResult:
-    """Returns the poses of files, each folder of which is a sequence in order of name. Folders run in parallel."""
+def _followed(
+    files: Sequence[ImageFile], camera_model: CameraModel, target, board, options, step: Callable[[object], None]
+) -> tuple[list[MeasuredImage | Skipped], int]:
+    """Returns the outcomes of files, each folder of which is a sequence in order of name, and the number of images that
+    were searched as a whole. Folders run in parallel; ``step`` is called once for each file."""
     camera, size_from = sized_by(camera_model, list(files))
     folders: dict[str, list[ImageFile]] = {}
-    for file in sorted(files, key=lambda result_of_image: result_of_image.name):
+    for file in sorted(files, key=lambda each: each.name):
         folders.setdefault(file.group, []).append(file)
     model = replace(camera_model, width=camera.width, height=camera.height)
-    jobs = [(files_of_folder, model, camera, size_from, target, board, options) for files_of_folder in folders.values()]
-    followed: list[tuple[list[MeasuredImage | Skipped], int]] = [([], 0)] * len(jobs)
-    for i, outcome in run_on_images(_follow_folder, jobs, options.workers):
-        followed[i] = outcome
+    jobs = [(own, model, camera, size_from, target, board, options) for own in folders.values()]
+    followed: dict[int, tuple[list[MeasuredImage | Skipped], int]] = {}
+    for i, found in run_on_images(_follow_folder, jobs, options.workers):
+        followed[i] = found
         for file in jobs[i][0]:
             step(file.name)
-    prior = None if camera_model.covariance is None else CameraPrior(camera_model.colmap_model, camera_model.covariance)
-    result = result_of(
-        [result_of_image for outcomes, _ in followed for result_of_image in outcomes], target, options, prior
-    )
-    return replace(result, searched=sum(searched for _, searched in followed))
+    outcomes = [each for i in range(len(jobs)) for each in followed[i][0]]
+    return outcomes, sum(searched for _, searched in followed.values())
 
 
 def _follow_folder(

@@ -26,6 +26,7 @@ HOPELESS = 500.0
 class PoseProblem:
     """Data of a pose: n circles, their measured centres and all covariances. Centres are free of distortion."""
 
+    labels: tuple[CircleLabel, ...]
     xyz: np.ndarray  # (n, 3) target frame, as ``normal``
     normal: np.ndarray
     radius: np.ndarray  # (n,)
@@ -35,6 +36,7 @@ class PoseProblem:
     by_camera: np.ndarray  # (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 if they are held fixed
     prior: np.ndarray  # (q, q) covariance of the intrinsics
     shape: np.ndarray  # (3n, 3n) mm² covariance of the circles
+    outliers: tuple[Outlier, ...] = ()  # circles that were left out
 
     def seen(self, poses: PoseStack) -> tuple[np.ndarray, CircleImages]:
         """Returns, for h poses, measured minus projected centres (h, n, 2), and the projections."""
@@ -45,12 +47,17 @@ class PoseProblem:
         """Returns residuals (n, 2) in the distorted image, px."""
         return (self.px_by_centre @ residual[..., None])[..., 0]
 
-    def select(self, keep: np.ndarray) -> "PoseProblem":
-        """Returns the problem of the selected circles only."""
+    def without(self, bad: np.ndarray, outliers: list[Outlier]) -> "PoseProblem":
+        """Returns the problem without the circles of a mask (n,), which are ``outliers``."""
+        keep = np.flatnonzero(~bad)
         rows = (3 * keep[:, None] + np.arange(3)).ravel()
-        fields_by_circle = ("xyz", "normal", "radius", "centre", "px_by_centre", "noise", "by_camera")
+        by_circle = ("xyz", "normal", "radius", "centre", "px_by_centre", "noise", "by_camera")
         return replace(
-            self, **{name: getattr(self, name)[keep] for name in fields_by_circle}, shape=self.shape[np.ix_(rows, rows)]
+            self,
+            labels=tuple(self.labels[i] for i in keep),
+            **{name: getattr(self, name)[keep] for name in by_circle},
+            shape=self.shape[np.ix_(rows, rows)],
+            outliers=(*self.outliers, *outliers),
         )
 
 
@@ -63,26 +70,25 @@ def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.n
 
 
 def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
-    """Returns the descent near a pose, with residuals whitened by the σ of each centre's noise and own circle."""
+    """Returns the descent near a pose, with residuals whitened by the σ of each centre's noise and own circle, and
+    Huber's loss."""
     by_circle = problem.seen(pose)[1].by_circle
     n = len(problem.xyz)
-    covariance_by_circle = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-    root = np.linalg.inv(
-        np.linalg.cholesky(problem.noise + by_circle @ covariance_by_circle @ np.swapaxes(by_circle, -1, -2))
-    )
-    return partial(_descend, problem, block_diagonal(root))
+    own = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    covariance = problem.noise + by_circle @ own @ np.swapaxes(by_circle, -1, -2)
+    whiten = block_diagonal(np.linalg.inv(np.linalg.cholesky(covariance)))
 
+    def descend(poses: PoseStack, huber: float) -> Minima:
+        h = len(poses)
 
-def _descend(problem: PoseProblem, whiten: np.ndarray, poses: PoseStack, huber: float) -> Minima:
-    """Returns the minima next to h poses, with Huber's loss on residuals whitened by (h or 1, 2n, 2n)."""
-    h, n = len(poses), len(problem.xyz)
+        def evaluate(poses: PoseStack) -> Normal:
+            residual, image = problem.seen(poses)
+            r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
+            return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), np.all(image.depth > 0, axis=1), huber)
 
-    def evaluate(poses: PoseStack) -> Normal:
-        residual, image = problem.seen(poses)
-        r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
-        return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), np.all(image.depth > 0, axis=1), huber)
+        return least_squares.descend(evaluate, poses, SETTLED, HOPELESS)
 
-    return least_squares.descend(evaluate, poses, SETTLED, HOPELESS)
+    return descend
 
 
 MIN_CIRCLES = 4
@@ -93,14 +99,13 @@ MIN_BREADTH = 0.05
 """Least ratio of breadth to length of the visible circles. Circles in a row leave the rotation about the row open."""
 
 
-def start_pose(
-    names: list[CircleLabel], problem: PoseProblem, target: TargetCircles, where: str
-) -> tuple[PoseStack, Rigid]:
+def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[PoseStack, Rigid]:
     """Returns the pose from the homography of the face with the most circles, and target_from_plane of that face."""
     faces: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
-        faces.setdefault(name.face, []).append(i)
-    by_size = sorted((f for f in faces if f in target.target_from_plane), key=lambda f: -len(faces[f]))
+    for i, label in enumerate(problem.labels):
+        if label.face in target.target_from_plane:
+            faces.setdefault(label.face, []).append(i)
+    by_size = sorted(faces, key=lambda face: -len(faces[face]))
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
         count = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
         raise DegenerateError(
@@ -108,11 +113,12 @@ def start_pose(
             f"{where}: {count} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
         )
     reasons = []
-    for face_id in (face for face in by_size if len(faces[face]) >= MIN_CIRCLES):
-        pose = _pose_by_face(target.target_from_plane[face_id], problem, faces[face_id])
-        if isinstance(pose, Rigid):
-            return PoseStack.of(pose), target.target_from_plane[face_id]
-        reasons.append(pose)
+    for face in by_size:
+        if len(faces[face]) >= MIN_CIRCLES:
+            pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
+            if isinstance(pose, Rigid):
+                return PoseStack.of(pose), target.target_from_plane[face]
+            reasons.append(pose)
     raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
 
 
@@ -133,29 +139,28 @@ def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int
     return pose
 
 
-def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):
-    """Returns the minima without centres that contradict the others, the indices kept, and the outliers."""
-    keep, outliers = np.arange(len(names)), []
-    alone = len({name.face for name in names}) == 1
+def minima_without_outliers(
+    problem: PoseProblem, start: PoseStack, plane: Rigid, where: str
+) -> tuple[Minima, PoseProblem]:
+    """Returns the minima without centres that contradict the others, and the problem without these."""
+    count, alone = len(problem.labels), len({label.face for label in problem.labels}) == 1
     failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"
     while True:
-        subset = problem if len(keep) == len(names) else problem.select(keep)
-        both = two_minima(partial(descent_near, subset), start, plane, failure, planar=alone)
+        both = two_minima(partial(descent_near, problem), start, plane, failure, planar=alone)
         best, limit = both.minima, both.outlier_limit
         excess = best.length[0] / limit
         bad = excess > max(1.0, WORST_SHARE * excess.max())
         if not bad.any():
-            return best, keep, tuple(outliers)
-        residual = np.linalg.norm(subset.in_px(subset.seen(best.poses[[0]])[0][0]), axis=1)
-        sigma = residual / best.length[0]
-        outliers += [
-            Outlier(where, names[keep[i]], float(residual[i]), float(limit * sigma[i])) for i in np.flatnonzero(bad)
-        ]
-        keep = keep[~bad]
-        if len(outliers) > MAX_OUTLIER_SHARE * len(names) or len(keep) < MIN_CIRCLES:
+            return best, problem
+        residual = np.linalg.norm(problem.in_px(problem.seen(best.poses[[0]])[0][0]), axis=1)
+        limits, labels = limit * (residual / best.length[0]), problem.labels
+        off = [Outlier(where, labels[i], float(residual[i]), float(limits[i])) for i in np.flatnonzero(bad)]
+        problem = problem.without(bad, off)
+        outliers = problem.outliers
+        if len(outliers) > MAX_OUTLIER_SHARE * count or len(problem.labels) < MIN_CIRCLES:
             raise DegenerateError(
                 "E-MEASURE-CONTRADICTS",
-                f"{where}: {len(outliers)} of {len(names)} circles contradict the others, first {outliers[0].label} by "
+                f"{where}: {len(outliers)} of {count} circles contradict the others, first {outliers[0].label} by "
                 f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together",
             )
         start = best.poses

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields, rms
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, PoseStack, block_diagonal
 from stcal.geometry.plane import (
@@ -25,7 +25,6 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import ImageObservations, Outlier
-from stcal.sfm.data.patterns import CircleImages
 from stcal.sfm.measurement.minima import (
     HOPELESS,
     MIN_CIRCLES,
@@ -81,11 +80,8 @@ def covariance_of_likelihood(
         square = float(step_to_mirrored @ np.linalg.solve(covariance, step_to_mirrored))
         delta = _best_of_tilt(problem, image_pose, plane, whiten) - least
         if delta < min(plausible, square / 2) and square > OTHER_SIDE**2:
-            other_side, first, curved = (
-                float(delta),
-                covariance + np.outer(step_to_mirrored, step_to_mirrored) / 4,
-                True,
-            )
+            other_side, curved = float(delta), True
+            first = covariance + np.outer(step_to_mirrored, step_to_mirrored) / 4
     return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
 
 
@@ -182,11 +178,14 @@ class TargetPose(ImageFit, Brief):
 
     def __post_init__(self):
         n = len(self.labels)
-        object.__setattr__(self, "covariance", frozen(self.covariance, (6, 6), "pose covariance"))
-        object.__setattr__(self, "by_circles", frozen(self.by_circles, (6, 3 * n), "pose by circles"))
-        object.__setattr__(self, "by_intrinsics", frozen(self.by_intrinsics, (6, None), "pose by intrinsics"))
-        object.__setattr__(self, "residuals_px", frozen(self.residuals_px, (n, 2), "residuals"))
-        object.__setattr__(self, "weights", frozen(self.weights, (n,), "weights"))
+        for name, shape in (
+            ("covariance", (6, 6)),
+            ("by_circles", (6, 3 * n)),
+            ("by_intrinsics", (6, None)),
+            ("residuals_px", (n, 2)),
+            ("weights", (n,)),
+        ):
+            freeze(self, name, shape, f"pose: {name}")
 
     def swapped(self) -> "TargetPose":
         """Returns the second solution as ``resolved``, with this one as its second; this one if there is no second."""
@@ -210,17 +209,23 @@ def pose_from_circles(
     weighed by the whole covariance of the centres: noise, target and intrinsics."""
     options = options or PoseOptions()
     labels = parse_labels(labels)
-    used, problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
-    names = list(circle_labels(labels[i] for i in used))
-    start, plane = start_pose(names, problem, target, where)
-    minima, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
-    problem, names = problem.select(keep), [names[i] for i in keep]
-    if len(names) < MIN_CIRCLES:
+    problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
+    start, plane = start_pose(problem, target, where)
+    minima, problem = minima_without_outliers(problem, start, plane, where)
+    if len(problem.labels) < MIN_CIRCLES:
         raise DegenerateError(
-            "E-MEASURE-FEW-CIRCLES", f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face"
+            "E-MEASURE-FEW-CIRCLES",
+            f"{where}: {len(problem.labels)} circles left, {MIN_CIRCLES} needed; show more of a face",
         )
-    _require_fit(problem, minima, where)
-    pose = _answer(problem, minima, names, outliers, plane, options)
+    residual = problem.in_px(problem.seen(minima.poses[[0]])[0][0])
+    rms_px, limit_px = rms(residual), MISFIT * float(np.ptp(problem.in_px(problem.centre), axis=0).max())
+    if not rms_px <= limit_px:  # no covariance describes a pose of which most circles are elsewhere
+        raise DegenerateError(
+            "E-MEASURE-MISFIT",
+            f"{where}: circles lie {rms_px:.3g} px RMS from where the best pose has them, {limit_px:.2g} allowed, "
+            f"{MISFIT:.0%} of their extent; wrong labels, a mirrored image, another target, or another camera's file",
+        )
+    pose = _answer(problem, minima, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
         if pose.chi2_per_redundancy() > OUTLIER**2:  # the rotation is open because the residuals are large
             raise DegenerateError(
@@ -234,8 +239,8 @@ def pose_from_circles(
     return pose
 
 
-def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where):
-    """Returns the indices of the target's circles among the labels, and the data of the pose."""
+def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where) -> PoseProblem:
+    """Returns the data of the pose: the target's circles among the labels."""
     n = len(labels)
     centre, noise = frozen(centre_px, (n, 2), "centres"), frozen(covariance_px2, (n, 2, 2), "centres' covariance")
     used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
@@ -266,60 +271,33 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
         prior_covariance = prior.covariance
     circles = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
     noise_of_centres = factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2)
-    return used, PoseProblem(
-        *circles, noise_of_centres, by_camera, prior_covariance, target.covariance[np.ix_(rows, rows)]
-    )
+    shape = target.covariance[np.ix_(rows, rows)]
+    names = circle_labels(labels[i] for i in used)
+    return PoseProblem(names, *circles, noise_of_centres, by_camera, prior_covariance, shape)
 
 
-def _require_fit(problem: PoseProblem, found: Minima, where: str) -> None:
-    """Refuses a pose that no covariance describes, since most circles are elsewhere."""
-    residual = problem.in_px(problem.seen(found.poses[[0]])[0][0])
-    rms_px = float(np.sqrt((residual**2).mean()))
-    limit_px = MISFIT * float(np.ptp(problem.in_px(problem.centre), axis=0).max())
-    if not rms_px <= limit_px:
-        raise DegenerateError(
-            "E-MEASURE-MISFIT",
-            f"{where}: circles lie {rms_px:.3g} px RMS from where the best pose has them, {limit_px:.2g} allowed, "
-            f"{MISFIT:.0%} of their extent; wrong labels, a mirrored image, another target, or another camera's file",
-        )
-
-
-def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
-    """Returns the derivative (6, 2n) of the weighted pose by the centres."""
-    a = image.by_pose.reshape(-1, 6)
-    gain = np.linalg.solve(full, a)
-    return np.linalg.solve(a.T @ gain, gain.T)
-
-
-def _answer(
-    problem: PoseProblem,
-    found: Minima,
-    names: list[CircleLabel],
-    outliers: tuple[Outlier, ...],
-    plane: Rigid,
-    options: PoseOptions,
-) -> TargetPose:
+def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOptions) -> TargetPose:
     """Decides between the two minima, or the two sides of a valley, and returns the pose."""
-    excess, second = _second_solution(problem, found, 2 * len(names) - 6)
-    alone = second is None and len({name.face for name in names}) == 1
-    first = _solution(problem, found.rows([0]), names, outliers, second, plane if alone else None, options)
+    excess, second = _second_solution(problem, found)
+    alone = second is None and len({label.face for label in problem.labels}) == 1
+    first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
     first = replace(first, delta_chi2=min(excess, first.delta_chi2))
     if first.delta_chi2 > first.needed_chi2:
         return first
     if second is None:
         return replace(first, status="ambiguous")
-    other = _solution(problem, found.rows([1]), names, outliers, found.poses[[0]], None, options)
+    other = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
     other = replace(other, status="ambiguous", delta_chi2=-excess, needed_chi2=first.needed_chi2)
     return replace(first, status="ambiguous", second=other)
 
 
-def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tuple[float, PoseStack | None]:
+def _second_solution(problem: PoseProblem, found: Minima) -> tuple[float, PoseStack | None]:
     """Returns the excess in χ² of the second minimum, and its pose; infinite and None if there is none. Both minima
     give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide."""
     if len(found.cost) == 1:
         return np.inf, None
     delta = float(found.cost[1] - found.cost[0])
-    if delta > HOPELESS * max(1.0, found.cost[0] / redundancy):  # whatever the weights
+    if delta > HOPELESS * max(1.0, found.cost[0] / (2 * len(problem.labels) - 6)):  # whatever the weights
         return delta, found.poses[[1]]
     residual, image = problem.seen(found.poses)
     common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
@@ -330,13 +308,7 @@ def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tu
 
 
 def _solution(
-    problem: PoseProblem,
-    minimum: Minima,
-    names: list[CircleLabel],
-    outliers: tuple[Outlier, ...],
-    second: PoseStack | None,
-    plane: Rigid | None,
-    options: PoseOptions,
+    problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
 ) -> TargetPose:
     """Returns a minimum weighed by the whole covariance of its centres in two steps: the first errs by second order.
     Its ``delta_chi2`` is that of the other side of a wide valley, infinite if the minimum is no valley."""
@@ -347,7 +319,9 @@ def _solution(
     poses = weigh(residual, image.by_pose, full, minimum.poses).poses
     residual, image = problem.seen(poses)
     last = weigh(residual, image.by_pose, full, poses)
-    gain = _gain(image, full[0])
+    a = image.by_pose.reshape(-1, 6)
+    gain = np.linalg.solve(full[0], a)
+    gain = np.linalg.solve(a.T @ gain, gain.T)  # (6, 2n) derivative of the weighted pose by the centres
     by_circles = gain @ block_diagonal(image.by_circle)[0]
     by_intrinsics = gain @ problem.by_camera.reshape(len(full[0]), -1)
     parts = {
@@ -356,7 +330,7 @@ def _solution(
         "intrinsics": by_intrinsics @ problem.prior @ by_intrinsics.T,
     }
     gaussian = parts["image"] + parts["target"] + parts["intrinsics"]
-    chi2, redundancy = float(last.chi2[0]), 2 * len(names) - 6
+    chi2, redundancy = float(last.chi2[0]), 2 * len(problem.labels) - 6
     needed = options.needed(chi2 / redundancy)
     # The samples cover a valley from side to side, so that no margin for wrong σ is needed here.
     plausible = needed / options.sigma_margin**2
@@ -371,11 +345,11 @@ def _solution(
         by_circles=by_circles,
         by_intrinsics=by_intrinsics,
         status="certain",
-        faces=tuple(dict.fromkeys(name.face for name in names)),
-        labels=tuple(names),
+        faces=tuple(dict.fromkeys(label.face for label in problem.labels)),
+        labels=problem.labels,
         residuals_px=problem.in_px(last.residual[0]),
         weights=weights,
-        outliers=outliers,
+        outliers=problem.outliers,
         chi2=chi2,
         redundancy=redundancy,
         delta_chi2=other_side,
@@ -440,7 +414,7 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
     normal. Only the largest directions that matter to the poses (:data:`FELT`) are kept."""
     if not poses:
         return np.zeros((0, 6, 0))
-    circles, intrinsics = _root(target.covariance), _root(np.zeros((0, 0)) if prior is None else prior.covariance)
+    circles, intrinsics = _root(target.covariance), np.zeros((0, 0)) if prior is None else _root(prior.covariance)
     effects = []
     for pose in poses:
         place = np.array([target.place[label] for label in pose.labels])

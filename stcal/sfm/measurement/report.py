@@ -13,12 +13,12 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, csv_text, pose_cells, require_pose_table_written
-from stcal.report.document import Block, Document, Printed, Section, alarms, fold, legend, plot, plots
+from stcal.report.document import Document, Printed, Section, legend, page_only, plot, plots
 from stcal.report.document import Table as ShownTable
-from stcal.report.svg import COLOURS, Axes, Drawing, count_ticks, limits, round_below
-from stcal.report.text import number, text_table
+from stcal.report.svg import COLOURS, Axes, Drawing, round_below
+from stcal.report.text import number
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
-from stcal.sfm.measurement.pose import fit_verdict
+from stcal.sfm.measurement.pose import TargetPose, fit_verdict
 
 
 class OtherPose(Part):
@@ -32,7 +32,7 @@ class CircleRow(Part):
     weight: float
 
 
-class OutlierCircleRow(Part):
+class OutlierRow(Part):
     label: str
     residual_px: float
     limit_px: float
@@ -64,7 +64,7 @@ class ImagePose(Part):
     circles: list[CircleRow] = Field(
         description="`label`, `residual_px` measured minus projected ellipse centre, Huber's `weight`"
     )
-    outliers: list[OutlierCircleRow] = Field(
+    outliers: list[OutlierRow] = Field(
         description="`label`, `residual_px`, `limit_px` of circles that contradict the others and are left out"
     )
     notes: list[str] = Field(description="what detection saw and left out")
@@ -86,13 +86,11 @@ class PosesFile(ResultFile):
     left_out: list[NamedReason] = Field(description="`name`, `reason` of files and images without a pose")
 
 
+IMAGE = "image"
 COMMON_SHARE = 0.5
 """Share of the variance from which on it is told that poses err in common."""
 MOST_LISTED = 20
 """Largest number of images for which the terminal has a line each."""
-
-IMAGE, FACES, CIRCLES, STATUS = "image", "faces", "circles", "status"
-QUALITY = ("rms_px", "chi2_per_dof")
 
 
 @require_arguments
@@ -119,7 +117,7 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
         The table has no column ``image``, an image twice, a column of the name of a measured one, or no image that was
         measured.
     """
-    header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
+    header = [IMAGE, "faces", "circles", "status", *POSE, *COVARIANCE, "rms_px", "chi2_per_dof"]
     common = common_columns(result.common.shape[2])
     where, joint_columns, rows = "", [], None
     if joints is not None:
@@ -187,15 +185,15 @@ def poses_file(result: MeasureResult) -> PosesFile:
             "sigma_factor": result.sigma_factor,
             "intrinsics_held": result.intrinsics_held,
             "notes": list(result.notes),
-            "images": [_image_json(image) for image in result.images],
+            "images": [_image_pose(image) for image in result.images],
             "left_out": result.left_out,
         }
     )
 
 
-def _image_json(each: MeasuredImage) -> dict:
+def _image_pose(each: MeasuredImage) -> dict:
     pose = each.pose
-    second = pose.second
+    circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
     return {
         "image": each.name,
         "faces": list(pose.faces),
@@ -203,7 +201,7 @@ def _image_json(each: MeasuredImage) -> dict:
         "camera_from_target": pose.camera_from_target,
         "covariance": pose.covariance,
         "covariance_parts": pose.parts,
-        "alternative": second,
+        "alternative": pose.second,
         "delta_chi2": pose.delta_chi2,
         "delta_chi2_needed": pose.needed_chi2,
         "rms_px": pose.rms_px(),
@@ -211,88 +209,21 @@ def _image_json(each: MeasuredImage) -> dict:
         "dof": pose.redundancy,
         "p_value": pose.p_value(),
         "fit": fit_verdict(pose),
-        "circles": [
-            {"label": label, "residual_px": residual, "weight": float(weight)}
-            for label, residual, weight in zip(pose.labels, pose.residuals_px, pose.weights, strict=True)
-        ],
+        "circles": [{"label": label, "residual_px": px, "weight": weight} for label, px, weight in circles],
         "outliers": pose.outliers,
-        "notes": list(each.notes),
+        "notes": each.notes,
     }
-
-
-def _printed(result: MeasureResult, every: bool) -> list[str]:
-    """Returns the table for the terminal; of more than :data:`MOST_LISTED` images those that need a look."""
-    every = every or len(result.images) <= MOST_LISTED
-    doubtful = [image for image in result.images if not _sound(image)]
-    images = result.images if every else doubtful[:MOST_LISTED]
-    lines = [] if every else [*_figures(result), ""]
-    wide = max([len(image.name) for image in images] + [5])
-    faces = max([len("+".join(image.pose.faces)) for image in images] + [5])
-    if images:
-        lines.append(
-            f"{'image':{wide}}  {'faces':{faces}}  n {'status':9} {'x':>9} {'y':>8} {'z':>8} mm {'σ µm':>5} "
-            f"{'σ mdeg':>6} {'RMS px':>6}"
-        )
-    for image in images:
-        pose = image.pose
-        mm, rad = _largest_sigma(image)
-        place = " ".join(f"{v:8.3f}" for v in pose.camera_from_target.translation)
-        verdict = fit_verdict(pose)
-        lines.append(
-            f"{image.name:{wide}}  {'+'.join(pose.faces):{faces}} {len(pose.labels):2} {pose.status:9}  {place}   "
-            f"{1e3 * mm:5.1f} {1e3 * np.degrees(rad):6.2f} {pose.rms_px():6.4f}"
-            + ("" if verdict == "passed" else f"  {verdict}")
-        )
-        lines += [
-            f"  outlier {image.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
-            for o in pose.outliers
-        ]
-    left_out = result.left_out if every else result.left_out[:MOST_LISTED]
-    lines += [f"left out {image.name}: {image.reason}" for image in left_out]
-    if more := len(result.left_out) - len(left_out):
-        lines.append(f"left out: {more} more; --verbose prints all")
-    if not every:
-        rest = len(result.images) - len(images)
-        what = f"{rest} more" if images else f"{rest} poses, all certain and without outliers"
-        lines.append(f"{what}: the table that is written has all; --verbose prints them")
-    return lines
-
-
-def _figures(result: MeasureResult) -> list[str]:
-    """Returns the median and the worst figures of all images."""
-    sigma = np.array([_largest_sigma(image) for image in result.images])
-    columns = {
-        "σ position µm": 1e3 * sigma[:, 0],
-        "σ rotation mdeg": 1e3 * np.degrees(sigma[:, 1]),
-        "residuals RMS px": np.array([image.pose.rms_px() for image in result.images]),
-    }
-    rows = [
-        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", result.images[int(v.argmax())].name]
-        for what, v in columns.items()
-    ]
-    return text_table([[f"<{len(result.images)} poses", "median", "worst", "<in image"], *rows])
-
-
-def _largest_sigma(image: MeasuredImage) -> tuple[float, float]:
-    """Returns the largest σ of three axes: position, mm, and rotation, rad."""
-    sigma = np.sqrt(np.diag(image.pose.covariance))
-    return float(sigma[3:].max()), float(sigma[:3].max())
-
-
-def _sound(image: MeasuredImage) -> bool:
-    """Returns True if a pose is certain, fits, and has no outlier."""
-    pose = image.pose
-    return pose.status == "certain" and fit_verdict(pose) == "passed" and not pose.outliers
 
 
 def summary(result: MeasureResult) -> list[str]:
     """Returns the counts of poses by status, followed by warnings and notes."""
     poses = [image.pose for image in result.images]
-    count = {s: sum(pose.status == s for pose in poses) for s in ("certain", "resolved", "ambiguous")}
-    counts = ", ".join(f"{n} {s}" for s, n in count.items() if n)
-    lines = [f"{len(poses)} poses: {counts}; centres' σ × {result.sigma_factor:.3g}"]
-    held = "held: their errors are not in σ"
-    lines[0] += f", intrinsics {held if result.intrinsics_held else 'with their σ'}"
+    count = {s: sum(pose.status == s for pose in poses) for s in COLOUR_OF}
+    lines = [
+        f"{len(poses)} poses: {', '.join(f'{n} {s}' for s, n in count.items() if n)}; centres' σ × "
+        f"{result.sigma_factor:.3g}, intrinsics "
+        f"{'held: their errors are not in σ' if result.intrinsics_held else 'with their σ'}"
+    ]
     if poses and result.common.size:
         whole = np.array([np.diag(pose.covariance)[3:].sum() for pose in poses])
         share = np.median((result.common[:, 3:] ** 2).sum((1, 2)) / whole)
@@ -325,48 +256,54 @@ def summary(result: MeasureResult) -> list[str]:
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
 ELLIPSE_SHARE = 0.06
 """Length with which the largest σ is drawn, as a share of the plot's width."""
+HEADS = ("<image", "<faces", "circles", "<status", "x mm", "y", "z", "σ µm", "σ mdeg", "RMS px", "χ²/dof", "<fit")
 
 
 def measure_report(result: MeasureResult, where: str, every: bool = False) -> Document:
-    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images."""
+    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images, not only for
+    those that need a look."""
     at = np.array([image.pose.camera_from_target.translation for image in result.images])
     largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in result.images))
     times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
-    verdicts = any(fit_verdict(image.pose) != "passed" for image in result.images)
     statuses = {image.pose.status for image in result.images}
     colours = legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {})
-    summary_lines = summary(result)
-    columns = {
-        "": ["<image", "<faces", "circles", "<status"],
-        "origin of the target": ["x mm", "y mm", "z mm"],
-        "σ µm": ["x", "y", "z"],
-        "σ mdeg, about": ["x", "y", "z"],
-        "residuals": ["RMS px", "χ² / dof", *["<fit"] * verdicts],
-    }
-    heads = [head for heads in columns.values() for head in heads]
-    over = [(name, len(heads)) for name, heads in columns.items()]
-    rows = [_row(image, verdicts) for image in result.images]
+    counts, *remarks = summary(result)
+    every = every or len(result.images) <= MOST_LISTED
+    listed = result.images if every else [image for image in result.images if not _is_sound(image.pose)][:MOST_LISTED]
+    figures = (
+        [] if every else ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), _figures(result)).lines()
+    )
+    rest = f"{len(listed)} of them need a look; the table that is written has all, and --verbose prints them"
     outliers = [
-        [image.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
+        [image.name, outlier.label, number(outlier.residual_px, 3), number(outlier.limit_px, 3)]
         for image in result.images
-        for o in image.pose.outliers
+        for outlier in image.pose.outliers
     ]
-    contradicting: Block = ShownTable(["<image", "<circle", "residual px", "limit px"], outliers)
     views = [
         plot(partial(_view, result, at, 0, j, times), f"path of the target {seen}", seen.capitalize(), "")
         for j, seen in ((1, "as the camera sees it"), (2, "from above, the camera below"))
     ]
-    if len(outliers) > 20:
-        contradicting = fold("Circles left out", contradicting)
     return Document(
         "Poses of the target",
-        f"{where}: {summary_lines[0]}",
+        f"{where}: {counts}",
         [
-            Section("", [Printed(_printed(result, every)), Printed(summary_lines[1:])], terminal=True),
+            Section(
+                "Poses",
+                [
+                    *remarks,
+                    Printed(figures),
+                    Printed([] if every else [rest]),
+                    Printed(ShownTable(HEADS, [_row(image) for image in listed]).lines() if listed else []),
+                    page_only(
+                        "σ: the largest of the three axes, of position and of rotation",
+                        ShownTable(HEADS, [_row(image) for image in result.images]),
+                    ),
+                ],
+                terminal=True,
+            ),
             Section(
                 "Path in the camera frame",
                 [
-                    alarms(summary_lines[1:]),
                     f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
                     "Lines join the images of a folder by name",
                     colours,
@@ -374,29 +311,54 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
                 ],
             ),
             Section(
-                "Uncertainty",
-                [
-                    colours,
-                    plot(
-                        lambda: _sigma(result),
-                        "σ of each pose",
-                        "Position: filled along the line of sight, open RMS across it; rotation: RMS of the three axes",
-                    ),
-                ],
-            ),
-            Section("Poses", [ShownTable(heads, rows, over)]),
-            Section(
                 "Left out",
                 [
                     ShownTable(
                         ["<image or file", "<reason"], [[e.name, e.reason] for e in result.left_out], css="text"
                     ),
                     f"{len(outliers)} circles contradict the others of their image" if outliers else "",
-                    contradicting,
+                    ShownTable(["<image", "<circle", "residual px", "limit px"], outliers),
                 ],
+                terminal=True,
             ),
         ],
     )
+
+
+def _figures(result: MeasureResult) -> list[list[str]]:
+    """Returns rows with the median and the worst figure of all images."""
+    sigma = np.array([_largest_sigma(image.pose) for image in result.images])
+    columns = {
+        "σ position µm": sigma[:, 0],
+        "σ rotation mdeg": sigma[:, 1],
+        "residuals RMS px": np.array([image.pose.rms_px() for image in result.images]),
+    }
+    return [
+        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", result.images[int(v.argmax())].name]
+        for what, v in columns.items()
+    ]
+
+
+def _largest_sigma(pose: TargetPose) -> tuple[float, float]:
+    """Returns the largest σ of three axes: position, µm, and rotation, mdeg."""
+    sigma = 1e3 * np.sqrt(np.diag(pose.covariance))
+    return float(sigma[3:].max()), float(np.degrees(sigma[:3].max()))
+
+
+def _is_sound(pose: TargetPose) -> bool:
+    """Returns True if a pose is certain, fits, and has no outlier."""
+    return pose.status == "certain" and fit_verdict(pose) == "passed" and not pose.outliers
+
+
+def _row(each: MeasuredImage) -> list[str]:
+    pose = each.pose
+    um, mdeg = _largest_sigma(pose)
+    return [
+        *(each.name, "+".join(pose.faces), str(len(pose.labels)), pose.status),
+        *(number(v, 3) for v in pose.camera_from_target.translation),
+        *(number(um, 1), number(mdeg, 2), number(pose.rms_px(), 4), number(pose.chi2_per_redundancy(), 2)),
+        fit_verdict(pose),
+    ]
 
 
 def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -> Drawing:
@@ -404,66 +366,17 @@ def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -
     drawing = Drawing(5, 4.4)
     turn = np.linspace(0, 2 * np.pi, 40)
     circle, ellipses = times * np.stack([np.cos(turn), np.sin(turn)], axis=1), []
-    for image, place in zip(result.images, at, strict=True):
+    folders: dict[str, list[np.ndarray]] = {}
+    for image, place in zip(result.images, at, strict=True):  # in order of name
         values, directions = np.linalg.eigh(image.pose.covariance[np.ix_([3 + i, 3 + j], [3 + i, 3 + j])])
         ellipses.append(place[[i, j]] + circle * np.sqrt(values) @ directions.T)
+        folders.setdefault(image.name.rpartition("/")[0], []).append(place[[i, j]])
     # y of a camera points down
     axes = Axes.equal(drawing, drawing.panels()[0], np.concatenate(ellipses), down=j == 1)
     axes.frame(f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", "xy")
-    axes.lines([at[rows][:, [i, j]].T for rows in _folders(result.images)], "#9aa0a8", 0.7)
+    axes.lines([np.transpose(path) for path in folders.values()], "#9aa0a8", 0.7)
     for image, place, ellipse in zip(result.images, at, ellipses, strict=True):
         colour = COLOUR_OF[image.pose.status]
         axes.lines([ellipse.T], colour, 0.6, fill=colour, opacity=0.3)
         axes.marks(place[i], place[j], "dot", 3.2, colour)
     return drawing
-
-
-def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
-    """Returns the indices of the images of each folder, in order of name."""
-    folders: dict[str, list[int]] = {}
-    for row in sorted(range(len(images)), key=lambda i: images[i].name):
-        folders.setdefault(images[row].name.rpartition("/")[0], []).append(row)
-    return list(folders.values())
-
-
-def _sigma(result: MeasureResult) -> Drawing:
-    """Returns a plot of σ along and across the line of sight, and of the rotation, image by image."""
-    drawing = Drawing(9, 3)
-    along, across, rotation = (1e3 * np.array(values) for values in zip(*map(_split, result.images), strict=True))
-    turned = np.degrees(rotation)
-    rows, size = np.arange(1, len(along) + 1), 4 if len(along) <= 200 else 1.5
-    status = np.array([image.pose.status for image in result.images])
-    left, right = drawing.panels(2, gap=56)
-    place = Axes(drawing, left, (0.4, len(rows) + 0.6), limits([*along, *across], low=0))
-    turn = Axes(drawing, right, place.x, limits(turned, low=0))
-    for axes, label in ((place, "σ position, µm"), (turn, "σ rotation, mdeg")):
-        axes.frame("image, in order of the table", label, "y", count_ticks(*axes.x))
-    for name, colour in COLOUR_OF.items():
-        own = status == name
-        place.marks(rows[own], along[own], "dot", size, colour)
-        place.marks(rows[own], across[own], "ring", size, colour)
-        turn.marks(rows[own], turned[own], "dot", size, colour)
-    return drawing
-
-
-def _split(each: MeasuredImage) -> tuple[float, float, float]:
-    """Returns σ along the line of sight and across it (mm), and of the rotation (rad)."""
-    covariance, place = each.pose.covariance, each.pose.camera_from_target.translation
-    sight = place / np.linalg.norm(place)
-    along = float(sight @ covariance[3:, 3:] @ sight)
-    across = (float(np.trace(covariance[3:, 3:])) - along) / 2
-    return np.sqrt(along), np.sqrt(max(across, 0.0)), float(np.sqrt(np.trace(covariance[:3, :3]) / 3))
-
-
-def _row(each: MeasuredImage, verdicts: bool) -> list[str]:
-    """Returns the row of an image in the table of poses."""
-    pose = each.pose
-    sigma = np.sqrt(np.diag(pose.covariance))
-    return (
-        [each.name, ", ".join(pose.faces), str(len(pose.labels)), pose.status]
-        + [number(v, 3) for v in pose.camera_from_target.translation]
-        + [number(1e3 * v, 1) for v in sigma[3:]]
-        + [number(1e3 * np.degrees(v), 2) for v in sigma[:3]]
-        + [number(pose.rms_px(), 4), number(pose.chi2_per_redundancy(), 2)]
-        + ([fit_verdict(pose)] if verdicts else [])
-    )

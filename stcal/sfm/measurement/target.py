@@ -10,7 +10,7 @@ import numpy as np
 from stcal.boards.target import load_body
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_arguments
+from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.covariance import Rows, require_covariance
@@ -43,9 +43,9 @@ class TargetCircles(Brief):
     def __post_init__(self):
         object.__setattr__(self, "labels", circle_labels(self.labels))
         c = len(self.labels)
-        object.__setattr__(self, "xyz", frozen(self.xyz, (c, 3), "circles"))
-        object.__setattr__(self, "radius", frozen(self.radius, (c,), "radii"))
-        object.__setattr__(self, "covariance", frozen(self.covariance, (3 * c, 3 * c), "circles' covariance"))
+        freeze(self, "xyz", (c, 3), "circles")
+        freeze(self, "radius", (c,), "radii")
+        freeze(self, "covariance", (3 * c, 3 * c), "circles' covariance")
         try:
             require_covariance(self.covariance, 3 * c, Rows.of(self.labels, "xyz"))
         except InputError as error:
@@ -119,7 +119,14 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
         shifts = [0.5 * faces.rim_mm.get(label, 0.0) * outward.get(label.face, np.zeros(3)) for label in labels]
         xyz = xyz + np.array(shifts).reshape(-1, 3)
         radius = np.array([faces.radius_mm[label] for label in labels])
-        covariance, notes = _covariance(labels, _joint(faces, labels), faces.circle_covariance_mm2)
+        joint, whole = faces.circles_joint_covariance_mm2, None
+        if joint is not None:
+            place = {label: i for i, label in enumerate(joint.labels)}
+            if sorted(place) != sorted(labels):
+                raise InputError("E-COVARIANCE-SHAPE", "its joint covariance is not of its circles")
+            rows = [3 * place[label] + axis for label in labels for axis in range(3)]
+            whole = joint.matrix()[np.ix_(rows, rows)]
+        covariance, notes = _covariance(labels, whole, faces.circle_covariance_mm2)
         if faces.centre_sigma_factor is None:
             notes += ("faces.json states no centre_sigma_factor: the centres' own σ are used; run it again",)
         if faces.doubted:
@@ -133,17 +140,6 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
         ) from error
     _require_design(target, design, path)
     return target
-
-
-def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:
-    """Returns the joint covariance (3c, 3c) in the order of ``labels``, or None if the file has none."""
-    joint = faces.circles_joint_covariance_mm2
-    if joint is None:
-        return None
-    if sorted(joint.labels) != sorted(labels):
-        raise InputError("E-COVARIANCE-SHAPE", "its joint covariance is not of its circles")
-    rows = (3 * np.array([joint.labels.index(label) for label in labels])[:, None] + np.arange(3)).ravel()
-    return joint.matrix()[np.ix_(rows, rows)]
 
 
 def _covariance(
@@ -161,26 +157,24 @@ def _covariance(
 
 
 def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> None:
-    radius = design.radius_of()
+    radius, where = design.radius_of(), f"faces {path}"
     for label, own in zip(target.labels, target.radius, strict=True):
         if label not in radius:
             raise InputError(
-                "E-FACES-DESIGN", f"faces {path}: circle {label} is not in target {design.name}; give its own --target"
+                "E-FACES-DESIGN", f"{where}: circle {label} is not in target {design.name}; give its own --target"
             )
         if abs(own - radius[label]) > SAME_RADIUS_MM:
             raise InputError(
                 "E-FACES-DESIGN",
-                f"faces {path}: circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}; "
-                "give the target.toml of that run",
+                f"{where}: circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}; give "
+                "the target.toml of that run",
             )
     for face in design.faces:
         xyz, flat = target.of_face(face)
-        if len(xyz) < 3:
-            continue
-        rms_mm = float(np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean()))
-        if rms_mm > SAME_DESIGN_MM:
+        off_mm = 0.0 if len(xyz) < 3 else np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean())
+        if off_mm > SAME_DESIGN_MM:
             raise InputError(
                 "E-FACES-DESIGN",
-                f"faces {path}: face {face.id} is {rms_mm:.3g} mm RMS off that of target {design.name}, "
+                f"{where}: face {face.id} is {off_mm:.3g} mm RMS off that of target {design.name}, "
                 f"{SAME_DESIGN_MM:g} mm allowed; give the target.toml of that run",
             )

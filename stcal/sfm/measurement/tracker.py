@@ -153,7 +153,11 @@ class Tracker:
         camera = self._camera_of(image, name)
         followed = self._follow(image, camera, name) if self.recent and not self.design.has_printed else None
         self.searched = followed is None
-        labelled, pose = followed or self._search(image, camera, name)
+        if followed is None:
+            detection = detect_target(image, camera, self.design, self.board, self.ellipses)
+            labelled = label_single(name, "", detection, self.design)
+            followed = labelled, self._pose(labelled.observations, camera)
+        labelled, pose = followed
         if isinstance(pose, StcalError):
             self.forget()
             return labelled, pose
@@ -173,12 +177,9 @@ class Tracker:
         require_grey(image, (self.camera.width, self.camera.height), name)
         return self.camera
 
-    def _search(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose | StcalError]:
-        detection = detect_target(image, camera, self.design, self.board, self.ellipses)
-        labelled = label_single(name, "", detection, self.design)
-        return labelled, self._pose(labelled.observations, camera)
-
-    def _follow(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose] | None:
+    def _follow(
+        self, image: np.ndarray, camera: Camera, name: str
+    ) -> tuple[LabelledImage, TargetPose | StcalError] | None:
         """Returns circles and pose near the predicted place, or None if the target is not there."""
         last = self.recent[-1]
         expected = last @ self.recent[0].inverse() @ last if len(self.recent) == 2 else last
@@ -193,10 +194,9 @@ class Tracker:
         pose = self._pose(labelled.observations, camera)
         if isinstance(pose, StcalError):
             return None
-        completed = self._completed(image, camera, labelled, pose)
-        if completed.observations is not labelled.observations:
-            pose = self._pose(completed.observations, camera)
-        labelled = completed
+        first, labelled = labelled, self._completed(image, camera, labelled, pose)
+        if labelled.observations is not first.observations:
+            pose = self._pose(labelled.observations, camera)
         if isinstance(pose, StcalError) or fit_verdict(pose) == "failed":
             return None
         return labelled, pose

@@ -28,8 +28,8 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.mapping.incremental import assemble
 from stcal.sfm.mapping.placed import unknown_lens
-from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, nominal_poses
-from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_as_asked, plan_with_board
+from stcal.sfm.planning.forecast import CentreNoise, Forecast, Setup, forecast, nominal_poses
+from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_as_asked, plan_with_board, remedy
 from stcal.sfm.planning.views import ROLLS_DEG, PlannedView, angle_deg, axes_of, looking_at, single, tilt_deg
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
 
@@ -100,10 +100,10 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
     now = plan_as_asked(options, setup, [model], "print and size of half the σ")
     measured = forecast([model], _with_distance(setup, model), now.forecast.derivatives)
     remedies = (
-        _remedy("twice the images", replace(options, images=2 * options.images), placed),
+        remedy("twice the images", _forecast, replace(options, images=2 * options.images), placed),
         *now.remedies,
         Remedy(f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm", measured.worst()[1]),
-        _remedy("nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), placed),
+        remedy("nearer by 20 %", _forecast, replace(options, distance_mm=NEARER * options.distance_mm), placed),
     )
     return replace(now, remedies=remedies, hardly_seen=scene.hardly_seen())
 
@@ -119,12 +119,9 @@ def _with_distance(setup: Setup, model: MetricModel) -> Setup:
     return replace(setup, board=replace(setup.board, distances=(*setup.board.distances, known)))
 
 
-def _remedy(what: str, options: PlanOptions, target: TargetDesign) -> Remedy:
-    try:
-        _, model, setup = planned_photographs(options, target)
-    except InputError as error:
-        return Remedy(what, None, str(error))
-    return Remedy(what, forecast([model], setup).worst()[1])
+def _forecast(options: PlanOptions, target: TargetDesign) -> Forecast:
+    _, model, setup = planned_photographs(options, target)
+    return forecast([model], setup)
 
 
 def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, MetricModel, Setup]:
@@ -185,38 +182,35 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
     middles = {face.id: target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
     centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
     towards = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
-    distance = float(np.median(np.linalg.norm(towards, axis=1)))
+    away = np.linalg.norm(towards, axis=1)
+    distance = float(np.median(away))
     views = []
-    for one, two in combinations(faces, 2):
-        if normals[one.id] @ normals[two.id] < LEAST_COSINE:
+    for (one, two), share, roll in product(combinations(normals, 2), SHARES, ROLLS_DEG):
+        if normals[one] @ normals[two] < LEAST_COSINE:
             continue
-        for share, roll in product(SHARES, ROLLS_DEG):
-            direction = share * normals[one.id] + (1 - share) * normals[two.id]
-            direction /= np.linalg.norm(direction)
-            cosine = towards @ direction / np.linalg.norm(towards, axis=1)
-            near = int(cosine.argmax())
-            axes = axes_of(model.camera_from_model[near], towards[near])
-            right, up, ahead = (axes @ direction).tolist()
-            pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
-            position = centre + distance * direction
-            tilts = {face.id: tilt_deg(normals[face.id], middles[face.id], position) for face in faces}
-            shown = {face for face, tilt in tilts.items() if tilt < MAX_TILT_DEG}
-            labels: list[Label] = [
-                label for label in model.labels if isinstance(label, CircleLabel) and label.face in shown
-            ]
-            name = f"{model.group}/view {one.id} {two.id} {share} {roll}"
-            views.append(
-                PlannedView(
-                    model.group,
-                    noise.applied(single(model, name, pose, labels, setup.camera), setup.camera, setup.radius_mm()),
-                    float(np.degrees(np.arctan2(right, ahead)).round()),
-                    float(np.degrees(np.arcsin(np.clip(up, -1, 1))).round()),
-                    roll,
-                    distance,
-                    {face: tilts[face] for face in sorted(shown)},
-                    model.images[near],
-                    model.images[near],
-                    angle_deg(cosine[near]),
-                )
+        direction = share * normals[one] + (1 - share) * normals[two]
+        direction /= np.linalg.norm(direction)
+        cosine = towards @ direction / away
+        near = int(cosine.argmax())
+        axes = axes_of(model.camera_from_model[near], towards[near])
+        right, up, ahead = (axes @ direction).tolist()
+        pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
+        tilts = {face: tilt_deg(normals[face], middles[face], centre + distance * direction) for face in normals}
+        shown = {face: tilt for face, tilt in sorted(tilts.items()) if tilt < MAX_TILT_DEG}
+        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in shown]
+        name = f"{model.group}/view {one} {two} {share} {roll}"
+        views.append(
+            PlannedView(
+                model.group,
+                single(model, name, pose, labels, setup, noise),
+                float(np.degrees(np.arctan2(right, ahead)).round()),
+                float(np.degrees(np.arcsin(np.clip(up, -1, 1))).round()),
+                roll,
+                distance,
+                shown,
+                model.images[near],
+                model.images[near],
+                angle_deg(cosine[near]),
             )
+        )
     return views

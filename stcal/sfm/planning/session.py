@@ -167,9 +167,9 @@ def plan_with_board(
     inputs = (target, board, nominal)
     jobs = [
         (_now, scene, options, board),
-        (_remedy, "twice the images", replace(options, images=2 * options.images), *inputs),
+        (remedy, "twice the images", _forecast, replace(options, images=2 * options.images), *inputs),
         (_wider, options, *inputs),
-        (_remedy, "nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), *inputs),
+        (remedy, "nearer by 20 %", _forecast, replace(options, distance_mm=NEARER * options.distance_mm), *inputs),
     ]
     workers = None if dots > MANY_DOTS else 1
     now, more, wider, near = run_in_order(_called, jobs, workers)
@@ -283,20 +283,23 @@ def _models(scene: Scene, options: PlanOptions) -> list[MetricModel]:
     return [options.noise.applied(model, scene.camera, radius) for model in exact]
 
 
-def _remedy(what: str, options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
+def _forecast(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Forecast:
+    scene = _scene(options, target, board, nominal)
+    return forecast(_models(scene, options), _setup(scene, options, board))
+
+
+def remedy(what: str, make: Callable[..., Forecast], *inputs) -> Remedy:
+    """Returns a change with the σ of the worst face of its forecast, or with the reason why it is impossible."""
     try:
-        scene = _scene(options, target, board, nominal)
-    except DegenerateError as error:
+        return Remedy(what, make(*inputs).worst()[1])
+    except (DegenerateError, InputError) as error:
         return Remedy(what, None, str(error))
-    return Remedy(what, forecast(_models(scene, options), _setup(scene, options, board)).worst()[1])
 
 
-def _wider(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
+def _wider(options: PlanOptions, *inputs) -> Remedy:
     """Returns the remedy of the largest spread at which there are enough views."""
-    remedy = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
+    found = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
     for spread in SPREADS_DEG:
-        if spread > options.spread_deg:
-            remedy = _remedy(f"spread of ±{spread:g}°", replace(options, spread_deg=spread), target, board, nominal)
-            if remedy.sigma_mm is not None:
-                break
-    return remedy
+        if spread > options.spread_deg and found.sigma_mm is None:
+            found = remedy(f"spread of ±{spread:g}°", _forecast, replace(options, spread_deg=spread), *inputs)
+    return found

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.design import TargetDesign
-from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel, Label
@@ -39,6 +38,15 @@ class PlannedView:
     nearest: str  # photograph, at the angle ``nearest_deg``
     nearest_deg: float
 
+    @property
+    def camera_from_target(self) -> Rigid:
+        return self.model.camera_from_model[0]
+
+    @property
+    def labels(self) -> list[Label]:
+        """The labels in view."""
+        return [self.model.labels[i] for i in self.model.point_index]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stand:
@@ -49,10 +57,6 @@ class _Stand:
     distance_mm: float  # median, of the cameras from the centre
     directions: np.ndarray  # (m, 3) unit vectors from the centre to the cameras
     middle: str  # image in the middle of the views
-
-    def __post_init__(self):
-        for name, shape in (("centre", (3,)), ("axes", (3, 3)), ("directions", (None, 3))):
-            freeze(self, name, shape, name)
 
     @classmethod
     def of(cls, model: MetricModel) -> "_Stand":
@@ -133,18 +137,18 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
     scene = replace(scene, groups={model.group: group})
     limit = _largest_tilt(scene, model)
+    members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
     views = []
     for i, place in enumerate(places):
         labels = set(model.labels) & shown(scene, model.group, i, limit)
-        if not _worth_it(labels, model):
+        if not (members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board")):
             continue
-        view_model = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
         views.append(
             PlannedView(
                 model.group,
-                noise.applied(view_model, setup.camera, setup.radius_mm()),
+                single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup, noise),
                 *place,
                 stand.distance_mm,
                 _tilts_deg(scene, model.group, position, labels),
@@ -189,11 +193,6 @@ def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
         return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
 
 
-def _worth_it(seen: set[Label], model: MetricModel) -> bool:
-    members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
-    return members["board"] <= seen and any(labels <= seen for key, labels in members.items() if key != "board")
-
-
 def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
     """Returns the angles between normal and line of sight, by ``board`` and face in view."""
     board = scene.groups[group].target_from_board.rotation[:, 2]
@@ -213,19 +212,20 @@ def angle_deg(cosine: ArrayLike) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
-def single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
-    """Returns the model of one image of the group that shows these points."""
-    place = {label: i for i, label in enumerate(model.labels)}
-    points = np.array([place[label] for label in labels])
-    n = len(points)
-    return replace(
+def single(
+    model: MetricModel, name: str, pose: Rigid, labels: list[Label], setup: Setup, noise: CentreNoise
+) -> MetricModel:
+    """Returns the model of one image of the group that shows these points, with the σ that they will have."""
+    points, n = np.array([model.labels.index(label) for label in labels]), len(labels)
+    image = replace(
         model,
         images=(name,),
         camera_from_model=(pose,),
         image_index=np.zeros(n, int),
         point_index=points,
         keypoint=np.arange(n),
-        measured_px=camera.project(pose @ model.xyz_model[points]),
+        measured_px=setup.camera.project(pose @ model.xyz_model[points]),
         shift_px=np.zeros((n, 2)),
         covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
     )
+    return noise.applied(image, setup.camera, setup.radius_mm())

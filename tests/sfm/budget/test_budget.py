@@ -220,7 +220,7 @@ def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path)
     assert not file.size_known
     assert (file.reference_temperature_c, file.correction_ppm, file.distances) == (None, None, [])
     for face in file.faces.values():
-        assert (face.position_mm, face.position_um, face.position_xyz_um) == (None, None, None)
+        assert (face.position_mm, face.position_um) == (None, None)
         assert face.rotation_mdeg.expanded > 0
     for shown in (budget_report(file).text(), budget_report(file).page()):
         assert "only the shape is known" in shown.lower()
@@ -248,8 +248,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     path, out = tmp_path / "lab.toml", tmp_path / "budget.json"
     path.write_text(STATEMENT)
     words = "--statement", path, "--field", "instrument=X 5"
-    brief = stcal_sfm("budget", small_run, *words)[1].splitlines()
-    assert (len(brief) <= 15, max(map(len, brief)) <= 100) == (True, True), brief
+    assert len(stcal_sfm("budget", small_run, *words)[1].splitlines()) <= 15
     code, text, _ = stcal_sfm("budget", small_run, *words, "-v", "--json", out)
     assert code == 0
     assert all(shown in text for shown in ("operator: A. Smith\n", "instrument: X 5\n", "-14.0 ppm"))
@@ -262,7 +261,7 @@ def test_command(stcal_sfm, small_run, tmp_path):
     first = file["distances"][0]
     assert first["corrected_mm"] == pytest.approx(first["length_mm"] * (1 - 14e-6), abs=1e-9)
     own = first["distance_um"]
-    assert own["sensitivities"]["board_pitch"] == pytest.approx(1e-3 * first["length_mm"], rel=2e-3)
+    assert own["contributions"]["board_pitch"] == pytest.approx(10e-3 * first["length_mm"], rel=2e-3)
     assert own["expanded"] == pytest.approx(2 * own["standard"])
     pose = np.array(json.loads((small_run / "faces.json").read_text())["target_from_face"]["5"])
     assert file["faces"]["5"]["position_mm"] == pytest.approx(pose[:3, 3] * (1 - 14e-6), abs=1e-9)

@@ -63,7 +63,7 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
     assert "cannot be seen here" in plain.notes[0]
     longest = budget.of_kind("distance")[0]
     assert plain.lengths[0].circles == longest.measurand.circles
-    assert plain.lengths[0].error_mm == 0
+    assert plain.lengths[0].error_um == 0
     assert plain.lengths[0].expanded_mm == pytest.approx(np.sqrt(2) * longest.expanded)
     path = tmp_path / "lab.toml"
     path.write_text(PITCH)

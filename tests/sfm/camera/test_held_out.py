@@ -179,7 +179,7 @@ def test_text_page_and_file_have_all_models(result):
     assert re.search(r"views held out, 5 parts: residual RMS 0\.0\d+ px after their poses were fitted", text)
     assert re.search(r"\* +OPENCV +8 +0\.0\d+ +0\.0000", text)
     assert [each.model for each in summary.models] == ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"]
-    assert summary.held_out.folds == 5
+    assert summary.held_out_rms_px == result.held_out.rms_px()
     assert page.count("data:image/svg+xml") == 3
     for words in ("σ of a projection over the image", "their pixels explain", "Lens models", "SIMPLE_RADIAL"):
         assert words in page

@@ -311,7 +311,7 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     more = ("--joints", joints, "--json", tmp_path / "poses.json", "--report", tmp_path / "poses.html")
     code, out, err = stcal_sfm(*command(small_dataset, small_run, tmp_path, *more))
     assert (code, err.count("error")) == (0, 0)
-    assert "left out empty.png: no face of the target recognised" in out
+    assert "no face of the target recognised" in out
     assert "not joined: IMG_1001.jpg: measured, but not in" in out
     assert "not joined: IMG_7.jpg: in" in out
     with open(tmp_path / "poses.csv", newline="") as stream:
@@ -334,7 +334,7 @@ def test_command_writes_poses_with_joints(stcal_sfm, small_dataset, small_run, t
     assert len(list(tmp_path.glob("*.partial"))) == 0
     page, pose = (tmp_path / "poses.html").read_text(), content["images"][0]
     assert "no face of the target recognised" in page
-    assert all(f"<td>{1e3 * np.sqrt(pose['covariance'][k][k]):.1f}</td>" in page for k in (3, 4, 5))
+    assert f"<td>{1e3 * max(np.sqrt(pose['covariance'][k][k]) for k in (3, 4, 5)):.1f}</td>" in page
 
 
 def spoilt(small_run, tmp_path, change):
