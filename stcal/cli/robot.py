@@ -227,9 +227,9 @@ def identify(
     report: shared.ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
+    from stcal.robot.identification import report as shown
     from stcal.robot.identification.prior import adjusted
-    from stcal.robot.identification.report import identified_file, identified_report
-    from stcal.robot.identification.result import IdentifyOptions, require_identified_written
+    from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions, require_identified_written
     from stcal.robot.identification.solve import identify as identified_from
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
@@ -241,7 +241,7 @@ def identify(
         observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
     )
     result = identified_from(nominal, data, options)
-    document = identified_report(result, nominal)
+    document = shown.identified_report(result)
     say(document.text())
     if out:
         write(
@@ -250,11 +250,9 @@ def identify(
         )
         require_identified_written(out, result)
     if offsets:
-        from stcal.robot.identification.report import offsets_csv, require_offsets_written
-
-        write(offsets, offsets_csv(result, nominal))
-        require_offsets_written(offsets, result, nominal)
-    write_if(json_file, lambda: identified_file(result, nominal))
+        write(offsets, shown.offsets_csv(result, nominal))
+        shown.require_offsets_written(offsets, result, nominal)
+    write_if(json_file, lambda: IdentifiedFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -280,6 +278,7 @@ def evaluate(
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.kinematics.measurements import read_measurements
     from stcal.robot.use import report as shown
+    from stcal.robot.use.evaluation import EvaluationFile
     from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
@@ -294,7 +293,7 @@ def evaluate(
     write_if(out, lambda: shown.evaluated_csv(result))
     if out:
         shown.require_evaluated_written(out, result)
-    write_if(json_file, lambda: shown.evaluation_file(result))
+    write_if(json_file, lambda: EvaluationFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -316,7 +315,7 @@ def verify(
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
     from stcal.robot.use import verification
-    from stcal.robot.use.report import verification_report
+    from stcal.robot.use.report import verification_figure, verification_report
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
@@ -328,11 +327,10 @@ def verify(
     print_each("warning", result.warnings())
     if plot:
         from stcal.report.svg import save
-        from stcal.robot.use.report import verification_figure
 
         save(verification_figure(result), plot)
         say(f"written: {plot}")
-    write_if(json_file, lambda: verification.verification_file(result))
+    write_if(json_file, lambda: verification.VerificationFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -360,14 +358,14 @@ def compensate(
     source = joined.table(targets, "TARGETS", quaternions=quaternions)
     wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
     result = compensation.compensate(identified, wanted, load_robot(nominal) if nominal else None)
-    document = compensation_report(result, identified)
+    document = compensation_report(result)
     say(document.text())
     print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
     write_if(out, lambda: compensation.compensated_csv(result, identified))
     if out:
         compensation.require_compensated_written(out, result, identified)
-    write_if(json_file, lambda: compensation.compensation_file(result, identified))
+    write_if(json_file, lambda: compensation.CompensationFile.model_validate(result))
     write_if(report, document.page)
     if not result.found.usable.any():
         raise DegenerateError(
@@ -406,7 +404,7 @@ def design(
     write_if(out, lambda: pose_design.design_csv(result, robot))
     if out:
         pose_design.require_design_written(out, result, robot, target)
-    write_if(json_file, lambda: pose_design.design_file(result))
+    write_if(json_file, lambda: pose_design.DesignFile.model_validate(result))
     write_if(report, document.page)
 
 

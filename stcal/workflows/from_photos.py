@@ -31,21 +31,27 @@ from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.report import axes_file, axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.observability import predicted_at
-from stcal.robot.identification.report import identified_file, identified_report
-from stcal.robot.identification.result import Identified, IdentifyOptions, require_identified_written
+from stcal.robot.identification.report import identified_report
+from stcal.robot.identification.result import (
+    Figures,
+    Identified,
+    IdentifiedFile,
+    IdentifyOptions,
+    require_identified_written,
+)
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import require_robot_written, robot_toml
 from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
     Compensated,
+    CompensationFile,
     compensate,
     compensated_csv,
     compensated_summary,
-    compensation_file,
     require_compensated_written,
 )
-from stcal.robot.use.evaluation import Figures, evaluate
+from stcal.robot.use.evaluation import evaluate
 from stcal.robot.use.report import compensation_report
 from stcal.robot.use.targets import Targets, read_targets
 from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
@@ -284,9 +290,9 @@ def _results(result: FromPhotos) -> dict[str, ResultFile]:
     axes, identified, compensated = result.axes, result.identified, result.compensated
     return {
         "poses.json": poses_file(result.measured),
-        "identified.json": identified_file(identified, result.nominal),
+        "identified.json": IdentifiedFile.model_validate(identified),
         **({} if axes is None else {"axes.json": axes_file(axes)}),
-        **({} if compensated is None else {"compensated.json": compensation_file(compensated, identified.robot)}),
+        **({} if compensated is None else {"compensated.json": CompensationFile.model_validate(compensated)}),
     }
 
 
@@ -298,7 +304,7 @@ def files_of(result: FromPhotos) -> dict[str, str]:
         POSES: poses_csv(result.measured)[0],
         "poses.html": measure_report(result.measured, result.images).page(),
         "identified.toml": robot_toml(identified, [source]),
-        "identified.html": identified_report(result.identified, result.nominal).page(),
+        "identified.html": identified_report(result.identified).page(),
     }
     if result.axes is not None:
         files |= {
@@ -308,7 +314,7 @@ def files_of(result: FromPhotos) -> dict[str, str]:
     if compensated is not None:
         files |= {
             "compensated.csv": compensated_csv(compensated, identified),
-            "compensated.html": compensation_report(compensated, identified).page(),
+            "compensated.html": compensation_report(compensated).page(),
         }
     files = dict(sorted(files.items(), key=lambda item: STAGES.index(item[0].split(".")[0])))
     return files | {"report.html": from_photos_page(result, tuple(files))}

@@ -13,6 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
+from stcal.io.covariance import TWIST
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import (
     carried_poses,
@@ -94,11 +95,16 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 def parameter_names(state: State, kind: Kind) -> list[str]:
     """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools, and
     ``station B rx`` … of stations but the first; r in rad, the others in mm."""
-    component = ("rx", "ry", "rz", "x", "y", "z")
-    tool = component if kind == "pose" else component[3:]
-    names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
-    names += [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
-    return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in component]
+    owners = [f"J{i + 1}" for i, _ in chain_parameters(state.chain)]
+    owners += [f"tool {name}".rstrip() for name in state.tools for _ in range(tool_width(kind))]
+    owners += [f"station {name}" for name in list(state.stations)[1:] for _ in TWIST]
+    return [f"{owner} {TWIST[c]}" for owner, c in zip(owners, parameter_components(state, kind), strict=True)]
+
+
+def parameter_components(state: State, kind: Kind) -> list[int]:
+    """Returns the component of each parameter without elasticity: 0 to 2 of a rotation, 3 to 5 of a translation."""
+    tool = list(range(6 - tool_width(kind), 6)) * len(state.tools)
+    return [c for _, c in chain_parameters(state.chain)] + tool + [*range(6)] * (len(state.stations) - 1)
 
 
 def tips(state: State, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:

@@ -163,6 +163,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     tested = held_out is not None or options.folds < LEAST_FOLDS
     result = Identified(
         robot=identified,
+        nominal=robot,
         seen=observations,
         adjustment=adjusted,
         names=tuple(names),
@@ -192,7 +193,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + ((TRY_ELASTIC,) if remarks and of_arm and not state.elastic else ())
         + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
-    return replace(result, notes=result.notes + misgivings(result, robot))
+    return replace(result, notes=result.notes + misgivings(result))
 
 
 def _modelled(

@@ -3,16 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
-from stcal.io.json import Part, ResultFile, Vector, Vector3
+from stcal.io.json import Part, ResultFile, Shape, Texts, Vector
 from stcal.io.table import csv_text, pose_values, read_table
 from stcal.parallel import one_thread
 from stcal.robot.kinematics.file import WRITTEN_MM
@@ -40,43 +40,6 @@ LEAST_SHOWN_MM = 1e-6
 """Error below which its size says nothing."""
 ISOLATED = 6
 """Largest number of joints with isolated solutions, of which another one is another configuration."""
-
-
-ByStatus = Annotated[str, "status"]
-
-
-class CompensatedPose(Part):
-    line: int
-    target: str
-    commanded_mm: Vector3
-    commanded_quaternion: Vector
-    status: str
-    joints: dict[str, float] | None
-    error_mm: float
-    error_rad: float
-    payload_kg: float | None = None
-    nominal_status: str = ""
-    nominal_joints: dict[str, float] | None = None
-    nominal_error_mm: float | None = None
-    nominal_error_rad: float | None = None
-
-
-class CompensationFile(ResultFile):
-    """Result file of ``compensate``."""
-
-    format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
-    robot: str = Field(description="name")
-    counts: dict[ByStatus, int] = Field(description="number of poses")
-    poses: list[CompensatedPose] = Field(
-        description="the columns above: `line`, `target`, `commanded_mm`, `commanded_quaternion` (w first), `status`, "
-        "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, `payload_kg` (null: as the robot "
-        "file has it), and with `--nominal` "
-        "`nominal_status`, `nominal_joints`, `nominal_error_mm`, `nominal_error_rad`"
-    )
-    notes: list[str] = Field(
-        description="columns that were not read, angles by their convention, and the warnings: doubts of targets and "
-        "robots, and rows that are not simply reached"
-    )
 
 
 def _stayed(
@@ -162,8 +125,8 @@ class Compensated(Brief):
     before_mm, before_rad : (m,) arrays
         Error of the nominal joint values by the identified robot, which compensation removes; empty without a nominal
         robot.
-    sliding : (n,) array
-        Which joints are prismatic.
+    identified : Robot
+        The identified robot, with the tools that were taken.
     reach_mm : float
         Of the arm.
     beyond : dict of int to str
@@ -180,14 +143,41 @@ class Compensated(Brief):
     nominal: Inverse | None
     before_mm: np.ndarray
     before_rad: np.ndarray
-    sliding: np.ndarray
+    identified: Robot
     reach_mm: float
     beyond: dict[int, str]
     doubts: tuple[str, ...] = ()
     controller: Robot | None = None
+    format: ClassVar = "stcal compensation 1"
 
     def __len__(self) -> int:
         return len(self.found)
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        return self.identified.name
+
+    @property
+    def lines(self) -> list[int]:
+        """Lines (m,) of the file."""
+        return [int(line) for line in self.targets.lines]
+
+    @property
+    def joints(self) -> list[dict[str, float] | None]:
+        """Joint values to command, by the names of columns; None where they do not reach the pose."""
+        return self.by_column(self.found)
+
+    @property
+    def nominal_joints(self) -> list[dict[str, float] | None] | None:
+        """The same by the nominal robot."""
+        return None if self.nominal is None else self.by_column(self.nominal)
+
+    def by_column(self, inverse: Inverse) -> list[dict[str, float] | None]:
+        """Returns joint values by the names of columns; None where they do not reach the pose."""
+        columns, unit = joint_columns(self.identified), np.where(self.identified.prismatic, 1.0, np.degrees(1.0))
+        rows = zip((inverse.q * unit).tolist(), inverse.usable, strict=True)
+        return [dict(zip(columns, q, strict=True)) if usable else None for q, usable in rows]
 
     def compared(self) -> np.ndarray:
         """Mask (m,) of the rows that both robots reach."""
@@ -200,7 +190,7 @@ class Compensated(Brief):
     def _far_moved(self) -> list[str]:
         if self.nominal is None:
             return []
-        moved = np.abs(self.found.q - self.nominal.q)[:, ~self.sliding].max(axis=1, initial=0.0)
+        moved = np.abs(self.found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
         expected = self.before_rad + self.before_mm / self.reach_mm
         return [
             f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: "
@@ -323,7 +313,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         nominal=before,
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
-        sliding=identified.prismatic,
+        identified=identified,
         reach_mm=reach_mm(identified, targets.tools[:1]),
         beyond=beyond,
         doubts=doubts + of_targets + others + rigid,
@@ -410,19 +400,16 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
     rows: list[Sequence] = [head]
 
-    def joints(inverse: Inverse, i: int) -> list[str]:
-        cells = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
-        return [*cells, inverse.status[i]]
-
-    def errors(mm: float, rad: float) -> list[str]:
-        return [f"{mm:.6f}", f"{np.degrees(rad):.6f}"]
+    def cells(inverse: Inverse, i: int, mm: np.ndarray, rad: np.ndarray, shown: bool = True) -> list[str]:
+        values = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
+        errors = [f"{mm[i]:.6f}", f"{np.degrees(rad[i]):.6f}"] if shown else ["", ""]
+        return [*values, inverse.status[i], *errors]
 
     for i, line in enumerate(result.targets.lines):
-        row = [*(own[i] for own in names.values()), line, result.targets.tools[i], *joints(result.found, i)]
-        row += errors(result.found.error_mm[i], result.found.error_rad[i])
-        if result.nominal:
-            row += joints(result.nominal, i)
-            row += errors(result.before_mm[i], result.before_rad[i]) if result.nominal.usable[i] else ["", ""]
+        row = [*(own[i] for own in names.values()), line, result.targets.tools[i]]
+        row += cells(result.found, i, result.found.error_mm, result.found.error_rad)
+        if (nominal := result.nominal) is not None:
+            row += cells(nominal, i, result.before_mm, result.before_rad, bool(nominal.usable[i]))
         rows.append(row)
     return csv_text(rows)
 
@@ -442,47 +429,34 @@ def require_compensated_written(path: str | Path, result: Compensated, robot: Ro
     require_written(path, again, pose_values(poses_of(robot, targets, result.found.q[usable])), WRITTEN_MM, "mm")
 
 
-def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
-    """Returns the complete result in machine-readable form."""
-    columns = joint_columns(robot)
-    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
+class Reached(Part):
+    status: list[str]
+    error_mm: Vector
+    error_rad: Vector
 
-    def joints(inverse: Inverse, i: int) -> dict | None:
-        return dict(zip(columns, (inverse.q[i] * unit).tolist(), strict=True)) if inverse.usable[i] else None
 
-    rows, mass = [], result.targets.conditions.payload_kg
-    quaternions = result.poses.quaternions()
-    for i, line in enumerate(result.targets.lines):
-        row = {
-            "line": int(line),
-            "target": result.targets.tools[i],
-            "commanded_mm": result.poses.translation[i],
-            "commanded_quaternion": quaternions[i],
-            "status": result.found.status[i],
-            "joints": joints(result.found, i),
-            "error_mm": float(result.found.error_mm[i]),
-            "error_rad": float(result.found.error_rad[i]),
-            "payload_kg": None if mass is None else float(mass[i]),
-        }
-        if result.nominal:
-            usable = bool(result.nominal.usable[i])
-            row |= {
-                "nominal_status": result.nominal.status[i],
-                "nominal_joints": joints(result.nominal, i),
-                "nominal_error_mm": float(result.before_mm[i]) if usable else None,
-                "nominal_error_rad": float(result.before_rad[i]) if usable else None,
-            }
-        rows.append(row)
-    counts = {status: result.found.status.count(status) for status in dict.fromkeys(result.found.status)}
-    return CompensationFile.model_validate(
-        {
-            "format": "stcal compensation 1",
-            "robot": robot.name,
-            "counts": counts,
-            "poses": rows,
-            "notes": [*result.targets.notes, *result.notes()],
-        }
+class CompensationFile(ResultFile):
+    """Result file of ``compensate``."""
+
+    format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
+    robot: str = Field(description="name")
+    lines: list[int] = Field(description="of the poses in the file")
+    poses: Annotated[
+        np.ndarray,
+        Shape((None, 4, 4)),
+        BeforeValidator(lambda poses: poses.matrix() if isinstance(poses, Poses) else poses),
+    ] = Field(description="commanded base_from_tool, mm")
+    joints: list[dict[str, float] | None] = Field(
+        description="joint values to command, by column name; null where the pose is not reached"
     )
+    found: Reached = Field(description="`status` of each pose, and what remains: `error_mm`, `error_rad`")
+    nominal_joints: list[dict[str, float] | None] | None = Field(description="the same of the nominal robot")
+    nominal: Reached | None = Field(description="the same of the nominal robot: `status`, `error_mm`, `error_rad`")
+    before_mm: Vector = Field(
+        description="error of the nominal joint values by the identified robot, where `nominal.status` is reached"
+    )
+    before_rad: Vector = Field(description="the same of the orientation")
+    notes: Texts = Field(description="doubts of targets and robots, and rows that are not simply reached")
 
 
 def compensated_summary(result: Compensated) -> list[str]:

@@ -7,7 +7,7 @@ inverse information matrix is updated by the few rows of a pose (Sherman, Morris
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -16,7 +16,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
-from stcal.io.json import ResultFile
+from stcal.io.json import Finite, ResultFile
 from stcal.io.table import POSE, csv_text, pose_cells, pose_values, read_table, require_pose_table_written
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
@@ -47,19 +47,19 @@ class DesignFile(ResultFile):
     """Result file of ``design``."""
 
     format: Literal["stcal pose design 1"] = Field(description="the file's form and its version")
-    count: int = Field(description="number of poses")
     parameters: int = Field(description="of the robot and its tool")
     seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
     exchanges: int = Field(description="single poses exchanged after the greedy choice")
-    chosen: dict[str, float] = Field(
-        description="`O1` … `O5` of the chosen poses; defined and in units as `identify --json` has them"
+    chosen: ObservabilityIndices = Field(
+        description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses, as `identify --json` has them"
     )
-    random_median: dict[str, float] = Field(description="medians of `random`")
-    random: list[dict[str, float]] = Field(description="`O1` … `O5` of 20 random sets of as many poses")
-    predicted_sigma_mm: float = Field(
+    random: list[ObservabilityIndices] = Field(
+        description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many poses"
+    )
+    sigma_mm: float = Field(
         description="σ per axis of the position that the identified robot predicts, RMS over random poses"
     )
-    random_predicted_sigma_mm: float | None = Field(
+    random_sigma_mm: Finite = Field(
         description="the same, median of the random sets (null where they leave parameters open)"
     )
 
@@ -80,6 +80,7 @@ class PoseDesign(Brief):
     exchanges : int
     """
 
+    format: ClassVar = "stcal pose design 1"
     q: Array
     poses: Poses
     parameters: int
@@ -353,21 +354,3 @@ def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, t
         return pose_values(forward(robot, joint_values(read_table(path, "poses"), robot), tool))
 
     require_written(path, again, pose_values(result.poses), WRITTEN_MM, "mm")
-
-
-def design_file(result: PoseDesign) -> DesignFile:
-    """Returns the result without the poses in machine-readable form."""
-    return DesignFile.model_validate(
-        {
-            "format": "stcal pose design 1",
-            "count": len(result.q),
-            "parameters": result.parameters,
-            "seen": result.seen,
-            "exchanges": result.exchanges,
-            "chosen": result.chosen.values(),
-            "random_median": result.median(),
-            "random": [each.values() for each in result.random],
-            "predicted_sigma_mm": result.sigma_mm,
-            "random_predicted_sigma_mm": result.random_sigma_mm if np.isfinite(result.random_sigma_mm) else None,
-        }
-    )
