@@ -141,8 +141,8 @@ def axes(
     report: shared.ReportFile = None,
 ) -> None:
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
-    from stcal.robot.axes.model import robot_from_sweeps
-    from stcal.robot.axes.report import axes_file, axes_report
+    from stcal.robot.axes.model import AxesFile, robot_from_sweeps
+    from stcal.robot.axes.report import axes_report
     from stcal.robot.axes.sweeps import ring
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
@@ -162,7 +162,7 @@ def axes(
     write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {shared.name_of(source)}."]))
     if out:
         require_robot_written(out, result.robot, result.chain)
-    write_if(json_file, lambda: axes_file(result))
+    write_if(json_file, lambda: AxesFile.model_validate(result))
     write_if(report, document.page)
 
 

@@ -27,8 +27,8 @@ from stcal.report.document import Block, Document, Section, bullets, links, list
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, log_limits
 from stcal.report.text import number
-from stcal.robot.axes.model import AxesResult, robot_from_sweeps
-from stcal.robot.axes.report import axes_file, axes_report
+from stcal.robot.axes.model import AxesFile, AxesResult, robot_from_sweeps
+from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.observability import predicted_at
 from stcal.robot.identification.report import identified_report
@@ -291,7 +291,7 @@ def _results(result: FromPhotos) -> dict[str, ResultFile]:
     return {
         "poses.json": poses_file(result.measured),
         "identified.json": IdentifiedFile.model_validate(identified),
-        **({} if axes is None else {"axes.json": axes_file(axes)}),
+        **({} if axes is None else {"axes.json": AxesFile.model_validate(axes)}),
         **({} if compensated is None else {"compensated.json": CompensationFile.model_validate(compensated)}),
     }
 
