@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.poses.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
-from stcal.robot.kinematics.dh import FITS, require_convention, require_orientations
+from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
@@ -86,9 +86,7 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
         flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
-        require_convention(data.where, data.targets, flange, data.rotations)
-        if len(data) >= LEAST_ORIENTATIONS:
-            require_orientations(data.where, data.targets, flange, data.rotations)
+        require_orientations(data.where, data.targets, flange, data.rotations, len(data) >= LEAST_ORIENTATIONS)
     return replace(state, stations={data.stations[0]: Rigid()})
 
 
@@ -375,35 +373,16 @@ def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iter
 
 def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
     """Yields frequent mistakes, one at a time."""
-    turning, q = ~robot.prismatic, data.q
-    angle = np.where(turning, 180 / np.pi, 1.0)
-    yield (
-        "joint values are radians in columns of degrees",
-        "call the columns q1_rad …",
-        robot,
-        replace(data, q=q * angle),
-    )
-    yield (
-        "joint values are degrees in columns of radians",
-        "call the columns q1_deg …",
-        robot,
-        replace(data, q=q / angle),
-    )
+    q = data.q
+    in_degrees = replace(data, q=q * np.where(robot.prismatic, 1.0, 180 / np.pi))
+    yield "joint values are radians in columns of degrees", "call the columns q1_rad …", robot, in_degrees
     lengths = {"distances": data.distances, "positions": data.positions}
     for unit, words in UNIT_WORDS.items():
-        for names, column, times in (
-            (f"{words} in columns of mm", unit, LENGTHS[unit]),
-            (f"mm in columns of {words}", "mm", 1 / LENGTHS[unit]),
-        ):
+        there = words, "mm", unit, LENGTHS[unit]
+        for held, said, right, times in (there, ("mm", words, "mm", 1 / LENGTHS[unit])):
             scaled = {name: times * values for name, values in lengths.items() if values is not None}
-            yield (
-                f"lengths are {names}",
-                f"call the columns x_{column} … or distance_{column}",
-                robot,
-                replace(data, **scaled),
-            )
-    opposite = replace(data, q=np.where(turning, -q, q))
-    yield "all joint values had the opposite sign", "check the rows and the joints' directions", robot, opposite
+            cure = f"call the columns x_{right} … or distance_{right}"
+            yield f"lengths are {held} in columns of {said}", cure, robot, replace(data, **scaled)
     yield from chain.from_iterable(kind(robot, data) for kind in KINDS)
     angles = np.array([[row.alpha, row.theta] for row in robot.rows])
     if angles.any() and np.abs(angles).max() <= np.radians(2 * np.pi):
@@ -482,10 +461,7 @@ def _signs(robot: Robot, data: Measurements) -> Iterator[Case]:
 def _couplings(robot: Robot, data: Measurements) -> Iterator[Case]:
     n = len(robot.rows)
     if (robot.coupling != np.eye(n)).any():
-        cure, other = "change the signs of coupling off its diagonal", 2 * np.diag(np.diag(robot.coupling))
         yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
-        opposite = replace(robot, coupling=other - robot.coupling)
-        yield "the joints were coupled with the other sign", cure, opposite, data
     elif n >= 3:
         for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
             coupling = np.eye(n)
