@@ -17,7 +17,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
-from stcal.io.files import json_text, save
+from stcal.io.files import json_text, require_text_written, save
 from stcal.io.images import find_images
 from stcal.io.join import join_tables
 from stcal.io.json import ResultFile, require_result_written
@@ -48,7 +48,6 @@ from stcal.robot.use.compensation import (
     compensate,
     compensated_csv,
     compensated_summary,
-    require_compensated_written,
 )
 from stcal.robot.use.evaluation import evaluate
 from stcal.robot.use.report import compensation_report
@@ -240,7 +239,7 @@ def require_files_written(out: Path, result: FromPhotos) -> None:
     if result.axes is not None:
         require_robot_written(out / "axes.toml", result.axes.robot, result.axes.chain)
     if result.compensated is not None:
-        require_compensated_written(out / "compensated.csv", result.compensated, result.identified.robot)
+        require_text_written(out / "compensated.csv", compensated_csv(result.compensated, result.identified.robot))
 
 
 PHOTOGRAPHS = "the photographs"

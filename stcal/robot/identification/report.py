@@ -1,19 +1,16 @@
 """Text and page of an identified robot, and the table of mastering offsets for its controller."""
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from stcal.geometry.arrays import require_arguments
-from stcal.io.files import require_written
 from stcal.io.poses.columns import fixed
-from stcal.io.table import csv_text, read_table
-from stcal.report.document import Block, Document, Notes, Section, Table, fold, listed, page_only, plot, subheading
-from stcal.report.svg import COLOURS, Axes, Drawing, limits
+from stcal.io.table import csv_text
+from stcal.report.document import Block, Document, Notes, Section, Table, fold, listed, page_only, subheading
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import parameter_components
-from stcal.robot.identification.drawings import Drawn, residual_plots
+from stcal.robot.identification.drawings import Drawn, residual_plot
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.prior import DIMENSIONS, SHOWN, Placed, dh_values
 from stcal.robot.identification.result import ERRORS, OUTLIER_WEIGHT, Identified
@@ -64,11 +61,6 @@ def identified_report(result: Identified) -> Document:
             "Held out: rows that took no part in the fit that they judge. σ: of the tool's position, by the "
             "covariance of the parameters"
         ),
-        plot(
-            lambda: _figure(result),
-            "Errors by row",
-            "Error by observation; held out: mean over the divisions into folds",
-        ),
         Notes(result.notes),
     ]
     rows = [
@@ -85,7 +77,7 @@ def identified_report(result: Identified) -> Document:
         Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
     ]
     good = result.weights >= OUTLIER_WEIGHT
-    drawn = Drawn(result.state, result.robot.world_from_base, result.seen, result.residuals, good)
+    drawn = Drawn(result.state, result.seen, result.residuals, good)
     return Document(
         f"{result.nominal.name}: identified",
         f"robot {result.nominal.name}: {len(seen)} {seen.kind}s{' by their distances' if seen.frameless else ''} from "
@@ -96,7 +88,7 @@ def identified_report(result: Identified) -> Document:
             Section("What the data determine", determined, terminal=True),
             Section(
                 "What the model leaves",
-                [*left_lines(result.left), *residual_plots(drawn, result.left or ())],
+                [*left_lines(result.left), residual_plot(drawn, result.left or ())],
                 name="left",
             ),
             Section(
@@ -190,25 +182,6 @@ def _dh_tables(result: Identified) -> list[Table]:
     return tables
 
 
-def _figure(result: Identified) -> Drawing:
-    drawing = Drawing(9, 2.6)
-    rows = np.arange(1, len(result.seen) + 1)
-    size = 4 if len(rows) <= 200 else 1.5
-    held_out = None
-    if result.held_out is not None:
-        held_out = np.ma.masked_invalid(result.held_out.position_mm).mean(0).filled(np.nan)
-    highest = np.append(result.fitted_mm, [] if held_out is None else held_out)
-    axes = Axes(drawing, drawing.panels(top=24)[0], (0, len(rows) + 1), limits(highest, low=0))
-    axes.frame("observation", "error, mm")
-    axes.marks(rows, result.fitted_mm, "dot", size, COLOURS[0])
-    key = {"identified": ("dot", COLOURS[0])}
-    if held_out is not None:
-        axes.marks(rows, held_out, "dash", 2 * size, COLOURS[1])
-        key["held out"] = "dash", COLOURS[1]
-    drawing.key((axes.box[0], 10), key)
-    return drawing
-
-
 def _noise(result: Identified) -> str:
     weighting = result.weighting
     if weighting.given:
@@ -283,16 +256,3 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
         factor, unit = (1.0, "mm") if slides else (float(np.degrees(1.0)), "deg")
         row(i + 1, ZERO, 0.0, factor * change[i], factor * change_sigma[i], unit, bool(known[i]))
     return csv_text(rows)
-
-
-def require_offsets_written(path: str | Path, result: Identified, nominal: Robot) -> None:
-    """Read a written table of offsets again, and require the identified D-H values and offsets of zeros."""
-    values, change = dh_values(result.robot) * SHOWN, zeros(result, nominal)[0]
-    change = np.where(nominal.prismatic, change, np.degrees(change))
-    require_written(
-        path,
-        lambda: read_table(path, "offsets").numbers("identified").reshape(len(values), -1),
-        np.column_stack([values, change]),
-        10.0 ** -DIGITS["mm"],
-        "mm or deg",
-    )

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -11,11 +10,9 @@ from pydantic import BeforeValidator, Field
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
-from stcal.io.files import require_written
 from stcal.io.json import Part, ResultFile, Shape, Texts, Vector
-from stcal.io.table import csv_text, pose_values, read_table
+from stcal.io.table import csv_text
 from stcal.parallel import one_thread
-from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import (
     LIMIT,
     ORIENTATION,
@@ -412,21 +409,6 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
             row += cells(nominal, i, result.before_mm, result.before_rad, bool(nominal.usable[i]))
         rows.append(row)
     return csv_text(rows)
-
-
-def require_compensated_written(path: str | Path, result: Compensated, robot: Robot) -> None:
-    """Read a written table again, and require that ``robot`` reaches the commanded poses with errors as reported."""
-    usable = result.found.usable
-    targets = result.targets[np.flatnonzero(usable)]
-
-    def again() -> np.ndarray:
-        table, q = read_table(path, "joint values"), np.full(result.found.q.shape, np.nan)
-        for i, column in enumerate(joint_columns(robot)):
-            cells = np.array(table.text(column), object)[usable].astype(float)
-            q[usable, i] = cells if robot.prismatic[i] else np.radians(cells)
-        return pose_values(poses_of(robot, targets, q[usable]))
-
-    require_written(path, again, pose_values(poses_of(robot, targets, result.found.q[usable])), WRITTEN_MM, "mm")
 
 
 class Reached(Part):

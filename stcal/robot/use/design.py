@@ -6,7 +6,6 @@ inverse information matrix is updated by the few rows of a pose (Sherman, Morris
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,9 +14,8 @@ from pydantic import Field
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses
-from stcal.io.files import require_written
 from stcal.io.json import Finite, ResultFile
-from stcal.io.table import POSE, csv_text, pose_cells, pose_values, read_table, require_pose_table_written
+from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
     SEEN,
@@ -25,9 +23,7 @@ from stcal.robot.identification.observability import (
     identification_jacobian,
     parameter_scale,
 )
-from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import joint_values
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
 
@@ -344,13 +340,3 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):
         rows.append([i, *joint_cells(robot, q), *pose_cells(pose)])
     return csv_text(rows)
-
-
-def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, tool: str = "") -> None:
-    """Read a written table again, and require the same poses, and joint values that lead the robot to them."""
-    require_pose_table_written(path, {"nominal_": result.poses})
-
-    def again() -> np.ndarray:
-        return pose_values(forward(robot, joint_values(read_table(path, "poses"), robot), tool))
-
-    require_written(path, again, pose_values(result.poses), WRITTEN_MM, "mm")

@@ -9,17 +9,15 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.io.files import require_written
-from stcal.io.table import QUATERNION, csv_text, read_table
+from stcal.io.table import QUATERNION, csv_text
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
 from stcal.report.svg import COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import tips_of
-from stcal.robot.identification.drawings import Drawn, residual_plots
+from stcal.robot.identification.drawings import Drawn, residual_plot
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.report import left_lines, placed_table
 from stcal.robot.identification.result import Figures
-from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
@@ -325,18 +323,6 @@ def _places(head: str, xyz: np.ndarray) -> list[tuple[str, list[str]]]:
     return [(head.format(axis), _cells(values)) for axis, values in zip("xyz", xyz.T, strict=True)]
 
 
-def require_evaluated_written(path: str | Path, result: Evaluation) -> None:
-    """Read a written table of residuals again, and require the errors of each robot."""
-
-    def again() -> np.ndarray:
-        table = read_table(path, "residuals")
-        names = [column for column in table.columns if column.endswith("_error_mm")]
-        return np.array([[float(cell) for cell in table.text(name)] for name in names])[:, result.seen.first]
-
-    reported = np.array([np.linalg.norm(each.residuals[:, -3:], axis=1) for each in result.robots])
-    require_written(path, again, reported, WRITTEN_MM, "mm")
-
-
 def _cells(values) -> list[str]:
     return [f"{v:.6f}" for v in values]
 
@@ -367,7 +353,7 @@ def evaluation_report(result: Evaluation) -> Document:
         robots += [
             subheading(each.name),
             *(f"{each.name}: {line}" for line in (*left_lines(each.left), *_beyond(each))),
-            *residual_plots(Drawn(each.state, base, seen, found, each.good, colour), each.left or ()),
+            residual_plot(Drawn(each.state, seen, found, each.good, colour), each.left or ()),
             page_only("Base in the instrument's frame, tools in the flange's; without σ: as the file has them"),
             page_only(placed_table(each.placed)),
         ]
