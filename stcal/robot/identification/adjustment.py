@@ -66,6 +66,11 @@ class Observed:
         return len(self.first)
 
     @property
+    def lines(self) -> list[int]:
+        """Lines (r,) of the file."""
+        return [int(self.data.lines[row]) for row in self.first]
+
+    @property
     def used(self) -> Kind:
         """Kind of observation for which the measurements are used."""
         return "distance" if self.frameless else self.kind

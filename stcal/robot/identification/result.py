@@ -297,7 +297,7 @@ class Identified(Brief):
     @property
     def lines(self) -> list[int]:
         """Lines (r,) of the file."""
-        return [int(self.seen.data.lines[row]) for row in self.seen.first]
+        return self.seen.lines
 
     @property
     def errors(self) -> dict[str, Figures]:

@@ -40,16 +40,11 @@ TURNS = {1: "once a turn", 2: "twice a turn"}
 class Finding:
     """An effect found in the residuals.
 
-    Parameters
-    ----------
-    what : name of the effect: "the angle of joint 3, once a turn"
-    effect_mm, effect_rad : amplitude in the residuals of position and of orientation (0 if there are none) if the
-        effect is periodic, else RMS
-    joint, turns : number of the joint, and number of periods in one turn of it; 0 where there is none
-    share : share of the squared residuals (weighted as in the fit) that the effect explains
-    p : probability of such an effect by chance, times the number of tests
-    line : line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size
-    advice : what to do about it; empty for effects of the robot
+    ``what`` : its name ("the angle of joint 3, once a turn"); ``joint``, ``turns`` : number of the joint, and of
+    periods in one turn of it, 0 where there is none; ``effect_mm``, ``effect_rad`` : amplitude in the residuals if it
+    is periodic, size of a jump, else RMS; ``share`` : of the squared residuals (weighted as in the fit) that it explains;
+    ``p`` : probability of such an effect by chance, times the number of tests; ``line`` : of the first row after a jump
+    along the order of the rows; ``advice`` : what to do about it, empty for effects of the robot.
     """
 
     what: str
@@ -306,7 +301,7 @@ def _moved_meanwhile(
     mm, rad = _size(moved, change)
     if log_p > np.log(LEVEL) or change.share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
         return None
-    lines = [int(measured.data.lines[row]) for row in measured.first]
+    lines = measured.lines
     if change.kind == "drift":
         what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
     else:

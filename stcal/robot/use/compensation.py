@@ -163,18 +163,12 @@ class Compensated(Brief):
     @property
     def joints(self) -> list[dict[str, float] | None]:
         """Joint values to command, by the names of columns; None where they do not reach the pose."""
-        return self.by_column(self.found)
+        return _by_column(self.found, self.identified)
 
     @property
     def nominal_joints(self) -> list[dict[str, float] | None] | None:
         """The same by the nominal robot."""
-        return None if self.nominal is None else self.by_column(self.nominal)
-
-    def by_column(self, inverse: Inverse) -> list[dict[str, float] | None]:
-        """Returns joint values by the names of columns; None where they do not reach the pose."""
-        columns, unit = joint_columns(self.identified), np.where(self.identified.prismatic, 1.0, np.degrees(1.0))
-        rows = zip((inverse.q * unit).tolist(), inverse.usable, strict=True)
-        return [dict(zip(columns, q, strict=True)) if usable else None for q, usable in rows]
+        return None if self.nominal is None else _by_column(self.nominal, self.identified)
 
     def compared(self) -> np.ndarray:
         """Mask (m,) of the rows that both robots reach."""
@@ -182,33 +176,23 @@ class Compensated(Brief):
 
     def notes(self) -> list[str]:
         """Returns doubts about targets and robots, then notes on rows not simply reached or far from nominal values."""
-        return [*self.doubts, *self._not_simply_reached(), *self._far_moved()]
-
-    def _far_moved(self) -> list[str]:
-        if self.nominal is None:
-            return []
-        moved = np.abs(self.found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
-        expected = self.before_rad + self.before_mm / self.reach_mm
-        return [
-            f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: "
-            + (
-                "near a singular pose"
-                if moved[i] > AMPLIFIED * expected[i]
-                else f"the nominal joint values err by {self.before_mm[i]:.4g} mm and "
-                f"{np.degrees(self.before_rad[i]):.3g}°"
-            )
-            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist()
-        ]
-
-    def _not_simply_reached(self) -> list[str]:
-        return [
+        found, lines, far = self.found, self.targets.lines, []
+        left = zip(lines, found.status, found.error_mm, found.error_rad, strict=True)
+        hardly = [
             f"line {line}: {MEANING[status]}{f' ({self.beyond[i]})' if i in self.beyond else ''}; {mm:.4g} mm and "
             f"{np.degrees(rad):.4g}° remain"
-            for i, (line, status, mm, rad) in enumerate(
-                zip(self.targets.lines, self.found.status, self.found.error_mm, self.found.error_rad, strict=True)
-            )
+            for i, (line, status, mm, rad) in enumerate(left)
             if status in MEANING
         ]
+        if self.nominal is not None:
+            moved = np.abs(found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
+            expected = self.before_rad + self.before_mm / self.reach_mm
+            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist():
+                mm, rad = self.before_mm[i], self.before_rad[i]
+                errs = f"the nominal joint values err by {mm:.4g} mm and {np.degrees(rad):.3g}°"
+                why = "near a singular pose" if moved[i] > AMPLIFIED * expected[i] else errs
+                far.append(f"line {lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: {why}")
+        return [*self.doubts, *hardly, *far]
 
 
 def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple[Robot, Robot, tuple[str, ...]]:
@@ -223,24 +207,18 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
         if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
             apart[name] = f"differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between the two files"
     with_own = replace(nominal, tools=dict(nominal.tools) | {name: identified.tools[name] for name in apart})
-    proved = (
+    taken = "identified file is taken in both"
+    if (
         apart.keys() <= nominal.tools.keys()
         and targets.poses is not None
         and targets.q is not None
         and position_misfit_mm(nominal, targets) < position_misfit_mm(with_own, targets)
-    )
-    taken = "nominal file is taken in both (joint values beside the poses say so)" if proved else None
-    notes = tuple(
-        f"tool {name or 'of the robot files'} {said}: that of the {taken or 'identified file is taken in both'}"
-        for name, said in apart.items()
-    )
-    if proved:
-        return (
-            replace(identified, tools=dict(identified.tools) | {name: nominal.tools[name] for name in apart}),
-            nominal,
-            notes,
-        )
-    return identified, with_own, notes
+    ):
+        taken = "nominal file is taken in both (joint values beside the poses say so)"
+        own = {name: nominal.tools[name] for name in apart}
+        identified, with_own = replace(identified, tools=dict(identified.tools) | own), nominal
+    notes = (f"tool {name or 'of the robot files'} {said}: that of the {taken}" for name, said in apart.items())
+    return identified, with_own, tuple(notes)
 
 
 @require_arguments
@@ -288,7 +266,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
             f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
             "give its file with --nominal",
         )
-    doubts, others, rigid = (), (), _rigid(identified, targets)
+    doubts, others = (), ()
+    rigid = targets.conditions.ignored(f"robot {identified.name}") if identified.elasticity is None else ()
     if nominal is not None:
         apart = robots_apart(identified, nominal)
         doubts = ((apart,) if apart else ()) + _roles(identified, nominal) + _in_radians(targets, identified.prismatic)
@@ -359,14 +338,15 @@ def _built(robot: Robot) -> list[tuple[str, int]]:
     return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
 
 
-def _rigid(robot: Robot, targets: Targets) -> tuple[str, ...]:
-    """Returns a note if the robot's model has no elasticity, although loads are stated."""
-    return targets.conditions.ignored(f"robot {robot.name}") if robot.elasticity is None else ()
-
-
 def joint_columns(robot: Robot) -> list[str]:
     """Returns the column names ``q1_deg`` …, and ``q3_mm`` for prismatic joints."""
     return [f"q{i}_{'mm' if sliding else 'deg'}" for i, sliding in enumerate(robot.prismatic, 1)]
+
+
+def _by_column(found: Inverse, robot: Robot) -> list[dict[str, float] | None]:
+    columns, unit = joint_columns(robot), np.where(robot.prismatic, 1.0, np.degrees(1.0))
+    rows = zip((found.q * unit).tolist(), found.usable, strict=True)
+    return [dict(zip(columns, q, strict=True)) if usable else None for q, usable in rows]
 
 
 def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
@@ -443,14 +423,12 @@ class CompensationFile(ResultFile):
 
 def compensated_summary(result: Compensated) -> list[str]:
     """Returns sentences on all poses together."""
-    m = len(result)
-    good = int(result.found.usable.sum())
-    lines = [f"{good} of {m} poses reached by the identified robot"]
+    lines = [f"{int(result.found.usable.sum())} of {len(result)} poses reached by the identified robot"]
     both = result.compared()
     if both.any():
         before, after = result.before_mm[both], max(result.found.error_mm[both].max(), LEAST_SHOWN_MM)
         lines.append(
-            f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
+            f"position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
             f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less. The real robot errs by more: by "
             "about the error of rows held out that identify stated"
         )

@@ -64,16 +64,10 @@ class DesignFile(ResultFile):
 class PoseDesign(Brief):
     """The chosen poses, compared with random sets of poses.
 
-    Parameters
-    ----------
-    q : (count, n) joint vectors, in order of choice: the first ones alone are a good set too
-    poses : base_from_tool there
-    parameters, seen : parameters, and how many of them (in combination) the candidates show; the indices are of these
-    chosen : ObservabilityIndices
-    random : of random sets of the same size
-    sigma_mm, random_sigma_mm : σ of the position that the identified robot will predict, RMS per axis over random
-        poses; of the chosen set, and median of the random ones
-    exchanges : int
+    ``q`` : (count, n) joint vectors, in order of choice: the first ones alone are a good set too; ``poses`` :
+    base_from_tool there; ``parameters``, ``seen`` : parameters, and how many of them (in combination) the candidates
+    show, of which the indices are; ``random`` : of random sets of the same size; ``sigma_mm`` : σ of the position that
+    the identified robot will predict, RMS per axis over random poses; ``random_sigma_mm`` : median of the random sets.
     """
 
     format: ClassVar = "stcal pose design 1"

@@ -64,18 +64,12 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """Errors of one robot at the r observations.
+    """Errors of one robot at the r observations, with base and tools as fitted.
 
-    Parameters
-    ----------
-    robot : with base and tools as fitted
-    state : its chain and tools
-    residuals : (r, 3) measured minus modelled position in the base's axes, or (r, 1) distance; mm
-    good : (r,) rows that some robot explains
-    rotation_rad : (r,) errors of orientations; empty if none were measured
-    placed : base and tools
-    left : effects found in the residuals; None if there are too few rows for a test
-    beyond : the same for the residuals after a fit of all kinematic parameters to these rows
+    ``residuals`` : (r, 3) measured minus modelled position in the base's axes, or (r, 1) distance; mm; ``good`` : (r,)
+    rows that some robot explains; ``rotation_rad`` : (r,) errors of orientations, empty if none were measured;
+    ``left`` : effects found in the residuals, None if there are too few rows for a test; ``beyond`` : the same after a
+    fit of all kinematic parameters to these rows.
     """
 
     robot: Robot
@@ -115,15 +109,11 @@ class Evaluated:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Robots on one set of measurements.
+    """Robots, in the order given, on one set of r observations: positions or distances.
 
-    Parameters
-    ----------
-    refit : what was fitted of each robot: base, tool, both or nothing
-    seen : the r observations: positions or distances
-    robots : in the order given
-    wrong : (r,) rows that no robot explains: they are wrong, or all models lack an effect; nothing was fitted to them
-    differences : the robot of least mean error against each other one, in order of their means
+    ``refit`` : what was fitted of each robot; ``wrong`` : (r,) rows that no robot explains: they are wrong, or all
+    models lack an effect; nothing was fitted to them; ``differences`` : the robot of least mean error against each
+    other one, in order of their means.
     """
 
     format: ClassVar = "stcal evaluation 1"
@@ -146,7 +136,7 @@ class Evaluation:
     @property
     def lines(self) -> list[int]:
         """Lines (r,) of the file."""
-        return [int(self.seen.data.lines[row]) for row in self.seen.first]
+        return self.seen.lines
 
     @property
     def wrong_lines(self) -> list[int]:

@@ -4,6 +4,7 @@ This is the test of the stereo-target paper. Distances from the first position n
 instrument. They all carry the error of the first position; the distances of all pairs depend less on any one position.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -238,22 +239,17 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
         names = tuple(table.text("pose"))
         seen: dict[tuple[str, str], int] = {}
         for line, key in zip(table.lines, zip(sets, names, strict=True), strict=True):
-            if key in seen:
+            if seen.setdefault(key, line) != line:
                 raise InputError(
                     "E-TABLE-ROW-REPEATED",
                     f"{table.where}: line {line}: pose {key[1]} of set {key[0]} stands on line {seen[key]} already; "
                     "give the sets different names",
                 )
-            seen[key] = line
         return names
-    places: dict[tuple, int] = {}
-    numbers: list[int] = []
-    times: dict[tuple, int] = {}
+    places, numbers, times = {}, [], Counter()
     for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
-        place = tuple(xyz)
-        times[name, place] = times.get((name, place), 0) + 1
-        key = (place, times[name, place])
-        numbers.append(places.setdefault(key, len(places) + 1))
+        times[name, *xyz] += 1
+        numbers.append(places.setdefault((*xyz, times[name, *xyz]), len(places) + 1))
     return tuple(map(str, numbers))
 
 
@@ -345,19 +341,16 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
 def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str]) -> SetResult:
     commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
-    size = np.abs(error)
-    squares = pairs = product = commanded_squares = 0.0
-    for i in range(1, len(measured)):  # row by row: all pairs of thousands at once are gigabytes
-        measured_distance = np.linalg.norm(measured[:i] - measured[i], axis=1)
-        commanded_distance = np.linalg.norm(commanded[:i] - commanded[i], axis=1)
-        squares += float(((measured_distance - commanded_distance) ** 2).sum())
-        product += float(measured_distance @ commanded_distance)
-        commanded_squares += float(commanded_distance @ commanded_distance)
-        pairs += i
+    sums = np.zeros(4)  # row by row: all pairs of thousands at once are gigabytes
+    for i in range(1, len(measured)):
+        seen, wanted = (np.linalg.norm(xyz[:i] - xyz[i], axis=1) for xyz in (measured, commanded))
+        sums += ((seen - wanted) ** 2).sum(), seen @ wanted, wanted @ wanted, i
+    squares, product, commanded_squares, pairs = sums.tolist()
     if commanded_squares == 0:
         raise InputError(
             "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
         )
+    size = np.abs(error)
     return SetResult(
         name=name,
         error_mm=error,
