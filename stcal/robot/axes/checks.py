@@ -7,7 +7,6 @@ from itertools import chain, combinations, pairwise
 import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, AxisFit, refit_axis, unwound_by
 from stcal.robot.axes.sweeps import called
@@ -327,10 +326,6 @@ class LeaveOneOut:
     lines: tuple[int, ...]
     distance: np.ndarray
     normal: np.ndarray
-
-    def __post_init__(self):  # nan is a value here
-        for name in ("distance", "normal"):
-            object.__setattr__(self, name, frozen(getattr(self, name), what=name, finite=False))
 
     def spread(self, name: str) -> np.ndarray:
         """Returns the largest minus the smallest ``distance`` or ``normal``, (n − 1,); nan where there is none."""

@@ -394,6 +394,10 @@ class Solution:
         return np.linalg.inv(scaled) * self.units[:, None] * self.units
 
 
+Away = tuple[State, np.ndarray]
+"""A state, and the sum of the steps (k,) that led to it."""
+
+
 def solve(
     state: State, measured: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
 ) -> Solution:
@@ -415,35 +419,37 @@ def solve(
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
 
-    def linearise(at: _Away, bends: bool) -> NormalEquations:
-        fit, gradient = _linearised(at.state, measured, weighting, limit)
-        straight = NormalEquations(fit.cost, fit.normal, gradient) + kept(at.away)
+    def linearise(at: Away, bends: bool) -> NormalEquations:
+        fit, gradient = _linearised(at[0], measured, weighting, limit)
+        straight = NormalEquations(fit.cost, fit.normal, gradient) + kept(at[1])
         curved = curvature_of(fit, measured, weighting) if bends else None
         if curved is None:
             return straight
         return replace(straight, normal=straight.normal - Bent.of(straight.normal, curved).taken())
 
-    def descended(begin: _Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[_Away, NormalEquations]:
+    def cost(at: Away) -> float:
+        white = weighting.whiten(residuals(at[0], measured), measured)
+        return float(huber_cost(np.linalg.norm(white, axis=1), limit).sum() + kept(at[1]).cost)
+
+    def descended(begin: Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[Away, NormalEquations]:
         return minimise(
             begin,
             partial(linearise, bends=bends),
-            lambda at, step: _Away(moved(at.state, step, measured.kind), at.away + step),
-            cost=lambda at: (
-                _cost(residuals(at.state, measured), measured, weighting, limit) + float(kept(at.away).cost)
-            ),
+            lambda at, step: (moved(at[0], step, measured.kind), at[1] + step),
+            cost=cost,
             settled=SETTLED,
             least_gain=least_gain,
             max_steps=max_steps,
         )
 
-    begin = _Away(state, np.zeros(len(hold)))
+    begin = state, np.zeros(len(hold))
     if state.elastic:
         near = descended(begin, False, NEAR, NEAR_STEPS).state
         fit, accepted = descended(near, True, LEAST_ELASTIC, MAX_STEPS), ACCEPTED_ELASTIC
     else:
         fit, accepted = descended(begin, False, LEAST_GAIN, MAX_STEPS), ACCEPTED
     fit.required(f"{measured.data.where}: identification", "check the robot file and the outliers", accepted)
-    solution = _linearised(fit.state.state, measured, weighting, limit)[0]
+    solution = _linearised(fit.state[0], measured, weighting, limit)[0]
     return replace(solution, prior=prior, conditions=conditions, count=count)
 
 
@@ -491,14 +497,6 @@ class Bent:
         return solve_triangular(self.root, wider @ self.root.T, lower=True, trans=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Away:
-    """A state, and the sum of the steps (k,) that led to it."""
-
-    state: State
-    away: np.ndarray
-
-
 def unseen(kind: Kind) -> int:
     """Returns the number of directions that this kind of observation never shows: those of the instrument's place."""
     return 6 if kind == "distance" else 0
@@ -543,7 +541,3 @@ def parameter_units(derivative: np.ndarray) -> np.ndarray:
     turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
     moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
-
-
-def _cost(found: np.ndarray, measured: Observed, weighting: Weighting, limit: float) -> float:
-    return float(huber_cost(np.linalg.norm(weighting.whiten(found, measured), axis=1), limit).sum())

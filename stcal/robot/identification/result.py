@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import AliasPath, BeforeValidator, Field
 from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields
-from stcal.geometry.rigid import Rigid
 from stcal.io.files import require_written
-from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector, Vector3
+from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
 from stcal.robot.identification.adjustment import (
     Kind,
     Observed,
@@ -290,16 +289,6 @@ class Identified(Brief):
         return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
     @property
-    def observed(self) -> Kind:
-        """Kind of observation that was used."""
-        return self.seen.used
-
-    @property
-    def lines(self) -> list[int]:
-        """Lines (r,) of the file."""
-        return self.seen.lines
-
-    @property
     def errors(self) -> dict[str, Figures]:
         """Position errors, and their predicted σ, mm, by the keys of :data:`ERRORS`."""
         held_out, every, predicted = self.held_out, self.all_held_out, self.predicted
@@ -314,11 +303,6 @@ class Identified(Brief):
         return {key: Figures.of(values) for key, values in found.items() if values is not None}
 
     @property
-    def stations(self) -> dict[str, Rigid]:
-        """Transforms first_from_station by name."""
-        return {name: pose.inverse() for name, pose in self.state.stations.items()}
-
-    @property
     def rows(self) -> np.ndarray:
         """Rows (n, 5) a, alpha, d, theta, beta; mm, rad."""
         return dh_values(self.robot)
@@ -327,11 +311,6 @@ class Identified(Brief):
     def nominal_rows(self) -> np.ndarray:
         """The same of the nominal robot."""
         return dh_values(self.nominal)
-
-    @property
-    def elasticity(self) -> Elasticity | None:
-        """Elasticity of the robot if it was adjusted."""
-        return None if self.elasticity_sigma is None else self.robot.elasticity
 
 
 ERRORS = {
@@ -345,7 +324,6 @@ ERRORS = {
 
 
 class ElasticityValues(Part):
-    gravity: Vector3
     compliance: Matrix
     moment: Matrix
     periodic: Matrix
@@ -363,27 +341,21 @@ class IdentifiedFile(ResultFile):
 
     format: Literal["stcal identified 1"] = Field(description="the file's form and its version")
     robot: RobotText = Field(description="text of the robot file")
-    observed: str = Field(description="kind of observation used")
+    observed: str = Field(validation_alias=AliasPath("seen", "used"), description="kind of observation used")
     rank: int = Field(description="parameters determined by the data used")
     ranks: dict[str, int] = Field(description="`rank` by kind of observation at the same joint values")
     undetermined: list[str] = Field(
         description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
     )
     notes: list[str] = Field(description="rows left out, columns not read, and remarks on the result")
-    stations: dict[ByName, Pose] = Field(
-        description="first_from_station, mm: column `station`; the base is in the frame of the first, that of most rows"
-    )
     model: Literal["rigid", "elastic"] = Field(description="that was identified")
     gain: Gain | None = Field(
         description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
         "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
     )
-    elasticity: ElasticityValues | None = Field(
-        description="of the elastic model: `gravity` in the base, and a row for each joint of `compliance` about its "
-        "axis and across it (rad/Nm), `moment` (Nm), `periodic` and `hysteresis` (rad), as in the robot file"
-    )
     elasticity_sigma: ElasticityValues | None = Field(
-        description="σ of `compliance`, `moment`, `periodic`, `hysteresis`; `gravity` is given"
+        description="σ of the elasticity in the robot file, a row for each joint: `compliance` (rad/Nm) about its axis "
+        "and across it, `moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
     )
     weighting: Weighting = Field(
         description="σ of one coordinate, `sigma_mm`, and of one component of a rotation, `sigma_rad`, or `given` by "
@@ -405,7 +377,6 @@ class IdentifiedFile(ResultFile):
         "whole length; 1/mm, `o2` without unit; 1/`o3` is the σ in mm of the combination that is seen worst"
     )
     rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
-    nominal_rows: Matrix = Field(description="the same of the robot given")
     dh_sigma: Matrix = Field(description="their σ; 0: not adjusted")
     placed: list[PlacedPose] = Field(
         description="base in the instrument's frame, tools in the flange's: `name`, `pose` (mm), `sigma` of rotation "
@@ -415,7 +386,7 @@ class IdentifiedFile(ResultFile):
         description="of parameters, small motions of each joint's frame (`J2 rx`: rad, `J2 x`: mm) and of the tools"
     )
     covariance: Matrix = Field(description="of these; of distances singular: 0 along what they never show")
-    lines: list[int] = Field(description="of the observations in the file")
+    lines: list[int] = Field(validation_alias=AliasPath("seen", "lines"), description="of the observations in the file")
     fitted_mm: Vector = Field(description="their errors")
     weights: Vector = Field(description="their weights; below a half: outliers")
     left: list[Finding] | None = Field(

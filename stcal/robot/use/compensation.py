@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import AliasPath, BeforeValidator, Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
-from stcal.io.json import Part, ResultFile, Shape, Texts, Vector
+from stcal.io.json import Part, ResultFile, Shape, Vector
 from stcal.io.table import csv_text
 from stcal.parallel import one_thread
 from stcal.robot.kinematics.inverse import (
@@ -151,9 +151,9 @@ class Compensated(Brief):
         return len(self.found)
 
     @property
-    def robot(self) -> str:
-        """Name of the robot."""
-        return self.identified.name
+    def remarks(self) -> list[str]:
+        """Notes of the file of targets, and :meth:`notes`."""
+        return [*self.targets.notes, *self.notes()]
 
     @property
     def lines(self) -> list[int]:
@@ -401,7 +401,7 @@ class CompensationFile(ResultFile):
     """Result file of ``compensate``."""
 
     format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
-    robot: str = Field(description="name")
+    robot: str = Field(validation_alias=AliasPath("identified", "name"), description="name")
     lines: list[int] = Field(description="of the poses in the file")
     poses: Annotated[
         np.ndarray,
@@ -418,7 +418,11 @@ class CompensationFile(ResultFile):
         description="error of the nominal joint values by the identified robot, where `nominal.status` is reached"
     )
     before_rad: Vector = Field(description="the same of the orientation")
-    notes: Texts = Field(description="doubts of targets and robots, and rows that are not simply reached")
+    notes: list[str] = Field(
+        validation_alias="remarks",
+        description="columns that were not read, angles by their convention; doubts of targets and robots, and rows "
+        "that are not simply reached",
+    )
 
 
 def compensated_summary(result: Compensated) -> list[str]:

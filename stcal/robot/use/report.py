@@ -101,7 +101,7 @@ def compensation_report(result: Compensated) -> Document:
         f"{len(result)} poses: {counts}",
         [
             Section("Result", compensated_summary(result), terminal=True),
-            Section("To know", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
+            Section("To know", [bullets(result.remarks[:MOST_NOTES])]),
             Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
         ],
     )
