@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
@@ -100,16 +100,9 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 def parameter_names(state: State, kind: Kind) -> list[str]:
     """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools, and
     ``station B rx`` … of stations but the first; r in rad, the others in mm."""
-    owners = [f"J{i + 1}" for i, _ in chain_parameters(state.chain)]
-    owners += [f"tool {name}".rstrip() for name in state.tools for _ in range(tool_width(kind))]
-    owners += [f"station {name}" for name in list(state.stations)[1:] for _ in TWIST]
-    return [f"{owner} {TWIST[c]}" for owner, c in zip(owners, parameter_components(state, kind), strict=True)]
-
-
-def parameter_components(state: State, kind: Kind) -> list[int]:
-    """Returns the component of each parameter without elasticity: 0 to 2 of a rotation, 3 to 5 of a translation."""
-    tool = list(range(6 - tool_width(kind), 6)) * len(state.tools)
-    return [c for _, c in chain_parameters(state.chain)] + tool + [*range(6)] * (len(state.stations) - 1)
+    names = [f"J{i + 1} {TWIST[c]}" for i, c in chain_parameters(state.chain)]
+    names += [f"{f'tool {name}'.rstrip()} {c}" for name in state.tools for c in TWIST[-tool_width(kind) :]]
+    return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in TWIST]
 
 
 def tips(state: State, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
@@ -495,6 +488,17 @@ class Bent:
         """Returns B (k, k): Bᵀ N B is what is left of the normal matrix N."""
         wider = (self.directions * np.sqrt(1 - self.share)) @ self.directions.T
         return solve_triangular(self.root, wider @ self.root.T, lower=True, trans=1)
+
+
+def require_enough(measured: Observed, seeks: int, what: str, advice: str) -> None:
+    """Refuses observations that give no more numbers than ``seeks`` parameters."""
+    numbers, width = WIDTH[measured.kind] * len(measured), WIDTH[measured.kind]
+    if numbers <= seeks:
+        raise DegenerateError(
+            "E-IDENTIFY-FEW",
+            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} {what}; "
+            f"{seeks // width + 1} or more needed, {advice}",
+        )
 
 
 def unseen(kind: Kind) -> int:

@@ -76,13 +76,6 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
     return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
 
 
-def carries(chain: Chain, conditions: Conditions) -> bool:
-    """Returns True if any row carried a mass, or, where the rows do not say, if the chain has a payload."""
-    if conditions.payload_kg is None:
-        return chain.elasticity is not None and chain.elasticity.payload_kg > 0
-    return conditions.loaded
-
-
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
     """Returns the state with elasticity to be adjusted, from the robot file or nearly rigid with gravity down. The
     payload is the mass that all rows carried, if it was one; hysteresis is included if rows have approach

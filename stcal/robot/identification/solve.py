@@ -28,6 +28,7 @@ from stcal.robot.identification.adjustment import (
     only_of,
     parameter_names,
     parameter_units,
+    require_enough,
     residuals,
     solve,
     tips_of,
@@ -42,7 +43,7 @@ from stcal.robot.identification.observability import (
     predicted,
     widened,
 )
-from stcal.robot.identification.prior import Deviations, NominalRows, bending, carries, placed
+from stcal.robot.identification.prior import Deviations, NominalRows, bending, placed
 from stcal.robot.identification.result import (
     LEAST_FOLDS,
     Adjustment,
@@ -147,7 +148,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     computed = options.observe is None and _turns_as_computed(first, data)
     observations = observed(data, "position" if computed else options.observe)
     rows = NominalRows.about(first, parameter_units(jacobian(first, observations)), robot, options.adjust)
-    _enough(observations, first, rows)
+    seeks = len(parameter_names(first, observations.kind)) - unseen(observations.kind) - int(rows.fixed.sum())
+    require_enough(observations, seeks, "parameters", "better twice that")
     adjusted, held_out, gain = _modelled(robot, first, observations, options, rows)
     solution, state = adjusted.solution, adjusted.solution.state
     names = parameter_names(state, observations.kind)
@@ -216,7 +218,10 @@ def _modelled(
     _undetermined(rigid.solution, parameter_names(first, measured.kind), measured, options.partial)
     conditions = measured.data.conditions
     state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad, conditions)
-    carried, units = carries(state.chain, conditions), parameter_units(jacobian(state, measured))
+    elasticity, units = state.chain.elasticity, parameter_units(jacobian(state, measured))
+    carried = conditions.loaded  # if no row states a load, by the payload of the chain
+    if conditions.payload_kg is None:
+        carried = elasticity is not None and elasticity.payload_kg > 0
     rows = NominalRows.about(state, units, robot, options.adjust, carried)
     good = rigid.solution.weights >= GROSS
     good |= good.mean() < MOSTLY_GOOD
@@ -254,18 +259,6 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
                 f"{data.where}: joint {i} never moved, so that its axis is not determined; measure with other values "
                 f"of q{i}, or keep its nominal values with --partial",
             )
-
-
-def _enough(measured: Observed, state: State, rows: NominalRows) -> None:
-    seeks = len(parameter_names(state, measured.kind)) - unseen(measured.kind) - int(rows.fixed.sum())
-    numbers = WIDTH[measured.kind] * len(measured)
-    if numbers <= seeks:
-        needed = seeks // WIDTH[measured.kind] + 1
-        raise DegenerateError(
-            "E-IDENTIFY-FEW",
-            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} parameters; "
-            f"{needed} or more needed, better twice that",
-        )
 
 
 def _weighting(state: State, measured: Observed, options: IdentifyOptions) -> Weighting:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 from scipy.stats import t as t_distribution
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
@@ -23,6 +23,7 @@ from stcal.robot.identification.adjustment import (
     observed,
     only_of,
     parameter_names,
+    require_enough,
     residuals,
     tips_of,
 )
@@ -219,7 +220,8 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
                 f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {len(robot.rows)} joints",
             )
     seen = observed(data, None if data.positions is None else "position")
-    _enough(seen, fit)
+    what = f"parameters of {' and '.join(sorted(fit))}"
+    require_enough(seen, _parameters(seen, fit), what, "or fit less (--refit)")
     states, wrong = _fitted(list(named.values()), data, seen, fit)
     found = tuple(
         _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
@@ -230,16 +232,6 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 def _parameters(measured: Observed, fit: Fit) -> int:
     base = 6 if "base" in fit and measured.kind != "distance" else 0
     return base + (3 * len(set(measured.data.targets)) if "tool" in fit else 0)
-
-
-def _enough(measured: Observed, fit: Fit) -> None:
-    numbers, seeks = WIDTH[measured.kind] * len(measured), _parameters(measured, fit)
-    if numbers <= seeks:
-        raise DegenerateError(
-            "E-IDENTIFY-FEW",
-            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} parameters of "
-            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[measured.kind] + 1} or more needed, or fit less (--refit)",
-        )
 
 
 def _fitted(robots: list[Robot], data: Measurements, measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:

@@ -14,9 +14,8 @@ from stcal.report.document import Block, Document, Section, Table, alarms, bulle
 from stcal.report.svg import COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import tips_of
-from stcal.robot.identification.drawings import Drawn, residual_plot
 from stcal.robot.identification.observability import MEANING
-from stcal.robot.identification.report import left_lines, placed_table
+from stcal.robot.identification.report import Drawn, left_lines, placed_table, residual_plot
 from stcal.robot.identification.result import Figures
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot

@@ -18,7 +18,7 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips,
 )
-from stcal.robot.identification.drawings import Drawn, joints_figure
+from stcal.robot.identification.report import Drawn, joints_figure
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.dh import robot_from_chain
