@@ -147,10 +147,10 @@ def test_photographs_to_a_compensated_arm_and_tags_to_its_base(cell):
         "--json {0}/verified.json"
     )
     before, after = json.loads((root / "verified.json").read_text())["sets"]
-    assert (before["set"], after["set"]) == ("before", "after")
+    assert (before["name"], after["name"]) == ("before", "after")
     # The arm is off by part of what it was built off; then by the measurement: σ of up to 20 µm in depth, twice.
-    assert before["all_pairs_rms_mm"] > BUILT_MM / 4
-    assert after["all_pairs_rms_mm"] < 0.03
+    assert before["pairs_rms_mm"] > BUILT_MM / 4
+    assert after["pairs_rms_mm"] < 0.03
 
     flange = forward(replace(identified, tools={"": Rigid()}), np.radians(_joints(root / "joints.csv")))
     robot = [

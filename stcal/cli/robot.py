@@ -11,7 +11,10 @@ from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import DegenerateError, InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from stcal.robot.kinematics.measurements import Measurements
+    from stcal.robot.kinematics.model import Chain, Robot
 
 
 XML = (".urdf", ".xml")
@@ -39,60 +42,76 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
-    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
+    from stcal.robot.kinematics.file import load_robot
     from stcal.robot.universal import read_universal
     from stcal.robot.urdf import coupled, load_urdf, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
+    to_xml = out.suffix.lower() in XML
     made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
+    if (from_link or to_link) and (made is not None or not _is_xml(source)):
+        raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
     if made is not None:
-        if from_link or to_link:
-            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
-        robot = made.robot
+        robot, comment = made.robot, f"From {source.name}, calibration of Universal Robots."
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
         print_each(f"note: {source}", made.notes)
-        if out.suffix.lower() in XML:
-            write(out, robot_urdf(robot))
-            require_urdf_written(out, robot)
-        else:
-            write(out, robot_toml(robot, [f"From {source.name}, calibration of Universal Robots."]))
-            require_robot_written(out, robot)
-        return
-    if _is_xml(source) == (out.suffix.lower() in XML):
+    elif _is_xml(source) == to_xml:
         raise InputError(
             "E-OPTION-FILES",
-            f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed",
+            f"{source}, {out}: both are {'URDF' if to_xml else 'robot files'}; one of each needed",
         )
-    if _is_xml(source):
+    elif not to_xml:
         urdf = load_urdf(source, from_link, to_link or "", convention)
-        joints = ", ".join(urdf.joints)
-        say(f"robot {urdf.robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
+        robot, joints = urdf.robot, ", ".join(urdf.joints)
+        comment = f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."
+        say(f"robot {robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
         print_each(f"note: {source}", urdf.notes)
-        tool = urdf.robot.tools.get("")
+        tool = robot.tools.get("")
         if tool is not None and max(*map(abs, tool.translation.tolist()), tool.angle_rad()) > 1e-6:
             at = ", ".join(f"{value:.4g}" for value in tool.translation)
             say(
                 f"note: {urdf.to_link} is not the frame of the last row but [tool] of the robot file: {at} mm from it, "
                 f"turned by {math.degrees(tool.angle_rad()):.4g}°"
             )
-        write(out, robot_toml(urdf.robot, [f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."]))
-        require_robot_written(out, urdf.robot)
-        return
-    if from_link or to_link or convention != "standard":
-        raise InputError(
-            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only for reading a URDF; leave them out"
+    else:
+        if convention != "standard":
+            raise InputError("E-OPTION-NEEDS", "--convention: only for reading a URDF; leave it out")
+        robot, comment = load_robot(source), ""
+        ends = (
+            f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
         )
-    robot = load_robot(source)
-    text = robot_urdf(robot)
-    ends = f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
-    say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
-    if coupled(robot):
-        say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
-    write(out, text)
-    require_urdf_written(out, robot)
+        say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
+        if coupled(robot):
+            say(
+                "note: URDF has no coupling; its joint values are the coupling times the controller's, with wider "
+                "limits"
+            )
+    if to_xml:
+        write(out, robot_urdf(robot))
+        require_urdf_written(out, robot)
+    else:
+        _write_robot(out, robot, comment)
+
+
+def _write_robot(path: Path | None, robot: "Robot", *comments: str, chain: "Chain | None" = None) -> None:
+    """Writes a robot file, and reads it again, if a path is given."""
+    from stcal.robot.kinematics.file import require_robot_written, robot_toml
+
+    if path is not None:
+        write(path, robot_toml(robot, comments))
+        require_robot_written(path, robot, chain)
+
+
+def _write_table(path: Path | None, text: "Callable[[], str]") -> None:
+    """Writes a table, and reads it again, if a path is given."""
+    from stcal.io.files import require_text_written
+
+    if path is not None:
+        write(path, content := text())
+        require_text_written(path, content)
 
 
 def _is_xml(path: Path) -> bool:
@@ -109,7 +128,6 @@ def init(
     file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
-    from stcal.robot.kinematics.file import require_robot_written, robot_toml
     from stcal.robot.kinematics.model import mh80
 
     comments = (
@@ -117,8 +135,7 @@ def init(
         "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
         "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
     )
-    write(file, robot_toml(robot := mh80(), comments))
-    require_robot_written(file, robot)
+    _write_robot(file, mh80(), *comments)
 
 
 def axes(
@@ -141,10 +158,10 @@ def axes(
     report: shared.ReportFile = None,
 ) -> None:
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
-    from stcal.robot.axes.model import robot_from_sweeps
-    from stcal.robot.axes.report import axes_file, axes_report
+    from stcal.robot.axes.model import AxesFile, robot_from_sweeps
+    from stcal.robot.axes.report import axes_report
     from stcal.robot.axes.sweeps import ring
-    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
+    from stcal.robot.kinematics.file import load_robot
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
@@ -159,10 +176,8 @@ def axes(
     elif data.rotations is not None:
         say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
     print_each(f"warning: {data.where}", result.notes)
-    write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {shared.name_of(source)}."]))
-    if out:
-        require_robot_written(out, result.robot, result.chain)
-    write_if(json_file, lambda: axes_file(result))
+    _write_robot(out, result.robot, f"Identified by the axis method from {shared.name_of(source)}.", chain=result.chain)
+    write_if(json_file, lambda: AxesFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -227,9 +242,9 @@ def identify(
     report: shared.ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
+    from stcal.robot.identification import report as shown
     from stcal.robot.identification.prior import adjusted
-    from stcal.robot.identification.report import identified_file, identified_report
-    from stcal.robot.identification.result import IdentifyOptions, require_identified_written
+    from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions, require_identified_written
     from stcal.robot.identification.solve import identify as identified_from
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
@@ -241,20 +256,14 @@ def identify(
         observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
     )
     result = identified_from(nominal, data, options)
-    document = identified_report(result, nominal)
+    document = shown.identified_report(result)
     say(document.text())
     if out:
-        write(
-            out,
-            robot_toml(result.robot, [f"Identified from {shared.name_of(source)}: {result.rank} parameters."]),
-        )
+        comment = f"Identified from {shared.name_of(source)}: {result.rank} parameters."
+        write(out, robot_toml(result.robot, [comment]))
         require_identified_written(out, result)
-    if offsets:
-        from stcal.robot.identification.report import offsets_csv, require_offsets_written
-
-        write(offsets, offsets_csv(result, nominal))
-        require_offsets_written(offsets, result, nominal)
-    write_if(json_file, lambda: identified_file(result, nominal))
+    _write_table(offsets, lambda: shown.offsets_csv(result, nominal))
+    write_if(json_file, lambda: IdentifiedFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -280,6 +289,7 @@ def evaluate(
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.kinematics.measurements import read_measurements
     from stcal.robot.use import report as shown
+    from stcal.robot.use.evaluation import EvaluationFile
     from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
@@ -291,10 +301,8 @@ def evaluate(
     document = shown.evaluation_report(result)
     say(document.text())
     print_each("note", data[0].notes)
-    write_if(out, lambda: shown.evaluated_csv(result))
-    if out:
-        shown.require_evaluated_written(out, result)
-    write_if(json_file, lambda: shown.evaluation_file(result))
+    _write_table(out, lambda: shown.evaluated_csv(result))
+    write_if(json_file, lambda: EvaluationFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -316,7 +324,7 @@ def verify(
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
     from stcal.robot.use import verification
-    from stcal.robot.use.report import verification_report
+    from stcal.robot.use.report import verification_figure, verification_report
 
     tables = shared.several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""))
     if isinstance(tables, list):
@@ -328,11 +336,10 @@ def verify(
     print_each("warning", result.warnings())
     if plot:
         from stcal.report.svg import save
-        from stcal.robot.use.report import verification_figure
 
         save(verification_figure(result), plot)
         say(f"written: {plot}")
-    write_if(json_file, lambda: verification.verification_file(result))
+    write_if(json_file, lambda: verification.VerificationFile.model_validate(result))
     write_if(report, document.page)
 
 
@@ -360,14 +367,12 @@ def compensate(
     source = joined.table(targets, "TARGETS", quaternions=quaternions)
     wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
     result = compensation.compensate(identified, wanted, load_robot(nominal) if nominal else None)
-    document = compensation_report(result, identified)
+    document = compensation_report(result)
     say(document.text())
     print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
-    write_if(out, lambda: compensation.compensated_csv(result, identified))
-    if out:
-        compensation.require_compensated_written(out, result, identified)
-    write_if(json_file, lambda: compensation.compensation_file(result, identified))
+    _write_table(out, lambda: compensation.compensated_csv(result, identified))
+    write_if(json_file, lambda: compensation.CompensationFile.model_validate(result))
     write_if(report, document.page)
     if not result.found.usable.any():
         raise DegenerateError(
@@ -403,10 +408,8 @@ def design(
     say(document.text())
     also = f" and {sigma_rad:g} rad" if observe == "pose" else ""
     say(f"for an instrument whose {observe}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
-    write_if(out, lambda: pose_design.design_csv(result, robot))
-    if out:
-        pose_design.require_design_written(out, result, robot, target)
-    write_if(json_file, lambda: pose_design.design_file(result))
+    _write_table(out, lambda: pose_design.design_csv(result, robot))
+    write_if(json_file, lambda: pose_design.DesignFile.model_validate(result))
     write_if(report, document.page)
 
 

@@ -168,6 +168,11 @@ def require_same(path: str | Path, read: Callable[[], object], content: object) 
     require_written(path, lambda: 0.0 if read() == content else float("inf"), 0.0, 0.0, "(content)")
 
 
+def require_text_written(path: str | Path, text: str) -> None:
+    """Read a written text again, and require that it is the same."""
+    require_same(path, lambda: read_bytes(path, TABLE_BYTES), text.encode("utf-8", "backslashreplace"))
+
+
 def save_folder(out: Path, files: dict[str, str]) -> None:
     """Write all files into a new folder, or none of them."""
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -88,7 +88,7 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
         )
     links = validated(content, _File, where).kinematics
     chains = []
-    for turned in (_turning, from_roll_pitch_yaw):
+    for turned in (lambda angles: Rotation.from_euler("XYZ", angles).as_matrix(), from_roll_pitch_yaw):
         joints = []
         for parent, name in zip(("base", *LINKS), LINKS, strict=False):
             link = getattr(links, name)
@@ -98,10 +98,6 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
     moving, fixed = (product(chain).translation for chain in chains)
     off = float(np.linalg.norm(moving - fixed))
     return robot_of({"": chains[0]}, NAME, convention), off
-
-
-def _turning(angles) -> np.ndarray:
-    return Rotation.from_euler("XYZ", angles).as_matrix()
 
 
 def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> Robot:

@@ -35,29 +35,16 @@ def link_of(tool: str) -> str:
     return f"{TOOL}_{tool}" if tool else TOOL
 
 
-def joint_name(i: int) -> str:
-    """Returns the name of joint ``i``, counted from 0."""
-    return f"joint_{i + 1}"
-
-
 SAME_MM, SAME_RAD = 1e-9, 1e-12
 """Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class UrdfRobot(Brief):
-    """A robot of a URDF.
+    """A robot of a URDF, mm, rad; its joint values are those of the URDF's joints.
 
-    Parameters
-    ----------
-    robot : Robot
-        mm, rad; joint values are those of the URDF's joints.
-    joints : tuple of str
-        Names of the moving joints.
-    from_link, to_link : str
-        Links between which the robot was read.
-    notes : tuple of str
-        Missing limits of joints.
+    ``joints`` : names of the moving joints; ``from_link``, ``to_link`` : links between which the robot was read;
+    ``notes`` : missing limits of joints.
     """
 
     robot: Robot
@@ -116,17 +103,6 @@ def load_urdf(
         content = read_bytes(path, SETTINGS_BYTES)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
-    return read_urdf(content, where, from_link, to_link, convention)
-
-
-def read_urdf(
-    content: bytes,
-    where: str,
-    from_link: str = "",
-    to_link: str | Sequence[str] = "",
-    convention: Convention = "standard",
-) -> UrdfRobot:
-    """Reads a robot from the content of a file, as :func:`load_urdf`."""
     root = _parsed(content, where)
     elements = root.findall("joint")
     joints = {joint.child: joint for joint in (_read_joint(each, where) for each in elements)}
@@ -146,7 +122,12 @@ def read_urdf(
             f"{where}: joint {farthest.name}: origin {_far(farthest) / METRE_MM:g} m from its parent, up to "
             f"{MOST_LINK_MM / METRE_MM:g} possible: URDF is in metres; divide lengths in mm by 1000",
         )
-    start = from_link or _root(joints, links, where)
+    roots = [link for link in links if link not in joints]
+    if not from_link and len(roots) != 1:
+        raise InputError(
+            "E-URDF-LINKS", f"{where}: {len(roots)} links are no joint's child; one root needed, or --from-link"
+        )
+    start = from_link or roots[0]
     ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
     for name, path in paths.items():
@@ -208,9 +189,9 @@ def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
     flange = back @ product(behind[""][: children.index(FLANGE) + 1]) if FLANGE in children else Rigid()
     tools = {tool: flange.inverse() @ back @ product(path) for tool, path in behind.items()}
     joints = tuple(_limited(joint) for joint in moving)
-    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
     sliding = np.array([joint.type == "prismatic" for joint in joints])
-    chain = Chain(rotation, translation, flange, sliding, np.eye(len(gaps)))
+    placed = Poses.of(gaps)
+    chain = Chain(placed.rotation, placed.translation, flange, sliding, np.eye(len(gaps)))
     robot, q = robot_between(chain, tools, name, convention, joints), fixed_values(len(gaps))
     found = robot.chain()
     for each, tool in tools.items():
@@ -241,9 +222,8 @@ def _tree_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Conventio
         carriers[tool], tools[tool] = last, passed
     joints, n = tuple(_limited(joint) for joint in moving), len(moving)
     bare = Robot(name, convention, (DHRow(0, 0, 0, 0),) * n, joints, tools=tools, tree=Tree(mounts, carriers))
-    rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
-    grown = Grown(Tree(mounts, carriers), (Rigid(),) * n)
-    chain = Chain(rotation, translation, Rigid(), bare.prismatic, np.eye(n), grown=grown)
+    placed, grown = Poses.of(gaps), Grown(Tree(mounts, carriers), (Rigid(),) * n)
+    chain = Chain(placed.rotation, placed.translation, Rigid(), bare.prismatic, np.eye(n), grown=grown)
     robot, q = robot_from_chain(chain, tools, bare), fixed_values(n)
     for tool, pose in tools.items():
         require_near(robot.world_from_base @ forward(robot, q, tool), carried_poses(chain, q, [tool] * len(q)) @ pose)
@@ -334,15 +314,6 @@ def _z_to(axis: np.ndarray) -> Rigid:
     return Rigid.exp([*(np.arctan2(across, z) * np.array([-y, x, 0.0]) / across), 0.0, 0.0, 0.0])
 
 
-def _root(joints: dict[str, UrdfJoint], links: list[str], where: str) -> str:
-    roots = [link for link in links if link not in joints]
-    if len(roots) != 1:
-        raise InputError(
-            "E-URDF-LINKS", f"{where}: {len(roots)} links are no joint's child; one root needed, or --from-link"
-        )
-    return roots[0]
-
-
 def _require_no_circle(joints: dict[str, UrdfJoint], where: str) -> None:
     """Refuses a link that is below itself."""
     sound: set[str] = set()
@@ -361,19 +332,15 @@ def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, st
     below: dict[str, list[UrdfJoint]] = {}
     for joint in joints.values():
         below.setdefault(joint.parent, []).append(joint)
-    last, pending, branches = start, [start], []
+    behind, pending, branches = [start], [start], []
     while pending:
         link = pending.pop()
-        moving = [joint for joint in below.get(link, ()) if joint.kind != "fixed"]
-        pending += [joint.child for joint in below.get(link, ()) if joint.kind == "fixed"]
-        branches += moving
+        fixed = [joint.child for joint in below.get(link, ()) if joint.kind == "fixed"]
+        branches += [joint for joint in below.get(link, ()) if joint.kind != "fixed"]
+        behind, pending = behind + fixed, pending + fixed
         if not pending and len(branches) == 1:
             last = branches.pop().child
-            pending = [last]
-    behind, pending = [last], [last]
-    while pending:
-        found = [joint.child for joint in below.get(pending.pop(), ()) if joint.kind == "fixed"]
-        behind, pending = behind + found, pending + found
+            behind, pending = [last], [last]
     ends = [link for link in behind if link not in below]
     if len(ends) == 1 and not branches:
         return {"": ends[0]}
@@ -453,7 +420,7 @@ def robot_urdf(robot: Robot) -> str:
         limited = np.isfinite([low[i], high[i]]).any()
         kind = "continuous" if joint.type == "revolute" and not limited else joint.type
         above = f"link_{chain.after(i) + 1}" if chain.after(i) >= 0 else BASE
-        element = _joint(root, joint_name(i), kind, above, f"link_{i + 1}", chain.gap(i))
+        element = _joint(root, f"joint_{i + 1}", kind, above, f"link_{i + 1}", chain.gap(i))
         ElementTree.SubElement(element, "axis", xyz="0 0 1")
         if kind != "continuous":
             ends = {"lower": max(low[i] / unit, -UNLIMITED), "upper": min(high[i] / unit, UNLIMITED)}
@@ -506,13 +473,12 @@ def require_urdf_written(path: str | Path, robot: Robot) -> None:
     q = fixed_values(len(robot.rows))
 
     def again() -> np.ndarray:
-        content = read_bytes(path, SETTINGS_BYTES)
         if robot.tree is None:
-            found = read_urdf(content, WHAT, convention=robot.convention).robot
+            found = load_urdf(path, convention=robot.convention).robot
             chain, kinematic = found.chain(), q @ robot.coupling.T
             return tips(lambda name: flange_poses(chain, kinematic) @ found.tool(name))
-        read = read_urdf(content, WHAT, BASE, [link_of(name) for name in robot.tools], robot.convention)
-        names = [joint_name(i) for i in range(len(robot.rows))]
+        read = load_urdf(path, BASE, [link_of(name) for name in robot.tools], robot.convention)
+        names = [f"joint_{i + 1}" for i in range(len(robot.rows))]
         kinematic = (q @ robot.coupling.T)[:, [names.index(name) for name in read.joints]]
         return tips(lambda name: read.robot.world_from_base @ forward(read.robot, kinematic, link_of(name)))
 

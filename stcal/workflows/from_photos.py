@@ -12,40 +12,44 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import require_arguments, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
-from stcal.io.files import json_text, save
+from stcal.io.files import json_text, require_text_written, save
 from stcal.io.images import find_images
 from stcal.io.join import join_tables
 from stcal.io.json import ResultFile, require_result_written
 from stcal.io.table import POSE, Table, read_table
 from stcal.parallel import Progress, scratch_folder
-from stcal.report.document import Block, Document, Section, bullets, links, listed, plot, tiles
+from stcal.report.document import Document, Section, bullets, links, listed
 from stcal.report.document import Table as ShownTable
-from stcal.report.svg import COLOURS, Axes, Drawing, log_limits
 from stcal.report.text import number
-from stcal.robot.axes.model import AxesResult, robot_from_sweeps
-from stcal.robot.axes.report import axes_file, axes_report
+from stcal.robot.axes.model import AxesFile, AxesResult, robot_from_sweeps
+from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.observability import predicted_at
-from stcal.robot.identification.report import identified_file, identified_report
-from stcal.robot.identification.result import Identified, IdentifyOptions, require_identified_written
+from stcal.robot.identification.report import identified_report
+from stcal.robot.identification.result import (
+    Figures,
+    Identified,
+    IdentifiedFile,
+    IdentifyOptions,
+    require_identified_written,
+)
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import require_robot_written, robot_toml
 from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
     Compensated,
+    CompensationFile,
     compensate,
     compensated_csv,
     compensated_summary,
-    compensation_file,
-    require_compensated_written,
 )
-from stcal.robot.use.evaluation import Figures, evaluate
+from stcal.robot.use.evaluation import evaluate
 from stcal.robot.use.report import compensation_report
 from stcal.robot.use.targets import Targets, read_targets
 from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
@@ -59,8 +63,13 @@ from stcal.sfm.measurement.report import (
 )
 from stcal.sfm.measurement.target import TargetCircles
 
-STAGES = ("poses", "axes", "identified", "compensated")
-"""Names of the files, in the order of the steps."""
+STAGES = {
+    "poses": "Poses of the target in the photographs",
+    "axes": "Axes by the axis method",
+    "identified": "Identification of the arm",
+    "compensated": "Joint values for the targets",
+}
+"""Names of the files, in the order of the steps, and what their pages are."""
 DRAWING, AXES, SAME_ROWS = "as drawn", "by the axis method", "identified, the same rows"
 
 
@@ -68,19 +77,10 @@ DRAWING, AXES, SAME_ROWS = "as drawn", "by the axis method", "identified, the sa
 class FromPhotos:
     """Results of all steps, from photographs to joint values.
 
-    Parameters
-    ----------
-    images : folder of the photographs
-    measured : poses of the target
-    nominal : the arm as drawn
-    data : poses with their joint values
-    axes : result of the axis method, where every joint is swept
-    without_axes : reason why there is no result of the axis method
-    identified : identification from all poses
-    compensated : joint values for the targets, where there are any
-    errors : position errors of the rows, mm: as drawn and by the axis method with base and tool fitted, identified, and
-        of rows held out
-    notes : notes on rows and photographs that have no partner, and on the input
+    ``data`` : poses with their joint values; ``axes`` : where every joint is swept, else ``without_axes`` says why not;
+    ``compensated`` : joint values for the targets, where there are any; ``errors`` : position errors of the rows, mm:
+    as drawn and by the axis method with base and tool fitted, identified, and of rows held out; ``notes`` : on rows and
+    photographs that have no partner, and on the input.
     """
 
     images: str
@@ -110,80 +110,48 @@ class FromPhotos:
         return np.where(compensated.compared()[:, None], compensated.found.q - compensated.nominal.q, np.nan)
 
 
-PAGES = {
-    "poses.html": "Poses of the target in the photographs",
-    "axes.html": "Axes by the axis method",
-    "identified.html": "Identification of the arm",
-    "compensated.html": "Joint values for the targets",
-}
-MOST_NOTES, MOST_TARGETS = 20, 20
+MOST_NOTES = 20
 
 
 def story(result: FromPhotos) -> list[str]:
     """Returns the steps and their results, one sentence a step."""
-    identified, least = result.identified, list(result.errors.values())[-1]
+    identified, least, compensated = result.identified, list(result.errors.values())[-1], result.compensated
     sentences = [*summary(result.measured), f"{len(result.data)} poses have joint values"]
     if result.axes is None:
         sentences.append(f"the axis method was left out: {result.without_axes}")
     else:
-        spans = [
-            f"{np.degrees(fit.span):.0f}°" if len(fit.gain) != 2 else f"{fit.span:.0f} mm" for fit in result.axes.fits
-        ]
+        units = zip(result.axes.fits, result.nominal.prismatic, strict=True)
+        spans = [f"{fit.span:.0f} mm" if slides else f"{np.degrees(fit.span):.0f}°" for fit, slides in units]
         sentences.append(f"every joint is swept by itself, over {', '.join(spans)}: axis method")
     sentences.append(
         f"identified: {identified.rank} parameters; position errors {result.errors[DRAWING].rms:.3g} mm RMS as drawn, "
         f"{least.rms:.3g} mm {'of rows held out' if identified.held_out else 'of the same rows'}"
     )
-    if result.compensated is not None:
-        sentences += [line[0].lower() + line[1:] for line in compensated_summary(result.compensated)]
-        sentences += _at_targets(result)
-    return sentences
-
-
-def _at_targets(result: FromPhotos) -> list[str]:
-    """Returns sentences on the predicted error of the identified arm at the targets, and the joints' motion."""
-    sentences, sigma, moves = [], result.sigma_mm(), result.moves()
+    if compensated is None:
+        return sentences
+    sentences += compensated_summary(compensated)
+    sigma, moves, predicted = result.sigma_mm(), result.moves(), identified.predicted
     finite, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
-    prediction = result.identified.predicted
-    if len(finite) and prediction is not None:
+    if len(finite) and predicted is not None:
         sentences.append(
             f"predicted σ of the tool's position there: {finite.min():.2g} to {finite.max():.2g} mm; at the measured "
-            f"rows {np.sqrt((prediction.here_mm**2).mean()):.2g} mm RMS"
+            f"rows {rms(predicted.here_mm):.2g} mm RMS"
         )
     if len(moved):
-        most = _shown(result, np.abs(moved).max(axis=0))
-        motions = [f"{number(v, 4)}{unit}" for v, unit in zip(most, _units(result), strict=True)]
-        sentences.append(f"joints move by up to {', '.join(motions)}")
+        most = zip(_shown(result, np.abs(moved).max(axis=0)), result.nominal.prismatic, strict=True)
+        motions = ", ".join(f"{v:.4f} mm" if slides else f"{v:.4f}°" for v, slides in most)
+        sentences.append(f"joints move by up to {motions}")
     return sentences
-
-
-def _units(result: FromPhotos) -> list[str]:
-    """Returns the unit in which each joint's values are shown."""
-    return [" mm" if sliding else "°" for sliding in result.nominal.prismatic]
 
 
 def _shown(result: FromPhotos, values: np.ndarray) -> np.ndarray:
-    """Returns joint values (…, n) in these units."""
+    """Returns joint values (…, n) in degrees or mm."""
     return np.where(result.nominal.prismatic, values, np.degrees(values))
 
 
 def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
     """Returns the report: the story, errors of each model of the arm, and links to the other files ``names``."""
-    compensated, last = result.compensated, list(result.errors.values())[-1]
-    before = (
-        None
-        if compensated is None or not compensated.compared().any()
-        else compensated.before_mm[compensated.compared()]
-    )
-    headline = [
-        (str(len(result.data)), "", "poses measured, with joint values"),
-        (number(result.errors[DRAWING].rms, 3), "mm RMS", "position error of the arm as drawn"),
-        (number(last.rms, 3), "mm RMS", list(result.errors)[-1]),
-    ]
-    if before is not None:
-        headline.append(
-            (number(float(np.sqrt((before**2).mean())), 3), "mm RMS", "taken away at the targets, base included")
-        )
+    compensated, targets = result.compensated, []
     notes = [
         *result.notes,
         *(f"{entry.name}: {entry.reason}" for entry in result.measured.left_out),
@@ -194,86 +162,36 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
         [name, str(entry.rows), *(number(v, 4) for v in (entry.mean, entry.rms, entry.p95, entry.max))]
         for name, entry in result.errors.items()
     ]
-    heads = [
-        "line",
-        "<status",
-        "as drawn, mm",
-        "σ, mm",
-        *(f"J{i}, {u.strip()}" for i, u in enumerate(_units(result), 1)),
-    ]
-    targets: list[Block] = [
-        ShownTable(heads, rows := _target_rows(result)),
+    if compensated is not None:
+        values = np.column_stack([compensated.before_mm, result.sigma_mm(), _shown(result, result.moves())])
+        rows = zip(compensated.lines, compensated.found.status, values.tolist(), strict=True)
+        targets = [[str(line), status, *(number(v, 4) for v in row)] for line, status, row in rows]
+    joints = [f"J{i}, {'mm' if slides else '°'}" for i, slides in enumerate(result.nominal.prismatic, 1)]
+    at_targets = [
+        ShownTable(["line", "<status", "as drawn, mm", "σ, mm", *joints], targets),
         "as drawn: where the joint values of the drawing really lead, by the identified arm; nothing is fitted here, "
         "so that errors of the base count, unlike above. σ: of the tool's position after compensation, as predicted. "
         "Then how far each joint moves",
-        "compensated.html has all of them" if compensated is not None and len(compensated) > len(rows) else "",
     ]
-    more = len(notes) - MOST_NOTES
+    models = [
+        ShownTable(["<position error, mm", "errors", "mean", "RMS", "95 %", "max"], errors),
+        "As drawn and by the axis method, base and tool are fitted to the same rows. Rows held out took no part in "
+        "what they are compared with: their error is what is to be expected at other poses among these",
+    ]
+    more = f"and {len(notes) - MOST_NOTES} more, in the pages of each step" if len(notes) > MOST_NOTES else ""
+    pages = [(name, STAGES[name.split(".")[0]]) for name in names if name.endswith(".html")]
+    files = listed("for programs", [name for name in names if not name.endswith(".html")])
     return Document(
         f"From photographs to points: {result.nominal.name}",
         f"photographs of {result.images}",
         [
-            Section("Result", [tiles(headline), *story(result)]),
-            Section(
-                "Errors of the arm's models",
-                [
-                    plot(
-                        lambda: _figure(result),
-                        "errors of each model of the arm",
-                        "Line: from the median to the largest error of a row",
-                    ),
-                    ShownTable(["<position error, mm", "errors", "mean", "RMS", "95 %", "max"], errors),
-                    "As drawn and by the axis method, base and tool are fitted to the same rows. Rows held out took "
-                    "no part in what they are compared with: their error is what is to be expected at other poses "
-                    "among these",
-                ],
-            ),
-            Section("At the targets", targets if rows else []),
-            Section(
-                "To look at",
-                [bullets(notes[:MOST_NOTES]), f"and {more} more, in the pages of each step" if more > 0 else ""],
-            ),
-            Section(
-                "Each step",
-                [
-                    links((name, PAGES[name]) for name in names if name in PAGES),
-                    listed("for programs", [name for name in names if not name.endswith(".html")]),
-                ],
-            ),
+            Section("Result", story(result)),
+            Section("Errors of the arm's models", models),
+            Section("At the targets", at_targets if targets else []),
+            Section("To look at", [bullets(notes[:MOST_NOTES]), more]),
+            Section("Each step", [links(pages), files]),
         ],
     ).page()
-
-
-def _target_rows(result: FromPhotos) -> list[list[str]]:
-    """Returns each target's error by nominal joint values, predicted σ, and motion of the joints."""
-    compensated = result.compensated
-    if compensated is None:
-        return []
-    moves, sigma = _shown(result, result.moves()), result.sigma_mm()
-    return [
-        [
-            str(compensated.targets.lines[i]),
-            compensated.found.status[i],
-            *(number(float(v), 4) for v in (compensated.before_mm[i], sigma[i], *moves[i])),
-        ]
-        for i in range(min(MOST_TARGETS, len(compensated)))
-    ]
-
-
-def _figure(result: FromPhotos) -> Drawing:
-    """Returns a figure of median, RMS and largest error of each model, on a logarithmic scale."""
-    names, figures = list(result.errors), list(result.errors.values())
-    rows = list(range(len(names)))
-    median, rms, largest = ([getattr(each, name) for each in figures] for name in ("median", "rms", "max"))
-    drawing = Drawing(8, 0.5 * len(names) + 0.9)
-    box = drawing.panels(left=160, top=22)[0]
-    axes = Axes(drawing, box, log_limits([*median, *rms, *largest]), (len(names) - 0.5, -0.5), "x")
-    axes.frame("position error of a row, mm", y_ticks=(rows, names))
-    axes.lines([(ends, (row, row)) for row, *ends in zip(rows, median, largest, strict=True)], COLOURS[0], 1.2)
-    axes.marks(rms, rows, "dot", 6, COLOURS[0])
-    axes.marks(largest, rows, "bar", 10, COLOURS[1])
-    drawing.key((box[0], 10), {"RMS": ("dot", COLOURS[0]), "largest": ("bar", COLOURS[1])})
-    return drawing
 
 
 POSES = "poses.csv"
@@ -281,12 +199,10 @@ POSES = "poses.csv"
 
 def _results(result: FromPhotos) -> dict[str, ResultFile]:
     """Returns the result files, by name."""
-    axes, identified, compensated = result.axes, result.identified, result.compensated
-    return {
-        "poses.json": poses_file(result.measured),
-        "identified.json": identified_file(identified, result.nominal),
-        **({} if axes is None else {"axes.json": axes_file(axes)}),
-        **({} if compensated is None else {"compensated.json": compensation_file(compensated, identified.robot)}),
+    models = {"axes": AxesFile, "identified": IdentifiedFile, "compensated": CompensationFile}
+    parts = {name: getattr(result, name) for name in models}
+    return {"poses.json": poses_file(result.measured)} | {
+        f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None
     }
 
 
@@ -298,7 +214,7 @@ def files_of(result: FromPhotos) -> dict[str, str]:
         POSES: poses_csv(result.measured)[0],
         "poses.html": measure_report(result.measured, result.images).page(),
         "identified.toml": robot_toml(identified, [source]),
-        "identified.html": identified_report(result.identified, result.nominal).page(),
+        "identified.html": identified_report(result.identified).page(),
     }
     if result.axes is not None:
         files |= {
@@ -308,9 +224,9 @@ def files_of(result: FromPhotos) -> dict[str, str]:
     if compensated is not None:
         files |= {
             "compensated.csv": compensated_csv(compensated, identified),
-            "compensated.html": compensation_report(compensated, identified).page(),
+            "compensated.html": compensation_report(compensated).page(),
         }
-    files = dict(sorted(files.items(), key=lambda item: STAGES.index(item[0].split(".")[0])))
+    files = dict(sorted(files.items(), key=lambda item: [*STAGES].index(item[0].split(".")[0])))
     return files | {"report.html": from_photos_page(result, tuple(files))}
 
 
@@ -323,7 +239,7 @@ def require_files_written(out: Path, result: FromPhotos) -> None:
     if result.axes is not None:
         require_robot_written(out / "axes.toml", result.axes.robot, result.axes.chain)
     if result.compensated is not None:
-        require_compensated_written(out / "compensated.csv", result.compensated, result.identified.robot)
+        require_text_written(out / "compensated.csv", compensated_csv(result.compensated, result.identified.robot))
 
 
 PHOTOGRAPHS = "the photographs"
@@ -421,25 +337,14 @@ def from_measured(
     models = {DRAWING: nominal} if axes is None else {DRAWING: nominal, AXES: axes.robot}
     evaluation = evaluate(models, data)
     good = ~evaluation.wrong
-    errors = {
-        name: Figures.of(evaluated.errors_mm[good]) for name, evaluated in zip(models, evaluation.robots, strict=True)
+    errors = {each.name: each.good_mm for each in evaluation.robots} | {
+        SAME_ROWS: Figures.of(identified.fitted_mm[good])
     }
-    errors[SAME_ROWS] = Figures.of(identified.fitted_mm[good])
     if identified.held_out is not None:
-        held = identified.held_out.position_mm[:, good]
-        errors[f"identified, {identified.held_out.folds} folds held out"] = Figures.of(held[np.isfinite(held)])
-    return FromPhotos(
-        images,
-        measured,
-        nominal,
-        data,
-        axes,
-        without,
-        identified,
-        compensated,
-        errors,
-        joined.notes + tuple(data.notes),
-    )
+        name = f"identified, {identified.held_out.folds} folds held out"
+        errors[name] = Figures.of(identified.held_out.position_mm[:, good])
+    results = data, axes, without, identified, compensated, errors
+    return FromPhotos(images, measured, nominal, *results, joined.notes + tuple(data.notes))
 
 
 def _axes(data: Measurements, nominal: Robot) -> tuple[AxesResult | None, str]:

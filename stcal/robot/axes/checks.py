@@ -7,7 +7,6 @@ from itertools import chain, combinations, pairwise
 import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, AxisFit, refit_axis, unwound_by
 from stcal.robot.axes.sweeps import called
@@ -30,22 +29,22 @@ EXACTLY = 1e-12
 class Pair:
     """Two consecutive axes, ``joint`` (from 0) and the next; mm, rad; None along prismatic joints.
 
-    ``angle`` : between the axes; ``distance`` : of the next axis from this one, for near-parallel pairs in the plane
-    across this axis that the robot's rows define, else along the common normal; ``parallel`` : the rows have Hayati's
-    β; ``normal``, ``foot`` : length of the common normal, and position of its foot on this axis, from where the axis
-    was measured; ``refused`` : why a Denavit–Hartenberg row with these values must not be used, or "".
+    ``angle_rad`` : between the axes; ``distance_mm`` : of the next axis from this one, for near-parallel pairs in the
+    plane across this axis that the robot's rows define, else along the common normal; ``parallel`` : the rows have
+    Hayati's β; ``normal_mm``, ``foot_mm`` : length of the common normal, and position of its foot on this axis, from
+    where the axis was measured; ``refused`` : why a row of Denavit and Hartenberg must not be used, or "".
     """
 
     joint: int
-    angle: float
-    angle_sigma: float
+    angle_rad: float
+    angle_sigma_rad: float
     parallel: bool
-    distance: float | None = None
-    distance_sigma: float | None = None
-    normal: float | None = None
-    normal_sigma: float | None = None
-    foot: float | None = None
-    foot_sigma: float | None = None
+    distance_mm: float | None = None
+    distance_sigma_mm: float | None = None
+    normal_mm: float | None = None
+    normal_sigma_mm: float | None = None
+    foot_mm: float | None = None
+    foot_sigma_mm: float | None = None
     refused: str = ""
 
 
@@ -111,8 +110,8 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
             lengths = _lengths(acute, value[3:], sigma_of(jacobian[3:], covariance), size)
         pair = Pair(
             joint=i,
-            angle=np.pi - acute if opposed else acute,
-            angle_sigma=_angle_sigma(value[:3], jacobian[:3] @ covariance @ jacobian[:3].T),
+            angle_rad=np.pi - acute if opposed else acute,
+            angle_sigma_rad=_angle_sigma(value[:3], jacobian[:3] @ covariance @ jacobian[:3].T),
             parallel=bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
             **lengths,
         )
@@ -131,10 +130,11 @@ def _angle_sigma(angle: np.ndarray, covariance: np.ndarray) -> float:
 def _lengths(angle: float, value: np.ndarray, sigma: np.ndarray, size: float) -> dict:
     """Returns the lengths of a pair, and why Denavit and Hartenberg's must not be used, if so."""
     distance, normal, foot = (float(v) for v in value)
-    lengths = {"distance": abs(distance), "distance_sigma": float(sigma[0])}
+    lengths = {"distance_mm": abs(distance), "distance_sigma_mm": float(sigma[0])}
     if not np.isfinite(foot):
         return lengths | {"refused": "the axes are parallel: every common normal is as good as any other"}
-    lengths |= {"normal": abs(normal), "foot": foot, "normal_sigma": float(sigma[1]), "foot_sigma": float(sigma[2])}
+    lengths |= {"normal_mm": abs(normal), "foot_mm": foot}
+    lengths |= {"normal_sigma_mm": float(sigma[1]), "foot_sigma_mm": float(sigma[2])}
     reasons = []
     if abs(foot) > size:
         reasons.append(f"foot {abs(foot) / 1e3:.4g} m away, the arm is {size / 1e3:.3g} m long")
@@ -326,10 +326,6 @@ class LeaveOneOut:
     lines: tuple[int, ...]
     distance: np.ndarray
     normal: np.ndarray
-
-    def __post_init__(self):  # nan is a value here
-        for name in ("distance", "normal"):
-            object.__setattr__(self, name, frozen(getattr(self, name), what=name, finite=False))
 
     def spread(self, name: str) -> np.ndarray:
         """Returns the largest minus the smallest ``distance`` or ``normal``, (n − 1,); nan where there is none."""

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import rms
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
@@ -77,6 +78,16 @@ class AxisFit:
     def outliers(self) -> np.ndarray:
         """Rows that are left out as gross errors."""
         return np.unique(self.rows[self.weights == 0])
+
+    @property
+    def rms_mm(self) -> float:
+        """RMS of a coordinate of the residuals of the points used, mm."""
+        return rms(self.lengths()) / float(np.sqrt(2))
+
+    @property
+    def targets(self) -> list[str]:
+        """Reflectors of the arcs."""
+        return [arc.target for arc in self.arcs]
 
     def influence(self, points: np.ndarray) -> np.ndarray:
         """Returns the change (k, p) of the axis, linear, without each of the fitted ``points`` (k, 3), mm."""

@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
+from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile
 from stcal.parallel import one_thread
 from stcal.robot.axes.checks import (
     LeaveOneOut,
@@ -26,9 +29,13 @@ from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
+from stcal.robot.kinematics.file import RobotText
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
 
+ByLine = Annotated[int, "line"]
+Rows = Annotated[list[list[Finite]], BeforeValidator(lambda rows: np.asarray(rows, float).tolist())]
+"""Rows of numbers, null where there is none."""
 TOOL_GROSS = 6.0
 """Distance, in median distances, beyond which a row does not count for a reflector's place on the flange."""
 
@@ -45,6 +52,7 @@ class AxesResult:
     ``notes`` : what was passed over.
     """
 
+    format: ClassVar = "stcal axes 1"
     fits: tuple[AxisFit, ...]
     covariance: Array
     chain: Chain
@@ -59,6 +67,71 @@ class AxesResult:
     def __post_init__(self):
         freeze(self, "covariance", (None, None), "covariance")
         freeze(self, "row_sigma", (None, 5), "σ of the rows")
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows (n, 5) a, alpha, d, theta, beta of the robot; mm, rad."""
+        return dh_values(self.robot)
+
+    @property
+    def tools(self) -> Mapping[str, Rigid]:
+        """Tools of the robot."""
+        return self.robot.tools
+
+
+class AxisPart(Part):
+    world_from_axis: Pose
+    covariance: Matrix
+    rms_mm: float
+    sigma_mm: float
+    redundancy: int
+    span: float
+    targets: list[str]
+    radii: Annotated[list[Finite], BeforeValidator(list)]
+    heights: Annotated[list[Finite], BeforeValidator(list)]
+
+
+class LeaveOneOutRows(Part):
+    lines: list[int]
+    distance: Rows
+    normal: Rows
+
+
+class AxesFile(ResultFile):
+    """The result file of ``axes``."""
+
+    format: Literal["stcal axes 1"] = Field(description="the file's form and its version")
+    robot: RobotText = Field(description="text of the robot file")
+    fits: list[AxisPart] = Field(
+        description="of each joint in order, all joints at zero: `world_from_axis`, z along positive motion; "
+        "`covariance` of rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by the noise of its own sweeps; "
+        "`rms_mm` of a coordinate of the residuals, `sigma_mm` of a coordinate, `redundancy`; `span` of the joint's "
+        "values, rad or mm; of its arcs `targets`, `radii` and `heights`, mm"
+    )
+    off: list[dict[ByLine, float]] = Field(description="by joint, rows off their arcs and left out, mm")
+    covariance: Matrix = Field(
+        description="of all axes together, in the order of `fits`, with what each inherits from those before"
+    )
+    rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
+    row_sigma: Matrix = Field(description="their σ; 0: kept from the robot given")
+    tools: dict[ByName, Pose] = Field(description="flange_from_target, mm")
+    tool_spread_mm: dict[ByName, float] = Field(
+        description="RMS of all rows about it: encoders, gears and elasticity are in it"
+    )
+    pairs: list[Pair] = Field(
+        description="`joint` (from 0) and the next: `angle_rad`, `angle_sigma_rad`; `parallel`: within 1° of it; "
+        "`distance_mm`, `distance_sigma_mm`: along the common normal, of near-parallel axes in the plane of their row; "
+        "`normal_mm`, `foot_mm` and their σ `normal_sigma_mm`, `foot_sigma_mm`: the common normal, and its foot along "
+        'the first axis from where that was measured; `refused`: why these must not be used, or `""`'
+    )
+    without_one: LeaveOneOutRows = Field(
+        description="`lines` of the rows left out (with all reflectors), `distance`, `normal` of each pair without "
+        "them, mm, signed as `a`"
+    )
+    notes: list[str] = Field(
+        description="rows left out as grossly wrong, reflectors too close to an axis, arcs too short; columns that "
+        "were not read, angles by their convention"
+    )
 
 
 @one_thread()

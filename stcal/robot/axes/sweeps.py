@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid, align_rigid, skew
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
@@ -27,10 +26,7 @@ class Arc:
 
     joint: int
     target: str
-    rows: Array
-
-    def __post_init__(self):
-        freeze(self, "rows", (None,), "rows", int)
+    rows: np.ndarray
 
 
 def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) -> tuple[list[Arc], list[str]]:
@@ -58,7 +54,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
             places = values if robot.prismatic[j] else _within_a_turn(values)
             distinct = len(set(_clusters(places, still[j])))
             if distinct >= DISTINCT[joint.type]:
-                arcs.append(Arc(j, target, rows))
+                arcs.append(Arc(j, target, np.array(rows)))
                 arc_count += 1
             elif distinct > 1:
                 notes.append(
@@ -126,14 +122,9 @@ class VirtualReflectors:
     reflectors' mean, of RMS length 1, in the instrument's frame."""
 
     data: Measurements
-    places: Array
-    pose: Array
-    lever: Array
-
-    def __post_init__(self):
-        freeze(self, "places", (None, 3), "places")
-        freeze(self, "pose", (len(self.data),), "poses", int)
-        freeze(self, "lever", (len(self.data), 3), "levers")
+    places: np.ndarray
+    pose: np.ndarray
+    lever: np.ndarray
 
     def by_pose(self, response: np.ndarray) -> np.ndarray:
         """Returns the response (p, 6 m) to the noise of poses, given that (p, km, 3) to the noise of independent rows.

@@ -9,10 +9,11 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights, length_limit
+from stcal.io.covariance import TWIST
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.forward import (
     carried_poses,
@@ -65,6 +66,11 @@ class Observed:
         return len(self.first)
 
     @property
+    def lines(self) -> list[int]:
+        """Lines (r,) of the file."""
+        return [int(self.data.lines[row]) for row in self.first]
+
+    @property
     def used(self) -> Kind:
         """Kind of observation for which the measurements are used."""
         return "distance" if self.frameless else self.kind
@@ -94,11 +100,9 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 def parameter_names(state: State, kind: Kind) -> list[str]:
     """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools, and
     ``station B rx`` … of stations but the first; r in rad, the others in mm."""
-    component = ("rx", "ry", "rz", "x", "y", "z")
-    tool = component if kind == "pose" else component[3:]
-    names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
-    names += [f"tool {name} {c}".replace("  ", " ") for name in state.tools for c in tool]
-    return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in component]
+    names = [f"J{i + 1} {TWIST[c]}" for i, c in chain_parameters(state.chain)]
+    names += [f"{f'tool {name}'.rstrip()} {c}" for name in state.tools for c in TWIST[-tool_width(kind) :]]
+    return names + [f"station {name} {c}" for name in list(state.stations)[1:] for c in TWIST]
 
 
 def tips(state: State, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
@@ -383,6 +387,10 @@ class Solution:
         return np.linalg.inv(scaled) * self.units[:, None] * self.units
 
 
+Away = tuple[State, np.ndarray]
+"""A state, and the sum of the steps (k,) that led to it."""
+
+
 def solve(
     state: State, measured: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
 ) -> Solution:
@@ -404,35 +412,37 @@ def solve(
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
 
-    def linearise(at: _Away, bends: bool) -> NormalEquations:
-        fit, gradient = _linearised(at.state, measured, weighting, limit)
-        straight = NormalEquations(fit.cost, fit.normal, gradient) + kept(at.away)
+    def linearise(at: Away, bends: bool) -> NormalEquations:
+        fit, gradient = _linearised(at[0], measured, weighting, limit)
+        straight = NormalEquations(fit.cost, fit.normal, gradient) + kept(at[1])
         curved = curvature_of(fit, measured, weighting) if bends else None
         if curved is None:
             return straight
         return replace(straight, normal=straight.normal - Bent.of(straight.normal, curved).taken())
 
-    def descended(begin: _Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[_Away, NormalEquations]:
+    def cost(at: Away) -> float:
+        white = weighting.whiten(residuals(at[0], measured), measured)
+        return float(huber_cost(np.linalg.norm(white, axis=1), limit).sum() + kept(at[1]).cost)
+
+    def descended(begin: Away, bends: bool, least_gain: float, max_steps: int) -> Minimum[Away, NormalEquations]:
         return minimise(
             begin,
             partial(linearise, bends=bends),
-            lambda at, step: _Away(moved(at.state, step, measured.kind), at.away + step),
-            cost=lambda at: (
-                _cost(residuals(at.state, measured), measured, weighting, limit) + float(kept(at.away).cost)
-            ),
+            lambda at, step: (moved(at[0], step, measured.kind), at[1] + step),
+            cost=cost,
             settled=SETTLED,
             least_gain=least_gain,
             max_steps=max_steps,
         )
 
-    begin = _Away(state, np.zeros(len(hold)))
+    begin = state, np.zeros(len(hold))
     if state.elastic:
         near = descended(begin, False, NEAR, NEAR_STEPS).state
         fit, accepted = descended(near, True, LEAST_ELASTIC, MAX_STEPS), ACCEPTED_ELASTIC
     else:
         fit, accepted = descended(begin, False, LEAST_GAIN, MAX_STEPS), ACCEPTED
     fit.required(f"{measured.data.where}: identification", "check the robot file and the outliers", accepted)
-    solution = _linearised(fit.state.state, measured, weighting, limit)[0]
+    solution = _linearised(fit.state[0], measured, weighting, limit)[0]
     return replace(solution, prior=prior, conditions=conditions, count=count)
 
 
@@ -480,12 +490,15 @@ class Bent:
         return solve_triangular(self.root, wider @ self.root.T, lower=True, trans=1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Away:
-    """A state, and the sum of the steps (k,) that led to it."""
-
-    state: State
-    away: np.ndarray
+def require_enough(measured: Observed, seeks: int, what: str, advice: str) -> None:
+    """Refuses observations that give no more numbers than ``seeks`` parameters."""
+    numbers, width = WIDTH[measured.kind] * len(measured), WIDTH[measured.kind]
+    if numbers <= seeks:
+        raise DegenerateError(
+            "E-IDENTIFY-FEW",
+            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} {what}; "
+            f"{seeks // width + 1} or more needed, {advice}",
+        )
 
 
 def unseen(kind: Kind) -> int:
@@ -532,7 +545,3 @@ def parameter_units(derivative: np.ndarray) -> np.ndarray:
     turns = np.sqrt((derivative[:, :3] ** 2).sum(1).mean(0)) if derivative.shape[1] == 6 else np.zeros(len(moves))
     moves = np.where(moves > 1e-9, moves, turns)  # the tool's orientation moves no point
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
-
-
-def _cost(found: np.ndarray, measured: Observed, weighting: Weighting, limit: float) -> float:
-    return float(huber_cost(np.linalg.norm(weighting.whiten(found, measured), axis=1), limit).sum())

@@ -45,13 +45,10 @@ class ObservabilityIndices:
     (:func:`parameter_scale`), and measurements are counted in their σ. So singular values, O1, O3, O4 and O5 are in
     1/mm; O2 has no unit; and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
 
-    Parameters
-    ----------
-    o1 : (σ₁ … σ_L)^(1/L) / √count: the volume of the ellipsoid of uncertainty, D-optimality (Borm & Menq 1989, 1991)
-    o2 : σ_L / σ₁: inverse condition number (Driels & Pathre 1990)
-    o3 : σ_L: the combination of parameters that is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994)
-    o4 : σ_L² / σ₁: noise amplification (Nahvi & Hollerbach 1996)
-    o5 : 1 / (1/σ₁ + … + 1/σ_L): harmonic, near to A-optimality (Sun & Hollerbach 2008)
+    ``o1`` : (σ₁ … σ_L)^(1/L) / √count, volume of the ellipsoid of uncertainty, D-optimality (Borm & Menq 1989, 1991);
+    ``o2`` : σ_L / σ₁, inverse condition number (Driels & Pathre 1990); ``o3`` : σ_L, the combination of parameters that
+    is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994); ``o4`` : σ_L² / σ₁, noise amplification (Nahvi &
+    Hollerbach 1996); ``o5`` : 1 / (1/σ₁ + … + 1/σ_L), near to A-optimality (Sun & Hollerbach 2008).
     """
 
     o1: float

@@ -76,13 +76,6 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
     return UsualElasticity(expected, scale, group, HEAVIER if carried else 0.0)
 
 
-def carries(chain: Chain, conditions: Conditions) -> bool:
-    """Returns True if any row carried a mass, or, where the rows do not say, if the chain has a payload."""
-    if conditions.payload_kg is None:
-        return chain.elasticity is not None and chain.elasticity.payload_kg > 0
-    return conditions.loaded
-
-
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
     """Returns the state with elasticity to be adjusted, from the robot file or nearly rigid with gravity down. The
     payload is the mass that all rows carried, if it was one; hysteresis is included if rows have approach
@@ -330,19 +323,6 @@ class Placed:
     pose: Rigid
     sigma: np.ndarray
 
-    def sigma_or_none(self) -> list[float | None] | None:
-        """Returns σ for result files; None where it is nan."""
-        return None if np.isnan(self.sigma).all() else [None if np.isnan(s) else float(s) for s in self.sigma]
-
-
-BASE = "base in the instrument's frame"
-"""Name of the base in tables."""
-
-
-def tool_name(name: str) -> str:
-    """Returns the name of a tool in tables."""
-    return f"tool {name} in the flange's frame".replace("  ", " ")
-
 
 def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
     """Returns base and tools as ``nominal``'s file form has them, stations, and starts of branches, with σ from the
@@ -367,9 +347,8 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
         sigma[1 : 1 + len(state.tools), :3] = np.nan
     if kind == "distance":
         sigma[0] = np.nan
-    first, *others = state.stations
-    base = f"base in the frame of station {first}" if others else BASE
-    names = [base, *map(tool_name, state.tools), *(f"station {name} in that of {first}" for name in others)]
+    tools = (f"tool {name}".rstrip() for name in state.tools)
+    names = ["base", *tools, *(f"station {name}" for name in list(state.stations)[1:])]
     if nominal.tree is not None:
         names += [
             f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from pydantic import AliasPath, BeforeValidator, Field
 from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_fields
 from stcal.io.files import require_written
+from stcal.io.json import ByName, Finite, Matrix, Part, Pose, ResultFile, Vector
 from stcal.robot.identification.adjustment import (
     Kind,
     Observed,
@@ -19,10 +21,10 @@ from stcal.robot.identification.adjustment import (
     residuals,
 )
 from stcal.robot.identification.observability import ObservabilityIndices, Predicted
-from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed
+from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed, dh_values
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.identification.variances import Spread
-from stcal.robot.kinematics.file import WRITTEN_MM, load_robot
+from stcal.robot.kinematics.file import WRITTEN_MM, RobotText, load_robot
 from stcal.robot.kinematics.model import Elasticity, Robot
 
 Model = Literal["rigid", "elastic", "auto"]
@@ -104,6 +106,25 @@ class IdentifyOptions:
             )
 
 
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Summary of the errors of a number of rows; mm, or rad for orientations."""
+
+    rows: int
+    mean: float
+    median: float
+    rms: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: np.ndarray) -> "Figures":
+        """Returns the summary of the errors that are finite."""
+        errors = errors[np.isfinite(errors)]
+        rms, p95 = np.sqrt((errors**2).mean()), np.percentile(errors, 95)
+        return cls(len(errors), *(float(v) for v in (errors.mean(), np.median(errors), rms, p95, errors.max())))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutRows:
     """Errors of rows that were held out of a fit. ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
@@ -130,7 +151,7 @@ class Gain:
         errors = [np.nanmean(each.position_mm, axis=0) for each in (rigid, elastic)]
         differences = errors[0] - errors[1]
         differences = differences[np.isfinite(differences)]
-        before, after = (float(np.sqrt(np.nanmean(each.position_mm**2))) for each in (rigid, elastic))
+        before, after = (Figures.of(each.position_mm).rms for each in (rigid, elastic))
         return cls(before, after, float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(differences))))
 
     @property
@@ -157,8 +178,8 @@ class Identified(Brief):
 
     Parameters
     ----------
-    robot : Robot
-        The robot with its base in the instrument's frame, tools by target; mm, rad.
+    robot, nominal : Robot
+        The robot with its base in the instrument's frame, tools by target; and as drawn. mm, rad.
     seen : Observed
         The r observations.
     adjustment : Adjustment
@@ -201,7 +222,9 @@ class Identified(Brief):
         Rows left out, and remarks on the result.
     """
 
+    format: ClassVar = "stcal identified 1"
     robot: Robot
+    nominal: Robot
     seen: Observed
     adjustment: Adjustment
     names: tuple[str, ...]
@@ -265,25 +288,133 @@ class Identified(Brief):
         """Returns (row of the observations, error in mm) of each observation that weighs less than half."""
         return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
+    @property
+    def errors(self) -> dict[str, Figures]:
+        """Position errors, and their predicted σ, mm, by the keys of :data:`ERRORS`."""
+        held_out, every, predicted = self.held_out, self.all_held_out, self.predicted
+        found = {
+            "nominal": self.nominal_mm,
+            "identified": self.fitted_mm,
+            "held_out": None if held_out is None else held_out.position_mm,
+            "all_held_out": None if every is None else every.position_mm,
+            "sigma": None if predicted is None else predicted.here_mm,
+            "sigma_over_ranges": None if predicted is None else predicted.ranges_mm,
+        }
+        return {key: Figures.of(values) for key, values in found.items() if values is not None}
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows (n, 5) a, alpha, d, theta, beta; mm, rad."""
+        return dh_values(self.robot)
+
+    @property
+    def nominal_rows(self) -> np.ndarray:
+        """The same of the nominal robot."""
+        return dh_values(self.nominal)
+
+
+ERRORS = {
+    "nominal": "nominal axes, base and tool fitted",
+    "identified": "identified, the same rows",
+    "held_out": "held out",
+    "all_held_out": "held out, were all dimensions adjusted",
+    "sigma": "σ of the position, the same rows",
+    "sigma_over_ranges": "σ of the position, over the joints' ranges",
+}
+
+
+class ElasticityValues(Part):
+    compliance: Matrix
+    moment: Matrix
+    periodic: Matrix
+    hysteresis: Vector
+
+
+class PlacedPose(Part):
+    name: str
+    pose: Pose
+    sigma: Annotated[list[Finite], BeforeValidator(list)]
+
+
+class IdentifiedFile(ResultFile):
+    """The result file of ``identify``."""
+
+    format: Literal["stcal identified 1"] = Field(description="the file's form and its version")
+    robot: RobotText = Field(description="text of the robot file")
+    observed: str = Field(validation_alias=AliasPath("seen", "used"), description="kind of observation used")
+    rank: int = Field(description="parameters determined by the data used")
+    ranks: dict[str, int] = Field(description="`rank` by kind of observation at the same joint values")
+    undetermined: list[str] = Field(
+        description="directions kept nominal (`--partial`), each once, by its parameters: `J2 y (with tool z and J1 x)`"
+    )
+    notes: list[str] = Field(description="rows left out, columns not read, and remarks on the result")
+    model: Literal["rigid", "elastic"] = Field(description="that was identified")
+    gain: Gain | None = Field(
+        description="where both were tried: RMS errors of held-out rows by both, `rigid_mm` and `elastic_mm`; mean by "
+        "which elastic errs less, `gain_mm`, and its standard error `sigma_mm`"
+    )
+    elasticity_sigma: ElasticityValues | None = Field(
+        description="σ of the elasticity in the robot file, a row for each joint: `compliance` (rad/Nm) about its axis "
+        "and across it, `moment` (Nm), `periodic`, `hysteresis` (rad); null of the rigid model"
+    )
+    weighting: Weighting = Field(
+        description="σ of one coordinate, `sigma_mm`, and of one component of a rotation, `sigma_rad`, or `given` by "
+        "the rows' covariances; `factor`: σ₀ by which these are multiplied; `estimated`: which of them"
+    )
+    deviations: dict[str, float | None] = Field(
+        description="`length_mm`, `twist_rad`, `zero_rad`: σ of this robot's dimensions about nominal, as estimated; "
+        "`axis_rad`, `across_rad`: of what links give way by at the usual torque, `periodic_rad`: of gears, "
+        "`hysteresis_rad`; null where it has none"
+    )
+    errors: dict[ByName, Figures] = Field(
+        description="position errors, mm: `rows`, `mean`, `median`, `rms`, `p95`, `max` of `nominal` (base and tools "
+        "fitted), `identified`, `held_out`, `all_held_out` (were all dimensions adjusted); and the same of the "
+        "predicted `sigma` of the tool's position, and `sigma_over_ranges` of the joints, there with what is in `left`"
+    )
+    observability: ObservabilityIndices = Field(
+        description="`o1` … `o5` (Borm & Menq; `o2` Driels & Pathre; `o3` Nahvi, Hollerbach & Hayward; `o4` Nahvi & "
+        "Hollerbach; `o5` Sun & Hollerbach) of the Jacobian over σ, an angle being the arc that it makes at the arm's "
+        "whole length; 1/mm, `o2` without unit; 1/`o3` is the σ in mm of the combination that is seen worst"
+    )
+    rows: Matrix = Field(description="`a` (mm), `alpha` (rad), `d`, `theta`, `beta` of each joint")
+    dh_sigma: Matrix = Field(description="their σ; 0: not adjusted")
+    placed: list[PlacedPose] = Field(
+        description="base in the instrument's frame, tools in the flange's: `name`, `pose` (mm), `sigma` of rotation "
+        "(rad, about the outer frame's axes) and translation (mm); null where not determined"
+    )
+    names: list[str] = Field(
+        description="of parameters, small motions of each joint's frame (`J2 rx`: rad, `J2 x`: mm) and of the tools"
+    )
+    covariance: Matrix = Field(description="of these; of distances singular: 0 along what they never show")
+    lines: list[int] = Field(validation_alias=AliasPath("seen", "lines"), description="of the observations in the file")
+    fitted_mm: Vector = Field(description="their errors")
+    weights: Vector = Field(description="their weights; below a half: outliers")
+    left: list[Finding] | None = Field(
+        description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
+        "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
+        "number of tests, `line` of the first row after a jump along their order (null: no jump), `advice`; null where "
+        "rows are too few to tell"
+    )
+
 
 OTHER_TYPE_MM, SHOWN_LENGTHS = 5.0, 4
 """Change of a length beyond what workshops make of one type of arm, and most lengths to be shown."""
 
 
-def misgivings(result: Identified, nominal: Robot) -> tuple[str, ...]:
-    """Returns notes on stated σ that residuals contradict, no gain over ``nominal``, or lengths that differ by one
-    factor."""
+def misgivings(result: Identified) -> tuple[str, ...]:
+    """Returns notes on stated σ that residuals contradict, no gain over the nominal robot, or lengths that differ by
+    one factor."""
     notes = [] if (stated := _stated_otherwise(result)) is None else [stated]
     if result.held_out is not None:
-        after, before = (float(np.sqrt(np.nanmean(e**2))) for e in (result.held_out.position_mm, result.nominal_mm))
+        before, after = (result.errors[key].rms for key in ("nominal", "held_out"))
         if after > NO_GAIN * before > 0:
             notes.append(
                 f"no gain: rows held out err by {after:.3g} mm (RMS) with the identified robot and by {before:.3g} mm "
                 "with the nominal one, base and tool fitted: what errs is not the robot's dimensions; check joint "
                 "values and measurements, rounding too"
             )
-    lengths = np.array([[row.a, row.d] for row in nominal.rows]).ravel()
-    changes = np.array([[row.a, row.d] for row in result.robot.rows]).ravel() - lengths
+    lengths = result.nominal_rows[:, [0, 2]].ravel()
+    changes = result.rows[:, [0, 2]].ravel() - lengths
     square, free = float(lengths @ lengths), len(lengths) - 1
     if square > 0 and (changes != 0).sum() >= LEAST_LENGTHS:
         scale = float(lengths @ changes) / square

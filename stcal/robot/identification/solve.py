@@ -28,6 +28,7 @@ from stcal.robot.identification.adjustment import (
     only_of,
     parameter_names,
     parameter_units,
+    require_enough,
     residuals,
     solve,
     tips_of,
@@ -42,7 +43,7 @@ from stcal.robot.identification.observability import (
     predicted,
     widened,
 )
-from stcal.robot.identification.prior import Deviations, NominalRows, bending, carries, placed
+from stcal.robot.identification.prior import Deviations, NominalRows, bending, placed
 from stcal.robot.identification.result import (
     LEAST_FOLDS,
     Adjustment,
@@ -59,7 +60,7 @@ from stcal.robot.identification.variances import GROSS, Relaxation, components, 
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import with_values
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Elasticity, Robot
+from stcal.robot.kinematics.model import Robot
 
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
 """Lower limit of the σ at the start; σ that are not given start at the misfit of the nominal robot."""
@@ -147,7 +148,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     computed = options.observe is None and _turns_as_computed(first, data)
     observations = observed(data, "position" if computed else options.observe)
     rows = NominalRows.about(first, parameter_units(jacobian(first, observations)), robot, options.adjust)
-    _enough(observations, first, rows)
+    seeks = len(parameter_names(first, observations.kind)) - unseen(observations.kind) - int(rows.fixed.sum())
+    require_enough(observations, seeks, "parameters", "better twice that")
     adjusted, held_out, gain = _modelled(robot, first, observations, options, rows)
     solution, state = adjusted.solution, adjusted.solution.state
     names = parameter_names(state, observations.kind)
@@ -161,8 +163,18 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     wider, remarks = widened(prediction, findings or ())
     of_arm = any(not each.advice for each in findings or ())
     tested = held_out is not None or options.folds < LEAST_FOLDS
+    elasticity_sigma = None
+    if state.elastic and state.chain.elasticity is not None:
+        template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
+        elasticity_sigma = with_values(template, np.sqrt(np.diag(full_covariance))[-state.elastic_count :])
+    every = None
+    if rows.fixed.any():  # a rigid arm with all dimensions adjusted
+        free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
+        all_rows = NominalRows.about(first, parameter_units(jacobian(first, observations)), free)
+        every = _cross_validated(observations, _adjusted(first, observations, options, all_rows), options)
     result = Identified(
         robot=identified,
+        nominal=robot,
         seen=observations,
         adjustment=adjusted,
         names=tuple(names),
@@ -178,9 +190,9 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         dh_sigma=adjusted.rows.sigma(identified, covariance),
         observability=_observability(identified, adjusted, observations, rank),
         deviations=adjusted.deviations.of(adjusted.rows.groups),
-        elasticity_sigma=_elasticity_sigma(state, full_covariance),
+        elasticity_sigma=elasticity_sigma,
         gain=gain,
-        all_held_out=_with_all(robot, first, observations, options) if rows.fixed.any() else None,
+        all_held_out=every,
         notes=data.notes
         + ((COMPUTED,) if computed else ())
         + adjusted.rows.notes(identified)
@@ -192,7 +204,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + ((TRY_ELASTIC,) if remarks and of_arm and not state.elastic else ())
         + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
-    return replace(result, notes=result.notes + misgivings(result, robot))
+    return replace(result, notes=result.notes + misgivings(result))
 
 
 def _modelled(
@@ -202,30 +214,25 @@ def _modelled(
     held-out errors, and the gain if both were tried."""
     rigid = _adjusted(first, measured, options, rows)
     if options.model == "rigid":
-        return rigid, _cross_validated(robot, measured, rigid, options), None
+        return rigid, _cross_validated(measured, rigid, options), None
     _undetermined(rigid.solution, parameter_names(first, measured.kind), measured, options.partial)
     conditions = measured.data.conditions
     state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad, conditions)
-    carried, units = carries(state.chain, conditions), parameter_units(jacobian(state, measured))
+    elasticity, units = state.chain.elasticity, parameter_units(jacobian(state, measured))
+    carried = conditions.loaded  # if no row states a load, by the payload of the chain
+    if conditions.payload_kg is None:
+        carried = elasticity is not None and elasticity.payload_kg > 0
     rows = NominalRows.about(state, units, robot, options.adjust, carried)
     good = rigid.solution.weights >= GROSS
     good |= good.mean() < MOSTLY_GOOD
     elastic = _without_errors(state, measured, good, options, (rows, rigid.weighting, rigid.deviations))
-    held_out = [_cross_validated(robot, measured, each, options) for each in (rigid, elastic)]
+    held_out = [_cross_validated(measured, each, options) for each in (rigid, elastic)]
     if held_out[0] is None or held_out[1] is None:
         return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
     gain = Gain.between(held_out[0], held_out[1])
     if options.model == "elastic" or gain.beyond_chance:
         return elastic, held_out[1], gain
     return rigid, held_out[0], gain
-
-
-def _elasticity_sigma(state: State, covariance: np.ndarray) -> Elasticity | None:
-    """Returns σ of the elasticity from the covariance (k, k) of all parameters; None for a rigid arm."""
-    if not state.elastic or state.chain.elasticity is None:
-        return None
-    template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
-    return with_values(template, np.sqrt(np.diag(covariance))[-state.elastic_count :])
 
 
 def _turns_as_computed(first: State, data: Measurements) -> bool:
@@ -254,18 +261,6 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
             )
 
 
-def _enough(measured: Observed, state: State, rows: NominalRows) -> None:
-    seeks = len(parameter_names(state, measured.kind)) - unseen(measured.kind) - int(rows.fixed.sum())
-    numbers = WIDTH[measured.kind] * len(measured)
-    if numbers <= seeks:
-        needed = seeks // WIDTH[measured.kind] + 1
-        raise DegenerateError(
-            "E-IDENTIFY-FEW",
-            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} parameters; "
-            f"{needed} or more needed, better twice that",
-        )
-
-
 def _weighting(state: State, measured: Observed, options: IdentifyOptions) -> Weighting:
     """Returns the weighting at the start. If all σ are given, they are weights that σ₀ multiplies; one of two σ is
     exact. σ that are not given start at the misfit, so that no observation is an outlier at first."""
@@ -280,13 +275,6 @@ def _weighting(state: State, measured: Observed, options: IdentifyOptions) -> We
     white = weighting.whiten(residuals(state, measured), measured)
     misfit = {name: float(np.median(np.abs(white[:, c]))) for name, c in weighting.columns(white.shape[1]).items()}
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
-
-
-def _with_all(robot: Robot, first: State, measured: Observed, options: IdentifyOptions) -> HeldOutRows | None:
-    """Returns the held-out errors of a rigid arm with all dimensions adjusted."""
-    free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
-    rows = NominalRows.about(first, parameter_units(jacobian(first, measured)), free)
-    return _cross_validated(robot, measured, _adjusted(first, measured, options, rows), options)
 
 
 def _adjusted(state: State, measured: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
@@ -465,9 +453,7 @@ def _by_places(covariance: np.ndarray, adjusted: Adjustment, measured: Observed)
     return covariance + (clusters.covariance - clusters.independent) * sigma[:, None] * sigma
 
 
-def _cross_validated(
-    robot: Robot, measured: Observed, whole: Adjustment, options: IdentifyOptions
-) -> HeldOutRows | None:
+def _cross_validated(measured: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
     """Returns errors of rows that took no part in the parameters; None if too few. If few, they do not count for σ and
     gross errors either. Iterations start at the solution of all rows."""
     rows = len(measured)

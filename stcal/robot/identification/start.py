@@ -2,23 +2,25 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import chain, combinations, product
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares, minimize_scalar
+from scipy.optimize import least_squares
 
-from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError
+from stcal.explain import Candidate, explain
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.poses.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.identification.adjustment import USELESS_MM, State, observed, residuals, tips_of
-from stcal.robot.kinematics.dh import FITS, require_convention, require_orientations
+from stcal.robot.kinematics.dh import FITS, require_orientations
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import DHRow, Robot
+from stcal.robot.kinematics.model import Robot
 
 Fit = frozenset[Literal["base", "tool"]]
 BOTH: Fit = frozenset(("base", "tool"))
@@ -34,14 +36,12 @@ to the data, the valley is flat, and the misfit shows it."""
 STILL_MM = 0.01
 QUARTERS_DEG = (90, -90, 180)
 """Errors of a joint's zero that conventions of a robot's home position cause."""
-ZERO_STEP_DEG = 30
-"""Step at which other errors of a joint's zero are looked for; between two steps there is one minimum."""
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
-ALIKE, MOST_NAMED = 1.05, 3
-"""Ratio of misfits up to which reasons explain the data equally, as a joint's zero off by 180° and another joint's sign
-may, and largest number of them that is named."""
+MOST_NAMED = 3
+"""Largest number of mistakes that explain the data equally and are named, as a joint's zero off by 180° and another
+joint's sign may."""
 SHOWN = 6
 """Number of lines that a message names."""
 GUESS_ROWS = 60
@@ -86,9 +86,7 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
         _explain(robot, data, tools, misfit, extent)
     if data.rotations is not None:
         flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
-        require_convention(data.where, data.targets, flange, data.rotations)
-        if len(data) >= LEAST_ORIENTATIONS:
-            require_orientations(data.where, data.targets, flange, data.rotations)
+        require_orientations(data.where, data.targets, flange, data.rotations, len(data) >= LEAST_ORIENTATIONS)
     return replace(state, stations={data.stations[0]: Rigid()})
 
 
@@ -274,24 +272,21 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     """Raises an error that says what is wrong with the data, or with the robot file."""
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS * extent:.3g} mm allowed, {FITS:.0%} of their spread; "
-    thinned = _thinned(data)
-    singles = chain([("", robot, data)], _guesses(robot, thinned), _arms(robot, thinned), _late(robot, data))
-    others = _elsewhere(robot, data, tools), _any_zero(robot, thinned, tools), _pairs_of_mistakes(robot, thinned)
-    for guesses in (singles, *others):
-        fitting = []
-        for reason, variant, guess in guesses:
-            try:
-                share, far = _fitting(variant, guess, tools)
-            except (DegenerateError, ConvergenceError):  # this guess leaves too few data, or explains nothing
-                continue
-            if share < min(EXPLAINS * misfit / extent, FITS):
-                fitting.append((share, ", and ".join(each for each in (reason, _not_there(guess, far)) if each)))
-                if not reason:
-                    break  # all fits but some rows
-        if fitting:
-            least = min(fitting)[0]
-            alike = [reason for share, reason in sorted(fitting) if share <= ALIKE * least]
-            raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {', or if '.join(alike[:MOST_NAMED])}")
+    thinned, most = _thinned(data), min(EXPLAINS * misfit / extent, FITS)
+    levels = (
+        [("", "", robot, data)],
+        chain(_single(robot, thinned), _late(robot, data)),
+        _moves_of(robot, data, tools),
+    )
+    for level in (*levels, _pairs(robot, thinned)):
+        cases = (Candidate(f"{what}; {cure}" if what else "", partial(tuple, case)) for what, cure, *case in level)
+        found = explain(cases, lambda case: _fitting(*case, tools)[0], most)
+        if found:
+            words = [
+                ", and ".join(filter(None, (each.words, _not_there(case[1], _fitting(*case, tools)[1]))))
+                for each, case in ((each, each.change()) for each, _ in found[:MOST_NAMED])
+            ]
+            raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {', or if '.join(words)}")
     raise InputError(
         "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
     )
@@ -302,47 +297,6 @@ def _thinned(data: Measurements) -> Measurements:
     if data.positions is None:
         return data
     return data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
-
-
-def _late(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields joint values that stand one row from the positions they belong to."""
-    if data.positions is None or len(data) < 3:
-        return
-    reason = "joint values stood one row further {}; pair each position with the joint values of its moment"
-    for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
-        yield reason.format(way), robot, _thinned(replace(data[places], q=data.q[joints]))
-
-
-def _elsewhere(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields the rows up to the first at which the instrument, the base or the target seems to stand elsewhere, if the
-    rows between such changes all fit by themselves."""
-    if data.positions is None or robot.tree is not None:
-        return
-    starts = [0]
-    while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
-        state, misfit = _placed(robot, data[first : first + PROBED], tools)
-        rest = data[first:]
-        far = np.linalg.norm(residuals(state, observed(rest, "position")), axis=1) > FITS * _extent(data)
-        if misfit > FITS * _extent(data) or not far.any():
-            break
-        starts.append(first + int(far.argmax()))
-    ends = [*starts[1:], len(data)]
-    if not 1 < len(starts) <= MOST_MOVES + 1 or min(np.subtract(ends, starts)) < PROBED:
-        return
-    pieces = [data[first:end] for first, end in zip(starts, ends, strict=True)]
-    if any(_placed(robot, each, tools)[1] > FITS * _extent(each) for each in pieces):
-        return
-    stations = tuple(str(k) for k, piece in enumerate(pieces) for _ in range(len(piece)))
-    lines = ", ".join(str(data.lines[first]) for first in starts[1:])
-    try:
-        _with_stations(robot, replace(data, stations=stations), BOTH)
-        what, column = "the instrument, or the robot's base, had", "station"
-    except InputError:
-        what, column = "the target, and perhaps the instrument, had", "target"
-    reason = (
-        f"{what} not moved before line{'s' * (len(starts) > 2)} {lines}; name the rows from there on in column {column}"
-    )
-    yield reason, robot, pieces[0]
 
 
 def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
@@ -364,107 +318,160 @@ def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple
 
 def _not_there(data: Measurements, far: np.ndarray) -> str:
     """Returns the reason that rows (m,) are far off; empty if there are none."""
-    if not far.any():
-        return ""
     lines = [str(line) for line, off in zip(data.lines, far, strict=True) if off]
     shown = ", ".join(lines[:SHOWN]) + (", …" if len(lines) > SHOWN else "")
-    return f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
+    said = f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
+    return said if lines else ""
 
 
-def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields frequent mistakes in the rows: convention, zeros of joints, order of joints and of rows."""
-    n = len(robot.rows)
-    yield from _other_convention(robot, data)
-    yield from _zeros(robot, data)
+Case = tuple[str, str, Robot, Measurements]
+"""What was mistaken, the remedy, and robot and data without the mistake."""
+
+
+def _late(robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Yields joint values that stand one row from the positions they belong to."""
+    if data.positions is None or len(data) < 3:
+        return
+    cure = "pair each position with the joint values of its moment"
+    for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
+        yield (
+            f"joint values stood one row further {way}",
+            cure,
+            robot,
+            _thinned(replace(data[places], q=data.q[joints])),
+        )
+
+
+def _moves_of(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
+    """Yields the rows up to the first at which the instrument, the base or the target seems to stand elsewhere, if the
+    rows between such changes all fit by themselves."""
+    if data.positions is None or robot.tree is not None:
+        return
+    starts = [0]
+    while (first := starts[-1]) < len(data) - PROBED and len(starts) <= MOST_MOVES + 1:
+        state, misfit = _placed(robot, data[first : first + PROBED], tools)
+        far = np.linalg.norm(residuals(state, observed(data[first:], "position")), axis=1) > FITS * _extent(data)
+        if misfit > FITS * _extent(data) or not far.any():
+            break
+        starts.append(first + int(far.argmax()))
+    ends = [*starts[1:], len(data)]
+    if not 1 < len(starts) <= MOST_MOVES + 1 or min(np.subtract(ends, starts)) < PROBED:
+        return
+    pieces = [data[first:end] for first, end in zip(starts, ends, strict=True)]
+    if any(_placed(robot, each, tools)[1] > FITS * _extent(each) for each in pieces):
+        return
+    stations = tuple(str(k) for k, piece in enumerate(pieces) for _ in range(len(piece)))
+    lines = ", ".join(str(data.lines[first]) for first in starts[1:])
+    try:
+        _with_stations(robot, replace(data, stations=stations), BOTH)
+        what, column = "the instrument, or the robot's base, had", "station"
+    except InputError:
+        what, column = "the target, and perhaps the instrument, had", "target"
+    what = f"{what} not moved before line{'s' * (len(starts) > 2)} {lines}"
+    yield what, f"name the rows from there on in column {column}", robot, pieces[0]
+
+
+def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Yields frequent mistakes, one at a time."""
+    q = data.q
+    in_degrees = replace(data, q=q * np.where(robot.prismatic, 1.0, 180 / np.pi))
+    yield "joint values are radians in columns of degrees", "call the columns q1_rad …", robot, in_degrees
+    lengths = {"distances": data.distances, "positions": data.positions}
+    for unit, words in UNIT_WORDS.items():
+        there = words, "mm", unit, LENGTHS[unit]
+        for held, said, right, times in (there, ("mm", words, "mm", 1 / LENGTHS[unit])):
+            scaled = {name: times * values for name, values in lengths.items() if values is not None}
+            cure = f"call the columns x_{right} … or distance_{right}"
+            yield f"lengths are {held} in columns of {said}", cure, robot, replace(data, **scaled)
+    yield from chain.from_iterable(kind(robot, data) for kind in KINDS)
     angles = np.array([[row.alpha, row.theta] for row in robot.rows])
     if angles.any() and np.abs(angles).max() <= np.radians(2 * np.pi):
         rows = tuple(replace(row, alpha=np.degrees(row.alpha), theta=np.degrees(row.theta)) for row in robot.rows)
-        yield "angles of the robot file were radians; write them in degrees", replace(robot, rows=rows), data
-    for i, k in combinations(range(n), 2):
-        if n > MOST_JOINTS or robot.joints[i].type != robot.joints[k].type:
-            continue
-        order = list(range(n))
-        order[i], order[k] = k, i
-        reason = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
-        yield reason, robot, replace(data, q=data.q[:, order])
-        if robot.tree is None:
-            rows = tuple(robot.rows[r] for r in order)
-            yield f"rows {i + 1} and {k + 1} were exchanged; correct the robot file", replace(robot, rows=rows), data
-    if len({joint.type for joint in robot.joints}) == 1:
-        reason = "joint values were in the opposite order, the last joint first; correct the columns"
-        yield reason, robot, replace(data, q=data.q[:, ::-1])
+        yield "angles of the robot file were radians", "write them in degrees", replace(robot, rows=rows), data
+    types = [joint.type for joint in robot.joints]
+    for i, k in combinations(range(len(types)), 2) if len(types) <= MOST_JOINTS else ():
+        if types[i] == types[k]:
+            order = list(range(len(types)))
+            order[i], order[k] = k, i
+            what, rows = f"{i + 1} and {k + 1} were exchanged", tuple(robot.rows[r] for r in order)
+            columns = f"columns q{i + 1} and q{k + 1} were exchanged"
+            yield columns, "correct the order of the joint values", robot, replace(data, q=q[:, order])
+            if robot.tree is None:
+                yield f"rows {what}", "correct the robot file", replace(robot, rows=rows), data
+    if len(set(types)) == 1:
+        backward = replace(data, q=q[:, ::-1])
+        yield "joint values were in the opposite order, the last joint first", "correct the columns", robot, backward
+    if data.positions is None:
+        return
+    moved = np.r_[True, (np.diff(data.positions, axis=0) != 0).any(1)]
+    if not moved.all():
+        first, last = np.flatnonzero(~moved)[[0, -1]]
+        what = (
+            f"{(~moved).sum()} rows, from line {data.lines[first]} to {data.lines[last]}, did not repeat the position "
+            "of the row before them, while the joints moved"
+        )
+        yield what, "leave them out, or measure again", robot, data[moved]
+    mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
+    yield "positions are mirrored (a left-handed frame)", "change the sign of one axis", robot, mirrored
+    if data.rotations is not None:
+        inverse = data.poses().inverse()
+        inverted = replace(data, positions=inverse.translation, rotations=inverse.rotation, covariance=None)
+        cure = "give the tool in the instrument's frame"
+        yield "poses are inverse (instrument seen from the tool)", cure, robot, inverted
 
 
-def _pairs_of_mistakes(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+def _pairs(robot: Robot, data: Measurements) -> Iterator[Case]:
     """Yields the data with two mistakes undone: of different kinds, two wrong zeros, or several reversed signs."""
-    n, inner = len(robot.rows), _inner(robot)
+    n = len(robot.rows)
     if n > MOST_JOINTS:
         return
-    for i, k in combinations(inner, 2):
-        for turns in product(QUARTERS_DEG, repeat=2):
-            rows = _turned(robot.rows, {i: turns[0], k: turns[1]})
-            reason = f"theta of joints {i + 1} and {k + 1} were larger by {turns[0]:+d}° and {turns[1]:+d}°"
-            yield f"{reason}; correct theta_deg", replace(robot, rows=rows), data
-    turning = np.flatnonzero(~robot.prismatic).tolist()
+    for i, k in combinations(_inner(robot), 2):
+        for one, two in product(QUARTERS_DEG, repeat=2):
+            what = f"theta of joints {i + 1} and {k + 1} were larger by {one:+d}° and {two:+d}°"
+            yield what, "correct theta_deg", _turned(robot, {i: one, k: two}), data
     for count in (2, 3):
-        for group in combinations(turning, count):
-            named = ", ".join(str(i + 1) for i in group)
-            reason = f"joints {named} had the opposite sign; check their directions in the rows, or the signs of q"
-            yield reason, robot, replace(data, q=data.q * np.where(np.isin(np.arange(n), group), -1, 1))
-    for first, second in combinations((_other_convention, _zeros, _signs, _couplings), 2):
-        for reason, variant, guess in first(robot, data):
-            for more, both, changed in second(variant, guess):
-                yield f"{reason.split('; ')[0]} and {more}", both, changed
+        for group in combinations(np.flatnonzero(~robot.prismatic).tolist(), count):
+            what = f"joints {', '.join(str(i + 1) for i in group)} had the opposite sign"
+            reversed_ = replace(data, q=data.q * np.where(np.isin(np.arange(n), group), -1, 1))
+            yield what, "check their directions in the rows, or the signs of q", robot, reversed_
+    for first, second in combinations(KINDS, 2):
+        for what, _, variant, guess in first(robot, data):
+            for more, cure, both, changed in second(variant, guess):
+                yield f"{what} and {more}", cure, both, changed
 
 
-def _other_convention(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+def _other_convention(robot: Robot, data: Measurements) -> Iterator[Case]:
     other = "standard" if robot.convention == "modified" else "modified"
-    reason = f'rows were of the {other} convention; give convention = "{other}" in the robot file'
-    yield reason, replace(robot, convention=other), data
+    cure = f'give convention = "{other}" in the robot file'
+    yield f"rows were of the {other} convention", cure, replace(robot, convention=other), data
 
 
-def _zeros(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    for i in _inner(robot):
-        for turn in QUARTERS_DEG:
-            reason = f"theta of joint {i + 1} were larger by {turn:+d}°; correct theta_deg"
-            yield reason, replace(robot, rows=_turned(robot.rows, {i: turn})), data
+def _zeros(robot: Robot, data: Measurements) -> Iterator[Case]:
+    for i, turn in product(_inner(robot), QUARTERS_DEG):
+        yield f"theta of joint {i + 1} were larger by {turn:+d}°", "correct theta_deg", _turned(robot, {i: turn}), data
 
 
-def _any_zero(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields the turn of each inner joint's zero that fits best, whatever its size."""
-    for i in _inner(robot):
-
-        def misfit(turn: float, i: int = i) -> float:
-            return _placed(replace(robot, rows=_turned(robot.rows, {i: turn})), data, tools)[1]
-
-        try:
-            start_deg = min(range(-180, 180, ZERO_STEP_DEG), key=misfit)
-            ends = start_deg - ZERO_STEP_DEG, start_deg + ZERO_STEP_DEG
-            turn = float(minimize_scalar(misfit, bounds=ends, method="bounded", options={"xatol": 0.02}).x)
-        except (DegenerateError, ConvergenceError):
-            continue
-        reason = f"theta of joint {i + 1} were larger by {turn:+.1f}°; correct theta_deg, or the joint's zero"
-        yield reason, replace(robot, rows=_turned(robot.rows, {i: turn})), data
-
-
-def _signs(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+def _signs(robot: Robot, data: Measurements) -> Iterator[Case]:
     for i in range(n := len(robot.rows)):
-        reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
-        yield reason, robot, replace(data, q=data.q * np.where(np.arange(n) == i, -1, 1))
+        cure = f"check its direction in the rows, or the sign of q{i + 1}"
+        reversed_ = replace(data, q=data.q * np.where(np.arange(n) == i, -1, 1))
+        yield f"joint {i + 1} had the opposite sign", cure, robot, reversed_
 
 
-def _couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+def _couplings(robot: Robot, data: Measurements) -> Iterator[Case]:
     n = len(robot.rows)
     if (robot.coupling != np.eye(n)).any():
-        yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
-        reason = "the joints were coupled with the other sign; change the signs of coupling off its diagonal"
-        yield reason, replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling), data
+        yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
     elif n >= 3:
         for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
             coupling = np.eye(n)
             coupling[2, 1] = sign
-            reason = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}; give coupling in the robot file"
-            yield reason, replace(robot, coupling=coupling), data
+            what = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}"
+            yield what, "give coupling in the robot file", replace(robot, coupling=coupling), data
+
+
+KINDS = (_other_convention, _zeros, _signs, _couplings)
+"""Kinds of mistakes of which two may have been made."""
 
 
 def _inner(robot: Robot) -> list[int]:
@@ -472,43 +479,9 @@ def _inner(robot: Robot) -> list[int]:
     return [i for i in range(1, len(robot.rows) - 1) if robot.joints[i].type == "revolute"]
 
 
-def _turned(rows: tuple[DHRow, ...], turns_deg: Mapping[int, float]) -> tuple[DHRow, ...]:
-    """Returns the rows with θ larger by these angles."""
-    return tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in enumerate(rows))
-
-
-def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields frequent mistakes: in words, with the robot and the data as they would be without the mistake."""
-    turning = ~robot.prismatic
-    q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
-    yield "joint values are radians in columns of degrees; call the columns q1_rad …", robot, replace(data, q=q * angle)
-    yield "joint values are degrees in columns of radians; call the columns q1_deg …", robot, replace(data, q=q / angle)
-    lengths = {"distances": data.distances, "positions": data.positions}
-    for unit, words in UNIT_WORDS.items():
-        reason = f"lengths are {words} in columns of mm; call the columns x_{unit} … or distance_{unit}"
-        scaled = {name: LENGTHS[unit] * values for name, values in lengths.items() if values is not None}
-        yield reason, robot, replace(data, **scaled)
-        reason = f"lengths are mm in columns of {words}; call the columns x_mm … or distance_mm"
-        scaled = {name: values / LENGTHS[unit] for name, values in lengths.items() if values is not None}
-        yield reason, robot, replace(data, **scaled)
-    reason = "all joint values had the opposite sign; check the rows and the joints' directions"
-    yield reason, robot, replace(data, q=np.where(turning, -q, q))
-    yield from _signs(robot, data)
-    yield from _couplings(robot, data)
-    if data.positions is None:
-        return
-    moved = np.r_[True, (np.diff(data.positions, axis=0) != 0).any(1)]
-    if not moved.all():
-        first, last = np.flatnonzero(~moved)[[0, -1]]
-        reason = (
-            f"{(~moved).sum()} rows, from line {data.lines[first]} to {data.lines[last]}, did not repeat the position "
-            "of the row before them, while the joints moved; leave them out, or measure again"
-        )
-        yield reason, robot, data[moved]
-    mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
-    yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
-    if data.rotations is not None:
-        inverse = data.poses().inverse()
-        reason = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"
-        inverted = {"positions": inverse.translation, "rotations": inverse.rotation, "covariance": None}
-        yield reason, robot, replace(data, **inverted)
+def _turned(robot: Robot, turns_deg: Mapping[int, float]) -> Robot:
+    """Returns the robot with θ of its rows larger by these angles."""
+    rows = enumerate(robot.rows)
+    return replace(
+        robot, rows=tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in rows)
+    )

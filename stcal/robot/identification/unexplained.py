@@ -40,16 +40,11 @@ TURNS = {1: "once a turn", 2: "twice a turn"}
 class Finding:
     """An effect found in the residuals.
 
-    Parameters
-    ----------
-    what : name of the effect: "the angle of joint 3, once a turn"
-    effect_mm, effect_rad : amplitude in the residuals of position and of orientation (0 if there are none) if the
-        effect is periodic, else RMS
-    joint, turns : number of the joint, and number of periods in one turn of it; 0 where there is none
-    share : share of the squared residuals (weighted as in the fit) that the effect explains
-    p : probability of such an effect by chance, times the number of tests
-    line : line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size
-    advice : what to do about it; empty for effects of the robot
+    ``what`` : its name ("the angle of joint 3, once a turn"); ``joint``, ``turns`` : number of the joint, and of
+    periods in one turn of it, 0 where there is none; ``effect_mm``, ``effect_rad`` : amplitude in the residuals if it
+    is periodic, size of a jump, else RMS; ``share`` : of the squared residuals (weighted as in the fit) explained;
+    ``p`` : probability of such an effect by chance, times the number of tests; ``line`` : of the first row after a jump
+    along the order of the rows; ``advice`` : what to do about it, empty for effects of the robot.
     """
 
     what: str
@@ -190,37 +185,30 @@ class _Rest:
         ]
         if not tried:
             return None
-        candidate, best = min(tried, key=lambda each: each[1].log_p)
+        candidate, (log_p, takes, new) = min(tried, key=lambda each: each[1][0])
         amplitude = np.sqrt(2) if candidate.turns else 1.0
-        mm = float(amplitude * self._effect(best.takes, slice(-3, None)))
-        rad = float(amplitude * self._effect(best.takes, slice(0, 3))) if self.errors.shape[1] == 6 else 0.0
-        share = float(best.takes @ best.takes) / max(self.square, 1e-300)
-        log_p = best.log_p + float(np.log(len(tried) + others))
+        mm = float(amplitude * self._effect(takes, slice(-3, None)))
+        rad = float(amplitude * self._effect(takes, slice(0, 3))) if self.errors.shape[1] == 6 else 0.0
+        share = float(takes @ takes) / max(self.square, 1e-300)
+        log_p += float(np.log(len(tried) + others))
         if log_p > np.log(LEVEL) or share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
             return None
         p = float(np.exp(min(log_p, 0.0)))
         rest = replace(
             self,
-            fitted=np.hstack([self.fitted, best.new]),
-            remaining=self.remaining - best.takes,
-            freedom=self.freedom - best.new.shape[1],
+            fitted=np.hstack([self.fitted, new]),
+            remaining=self.remaining - takes,
+            freedom=self.freedom - new.shape[1],
         )
         finding = Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p)
         return _Found(finding, log_p, candidate.motions, self.root, rest)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Test:
-    """An F test. ``log_p`` : logarithm of the probability by chance; ``takes`` : (N,) part of the residuals that the
-    candidate explains; ``new`` : (N, c) basis of what it adds."""
-
-    log_p: float
-    takes: np.ndarray
-    new: np.ndarray
-
-
-def _tested(rest: np.ndarray, known: np.ndarray, values: np.ndarray, freedom: int) -> _Test | None:
-    """Returns the F test of what ``values`` (N, c) add to ``known``; None if nothing, or without degrees of freedom."""
+def _tested(
+    rest: np.ndarray, known: np.ndarray, values: np.ndarray, freedom: int
+) -> tuple[float, np.ndarray, np.ndarray] | None:
+    """Returns the F test of what ``values`` (N, c) add to ``known``: log p, the part (N,) of the residuals that it
+    explains, and a basis (N, c) of it; None if nothing, or without degrees of freedom."""
     values = _unit(values)
     new = _basis(values - known @ (known.T @ values), NEW)
     c = new.shape[1]
@@ -229,7 +217,7 @@ def _tested(rest: np.ndarray, known: np.ndarray, values: np.ndarray, freedom: in
     takes = new @ (new.T @ rest)
     left_over = rest - takes
     ratio = float(takes @ takes) / c / max(float(left_over @ left_over) / (freedom - c), 1e-300)
-    return _Test(float(f_distribution.logsf(ratio, c, freedom - c)), takes, new)
+    return float(f_distribution.logsf(ratio, c, freedom - c)), takes, new
 
 
 def _unit(values: np.ndarray) -> np.ndarray:
@@ -306,7 +294,7 @@ def _moved_meanwhile(
     mm, rad = _size(moved, change)
     if log_p > np.log(LEVEL) or change.share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
         return None
-    lines = [int(measured.data.lines[row]) for row in measured.first]
+    lines = measured.lines
     if change.kind == "drift":
         what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
     else:

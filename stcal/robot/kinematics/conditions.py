@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -77,46 +77,36 @@ def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
 def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
     """Reads payload and columns ``approach1`` … of a table; the payload is column ``payload_kg``, or the argument.
     Raises InputError naming the line."""
-    return replace(_carried(table, payload_kg), approach=_approach(table, joints))
+
+    def require(good: np.ndarray, code: str, name: str, values: np.ndarray, needed: str) -> None:
+        for row in np.flatnonzero(~good).tolist():
+            raise InputError(
+                code, f"{table.where}: line {table.lines[row]}: {name} is {values[row]:g}; {needed} needed"
+            )
+
+    mass = None if payload_kg is None else loaded(payload_kg, len(table)).payload_kg
+    if PAYLOAD in table:
+        if payload_kg is not None:
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}; leave one of them out",
+            )
+        mass = table.numbers(PAYLOAD)
+        require((mass >= 0) & (mass <= MOST_KG), "E-PAYLOAD-VALUE", PAYLOAD, mass, f"0 … {MOST_KG:g}")
+    columns, approach = approach_columns(joints), None
+    if any(name in table for name in columns):
+        approach = np.zeros((len(table), joints))
+        for i, name in enumerate(columns):
+            if name in table:
+                approach[:, i] = values = table.numbers(name)
+                came = f"1 (joint {i + 1} came from below), -1 (from above) or 0 (not known)"
+                require(np.isin(values, DIRECTIONS), "E-APPROACH-VALUE", name, values, came)
+    return Conditions(mass, approach)
 
 
 def approach_columns(joints: int) -> tuple[str, ...]:
     """Returns the column names ``approach1`` … of ``joints`` joints."""
     return tuple(f"{APPROACH}{i + 1}" for i in range(joints))
-
-
-def _approach(table: Table, joints: int) -> np.ndarray | None:
-    columns = approach_columns(joints)
-    if not any(name in table for name in columns):
-        return None
-    values = np.zeros((len(table), joints))
-    for i, name in enumerate(columns):
-        if name in table:
-            values[:, i] = table.numbers(name)
-            for row in np.flatnonzero(~np.isin(values[:, i], DIRECTIONS)).tolist():
-                raise InputError(
-                    "E-APPROACH-VALUE",
-                    f"{table.where}: line {table.lines[row]}: {name} is {values[row, i]:g}; 1 (joint {i + 1} came from "
-                    "below), -1 (from above) or 0 (not known) needed",
-                )
-    return values
-
-
-def _carried(table: Table, payload_kg: float | None) -> Conditions:
-    if PAYLOAD not in table:
-        return loaded(payload_kg, len(table))
-    if payload_kg is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"{table.where}: a column {PAYLOAD}, and --payload-kg {payload_kg:g}; leave one of them out",
-        )
-    values = table.numbers(PAYLOAD)
-    for line, value in zip(table.lines, values.tolist(), strict=True):
-        if not 0 <= value <= MOST_KG:
-            raise InputError(
-                "E-PAYLOAD-VALUE", f"{table.where}: line {line}: {PAYLOAD} is {value:g}; 0 … {MOST_KG:g} needed"
-            )
-    return Conditions(values)
 
 
 _UNITS = "|".join((*ANGLES, *LENGTHS))

@@ -2,13 +2,15 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.explain import Candidate, explain
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.rotations import EXPLAINS, explaining
+from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.model import (
     Chain,
@@ -225,62 +227,38 @@ MOST_TOOLS = 200
 """Number of rows of a target whose tools are tried for the one that most rows agree with."""
 
 
-def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
-    """Refuse orientations that fit the robot only in another quaternion convention.
+def require_orientations(
+    where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray, many: bool = True
+) -> None:
+    """Refuse orientations of which most are not those of the robot, whatever its tools.
 
     ``where`` : name of the file; ``targets`` : (m,) of the rows; ``flange``, ``seen`` : (m, 3, 3) rotations by the
-    model, and of the targets as read.
+    model, and of the targets as read; ``many`` : False for few rows, which are refused only if quaternions of another
+    convention fit. The typical angle is tested, as few rows may be wrong. One orientation in all rows is no misreading:
+    the adjustment finds that it tells nothing.
 
-    Raises InputError: only another convention fits; the message names it.
+    Raises InputError: the message names the misreading that explains it.
     """
-    own = turned_rad(targets, flange, seen)
-    if own < TURNED_RAD:
-        return
-    found = explaining(seen, lambda rotations: turned_rad(targets, flange, rotations))
-    if found is not None:
-        reading, left = found
-        raise InputError(
-            "E-ROBOT-ORIENTATIONS",
-            f"{where}: orientations miss the robot by {np.degrees(own):.3g}° RMS, {np.degrees(TURNED_RAD):.2g}° "
-            f"allowed; they would fit to {np.degrees(left):.2g}° if quaternions were {reading.held}; {reading.remedy}",
-        )
-
-
-def turned_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
-    """Returns the RMS angle, rad, of ``seen`` (m, 3, 3) to the flange's with the best-fitting tool of each target."""
-    between = np.swapaxes(flange, 1, 2) @ seen
-    square = 0.0
-    for name in set(targets):
-        own = between[[t == name for t in targets]]
-        tool = Rotation.from_matrix(own).mean()
-        square += float(((tool.inv() * Rotation.from_matrix(own)).magnitude() ** 2).sum())
-    return float(np.sqrt(square / len(seen)))
-
-
-def require_orientations(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
-    """Refuse orientations of which most are not those of the robot, whatever its tools; arguments as above.
-
-    The typical angle is tested, as few rows may be wrong. One orientation in all rows is no misreading: the adjustment
-    finds that it tells nothing. Raises InputError: the message names the misreading that explains it.
-    """
+    names, rows = np.array(targets, object), np.arange(len(seen))
     own = _typical_rad(targets, flange, seen)
     if own < TURNED_RAD or np.ptp(seen, axis=0).max() < NOTHING_RAD:
         return
-    missed = f"{where}: orientations typically miss the robot by {np.degrees(own):.3g}°, {np.degrees(TURNED_RAD):.2g}°"
-    left = {
-        reason: _typical_rad(np.array(targets, object)[rows].tolist(), flange[rows], read)
-        for reason, rows, read in _misread(seen)
-    }
-    best = min(left, key=left.__getitem__)
-    if left[best] < EXPLAINS * own:
-        raise InputError(
-            "E-ROBOT-ORIENTATIONS", f"{missed} allowed; by {np.degrees(left[best]):.2g}° if {best}: correct them"
-        )
-    raise InputError(
-        "E-ROBOT-ORIENTATIONS",
-        f"{missed} allowed, though positions fit; check the convention of the angles and that each orientation is in "
-        "the line of its joint values, or leave the orientations out",
+    readings = ((f"quaternions were {each.held}; {each.remedy}", rows, each.rotations(seen)) for each in READINGS)
+    cases = [*readings, *(_misread(seen) if many else ())]
+    found = explain(
+        (Candidate(words, partial(tuple, case)) for words, *case in cases),
+        lambda case: _typical_rad(names[case[0]].tolist(), flange[case[0]], case[1]),
+        EXPLAINS * own,
     )
+    missed = f"{where}: orientations typically miss the robot by {np.degrees(own):.3g}°, {np.degrees(TURNED_RAD):.2g}°"
+    for best, left in found[:1]:
+        raise InputError("E-ROBOT-ORIENTATIONS", f"{missed} allowed; by {np.degrees(left):.2g}° if {best.words}")
+    if many:
+        raise InputError(
+            "E-ROBOT-ORIENTATIONS",
+            f"{missed} allowed, though positions fit; check the convention of the angles and that each orientation is "
+            "in the line of its joint values, or leave the orientations out",
+        )
 
 
 def _typical_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
@@ -298,15 +276,14 @@ def _misread(seen: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yields frequent misreadings of orientations in words, the rows (k,) that remain, and rotations (k, 3, 3)."""
     rows, fixed = np.arange(len(seen)), Rotation.from_matrix(seen).as_euler("xyz")
     moving = Rotation.from_matrix(seen).as_euler("XYZ")
-    yield (
-        "the first and the third angle were exchanged (A, B, C about Z, Y, X; W, P, R about X, Y, Z)",
-        rows,
-        Rotation.from_euler("xyz", fixed[:, ::-1]).as_matrix(),
-    )
-    for k, axis in enumerate("XYZ"):
-        signs = np.where(np.arange(3) == k, -1.0, 1.0)
-        yield f"the angle about {axis} had the other sign", rows, Rotation.from_euler("xyz", signs * fixed).as_matrix()
-    yield "the angles were about moving axes, X first", rows, Rotation.from_euler("XYZ", fixed).as_matrix()
-    yield "the angles were about fixed axes, X first", rows, Rotation.from_euler("xyz", moving).as_matrix()
-    yield "each orientation were in the line before", rows[:-1], seen[1:]
-    yield "each orientation were in the line after", rows[1:], seen[:-1]
+    swapped = "the first and the third angle were exchanged (A, B, C about Z, Y, X; W, P, R about X, Y, Z)"
+    angles = [(swapped, "xyz", fixed[:, ::-1])]
+    angles += [
+        (f"the angle about {'XYZ'[k]} had the other sign", "xyz", fixed * (1 - 2 * np.eye(3)[k])) for k in range(3)
+    ]
+    angles += [("the angles were about moving axes, X first", "XYZ", fixed)]
+    angles += [("the angles were about fixed axes, X first", "xyz", moving)]
+    for words, axes, values in angles:
+        yield f"{words}: correct them", rows, Rotation.from_euler(axes, values).as_matrix()
+    yield "each orientation were in the line before: correct them", rows[:-1], seen[1:]
+    yield "each orientation were in the line after: correct them", rows[1:], seen[:-1]

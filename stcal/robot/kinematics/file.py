@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
@@ -261,6 +261,10 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     if robot.elasticity is not None:
         lines += ["", *_elasticity_lines(robot.elasticity)]
     return "\n".join(lines) + "\n"
+
+
+RobotText = Annotated[str, BeforeValidator(lambda robot: robot_toml(robot) if isinstance(robot, Robot) else robot)]
+"""Text of a robot file inside a result file."""
 
 
 def _elasticity_lines(elasticity: Elasticity) -> list[str]:

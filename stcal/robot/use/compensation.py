@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AliasPath, BeforeValidator, Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
-from stcal.io.files import require_written
-from stcal.io.json import Part, ResultFile, Vector, Vector3
-from stcal.io.table import csv_text, pose_values, read_table
+from stcal.io.json import Part, ResultFile, Shape, Vector
+from stcal.io.table import csv_text
 from stcal.parallel import one_thread
-from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import (
     LIMIT,
     ORIENTATION,
@@ -40,43 +37,6 @@ LEAST_SHOWN_MM = 1e-6
 """Error below which its size says nothing."""
 ISOLATED = 6
 """Largest number of joints with isolated solutions, of which another one is another configuration."""
-
-
-ByStatus = Annotated[str, "status"]
-
-
-class CompensatedPose(Part):
-    line: int
-    target: str
-    commanded_mm: Vector3
-    commanded_quaternion: Vector
-    status: str
-    joints: dict[str, float] | None
-    error_mm: float
-    error_rad: float
-    payload_kg: float | None = None
-    nominal_status: str = ""
-    nominal_joints: dict[str, float] | None = None
-    nominal_error_mm: float | None = None
-    nominal_error_rad: float | None = None
-
-
-class CompensationFile(ResultFile):
-    """Result file of ``compensate``."""
-
-    format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
-    robot: str = Field(description="name")
-    counts: dict[ByStatus, int] = Field(description="number of poses")
-    poses: list[CompensatedPose] = Field(
-        description="the columns above: `line`, `target`, `commanded_mm`, `commanded_quaternion` (w first), `status`, "
-        "`joints` (by column name, null where not reached), `error_mm`, `error_rad`, `payload_kg` (null: as the robot "
-        "file has it), and with `--nominal` "
-        "`nominal_status`, `nominal_joints`, `nominal_error_mm`, `nominal_error_rad`"
-    )
-    notes: list[str] = Field(
-        description="columns that were not read, angles by their convention, and the warnings: doubts of targets and "
-        "robots, and rows that are not simply reached"
-    )
 
 
 def _stayed(
@@ -162,8 +122,8 @@ class Compensated(Brief):
     before_mm, before_rad : (m,) arrays
         Error of the nominal joint values by the identified robot, which compensation removes; empty without a nominal
         robot.
-    sliding : (n,) array
-        Which joints are prismatic.
+    identified : Robot
+        The identified robot, with the tools that were taken.
     reach_mm : float
         Of the arm.
     beyond : dict of int to str
@@ -180,14 +140,35 @@ class Compensated(Brief):
     nominal: Inverse | None
     before_mm: np.ndarray
     before_rad: np.ndarray
-    sliding: np.ndarray
+    identified: Robot
     reach_mm: float
     beyond: dict[int, str]
     doubts: tuple[str, ...] = ()
     controller: Robot | None = None
+    format: ClassVar = "stcal compensation 1"
 
     def __len__(self) -> int:
         return len(self.found)
+
+    @property
+    def remarks(self) -> list[str]:
+        """Notes of the file of targets, and :meth:`notes`."""
+        return [*self.targets.notes, *self.notes()]
+
+    @property
+    def lines(self) -> list[int]:
+        """Lines (m,) of the file."""
+        return [int(line) for line in self.targets.lines]
+
+    @property
+    def joints(self) -> list[dict[str, float] | None]:
+        """Joint values to command, by the names of columns; None where they do not reach the pose."""
+        return _by_column(self.found, self.identified)
+
+    @property
+    def nominal_joints(self) -> list[dict[str, float] | None] | None:
+        """The same by the nominal robot."""
+        return None if self.nominal is None else _by_column(self.nominal, self.identified)
 
     def compared(self) -> np.ndarray:
         """Mask (m,) of the rows that both robots reach."""
@@ -195,33 +176,23 @@ class Compensated(Brief):
 
     def notes(self) -> list[str]:
         """Returns doubts about targets and robots, then notes on rows not simply reached or far from nominal values."""
-        return [*self.doubts, *self._not_simply_reached(), *self._far_moved()]
-
-    def _far_moved(self) -> list[str]:
-        if self.nominal is None:
-            return []
-        moved = np.abs(self.found.q - self.nominal.q)[:, ~self.sliding].max(axis=1, initial=0.0)
-        expected = self.before_rad + self.before_mm / self.reach_mm
-        return [
-            f"line {self.targets.lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: "
-            + (
-                "near a singular pose"
-                if moved[i] > AMPLIFIED * expected[i]
-                else f"the nominal joint values err by {self.before_mm[i]:.4g} mm and "
-                f"{np.degrees(self.before_rad[i]):.3g}°"
-            )
-            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist()
-        ]
-
-    def _not_simply_reached(self) -> list[str]:
-        return [
+        found, lines, far = self.found, self.targets.lines, []
+        left = zip(lines, found.status, found.error_mm, found.error_rad, strict=True)
+        hardly = [
             f"line {line}: {MEANING[status]}{f' ({self.beyond[i]})' if i in self.beyond else ''}; {mm:.4g} mm and "
             f"{np.degrees(rad):.4g}° remain"
-            for i, (line, status, mm, rad) in enumerate(
-                zip(self.targets.lines, self.found.status, self.found.error_mm, self.found.error_rad, strict=True)
-            )
+            for i, (line, status, mm, rad) in enumerate(left)
             if status in MEANING
         ]
+        if self.nominal is not None:
+            moved = np.abs(found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
+            expected = self.before_rad + self.before_mm / self.reach_mm
+            for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist():
+                mm, rad = self.before_mm[i], self.before_rad[i]
+                errs = f"the nominal joint values err by {mm:.4g} mm and {np.degrees(rad):.3g}°"
+                why = "near a singular pose" if moved[i] > AMPLIFIED * expected[i] else errs
+                far.append(f"line {lines[i]}: a joint moves by {np.degrees(moved[i]):.1f}°: {why}")
+        return [*self.doubts, *hardly, *far]
 
 
 def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple[Robot, Robot, tuple[str, ...]]:
@@ -236,24 +207,18 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
         if mm > SAME_TOOL_MM or rad > SAME_TOOL_RAD:
             apart[name] = f"differs by {mm:.4g} mm and {np.degrees(rad):.3g}° between the two files"
     with_own = replace(nominal, tools=dict(nominal.tools) | {name: identified.tools[name] for name in apart})
-    proved = (
+    taken = "identified file is taken in both"
+    if (
         apart.keys() <= nominal.tools.keys()
         and targets.poses is not None
         and targets.q is not None
         and position_misfit_mm(nominal, targets) < position_misfit_mm(with_own, targets)
-    )
-    taken = "nominal file is taken in both (joint values beside the poses say so)" if proved else None
-    notes = tuple(
-        f"tool {name or 'of the robot files'} {said}: that of the {taken or 'identified file is taken in both'}"
-        for name, said in apart.items()
-    )
-    if proved:
-        return (
-            replace(identified, tools=dict(identified.tools) | {name: nominal.tools[name] for name in apart}),
-            nominal,
-            notes,
-        )
-    return identified, with_own, notes
+    ):
+        taken = "nominal file is taken in both (joint values beside the poses say so)"
+        own = {name: nominal.tools[name] for name in apart}
+        identified, with_own = replace(identified, tools=dict(identified.tools) | own), nominal
+    notes = (f"tool {name or 'of the robot files'} {said}: that of the {taken}" for name, said in apart.items())
+    return identified, with_own, tuple(notes)
 
 
 @require_arguments
@@ -301,7 +266,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
             f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
             "give its file with --nominal",
         )
-    doubts, others, rigid = (), (), _rigid(identified, targets)
+    doubts, others = (), ()
+    rigid = targets.conditions.ignored(f"robot {identified.name}") if identified.elasticity is None else ()
     if nominal is not None:
         apart = robots_apart(identified, nominal)
         doubts = ((apart,) if apart else ()) + _roles(identified, nominal) + _in_radians(targets, identified.prismatic)
@@ -323,7 +289,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         nominal=before,
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
-        sliding=identified.prismatic,
+        identified=identified,
         reach_mm=reach_mm(identified, targets.tools[:1]),
         beyond=beyond,
         doubts=doubts + of_targets + others + rigid,
@@ -372,14 +338,15 @@ def _built(robot: Robot) -> list[tuple[str, int]]:
     return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
 
 
-def _rigid(robot: Robot, targets: Targets) -> tuple[str, ...]:
-    """Returns a note if the robot's model has no elasticity, although loads are stated."""
-    return targets.conditions.ignored(f"robot {robot.name}") if robot.elasticity is None else ()
-
-
 def joint_columns(robot: Robot) -> list[str]:
     """Returns the column names ``q1_deg`` …, and ``q3_mm`` for prismatic joints."""
     return [f"q{i}_{'mm' if sliding else 'deg'}" for i, sliding in enumerate(robot.prismatic, 1)]
+
+
+def _by_column(found: Inverse, robot: Robot) -> list[dict[str, float] | None]:
+    columns, unit = joint_columns(robot), np.where(robot.prismatic, 1.0, np.degrees(1.0))
+    rows = zip((found.q * unit).tolist(), found.usable, strict=True)
+    return [dict(zip(columns, q, strict=True)) if usable else None for q, usable in rows]
 
 
 def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
@@ -410,91 +377,62 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
         head += [*(f"nominal_{c}" for c in columns), "nominal_status", "nominal_error_mm", "nominal_error_deg"]
     rows: list[Sequence] = [head]
 
-    def joints(inverse: Inverse, i: int) -> list[str]:
-        cells = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
-        return [*cells, inverse.status[i]]
-
-    def errors(mm: float, rad: float) -> list[str]:
-        return [f"{mm:.6f}", f"{np.degrees(rad):.6f}"]
+    def cells(inverse: Inverse, i: int, mm: np.ndarray, rad: np.ndarray, shown: bool = True) -> list[str]:
+        values = joint_cells(robot, inverse.q[i]) if inverse.usable[i] else [""] * len(columns)
+        errors = [f"{mm[i]:.6f}", f"{np.degrees(rad[i]):.6f}"] if shown else ["", ""]
+        return [*values, inverse.status[i], *errors]
 
     for i, line in enumerate(result.targets.lines):
-        row = [*(own[i] for own in names.values()), line, result.targets.tools[i], *joints(result.found, i)]
-        row += errors(result.found.error_mm[i], result.found.error_rad[i])
-        if result.nominal:
-            row += joints(result.nominal, i)
-            row += errors(result.before_mm[i], result.before_rad[i]) if result.nominal.usable[i] else ["", ""]
+        row = [*(own[i] for own in names.values()), line, result.targets.tools[i]]
+        row += cells(result.found, i, result.found.error_mm, result.found.error_rad)
+        if (nominal := result.nominal) is not None:
+            row += cells(nominal, i, result.before_mm, result.before_rad, bool(nominal.usable[i]))
         rows.append(row)
     return csv_text(rows)
 
 
-def require_compensated_written(path: str | Path, result: Compensated, robot: Robot) -> None:
-    """Read a written table again, and require that ``robot`` reaches the commanded poses with errors as reported."""
-    usable = result.found.usable
-    targets = result.targets[np.flatnonzero(usable)]
-
-    def again() -> np.ndarray:
-        table, q = read_table(path, "joint values"), np.full(result.found.q.shape, np.nan)
-        for i, column in enumerate(joint_columns(robot)):
-            cells = np.array(table.text(column), object)[usable].astype(float)
-            q[usable, i] = cells if robot.prismatic[i] else np.radians(cells)
-        return pose_values(poses_of(robot, targets, q[usable]))
-
-    require_written(path, again, pose_values(poses_of(robot, targets, result.found.q[usable])), WRITTEN_MM, "mm")
+class Reached(Part):
+    status: list[str]
+    error_mm: Vector
+    error_rad: Vector
 
 
-def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
-    """Returns the complete result in machine-readable form."""
-    columns = joint_columns(robot)
-    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
+class CompensationFile(ResultFile):
+    """Result file of ``compensate``."""
 
-    def joints(inverse: Inverse, i: int) -> dict | None:
-        return dict(zip(columns, (inverse.q[i] * unit).tolist(), strict=True)) if inverse.usable[i] else None
-
-    rows, mass = [], result.targets.conditions.payload_kg
-    quaternions = result.poses.quaternions()
-    for i, line in enumerate(result.targets.lines):
-        row = {
-            "line": int(line),
-            "target": result.targets.tools[i],
-            "commanded_mm": result.poses.translation[i],
-            "commanded_quaternion": quaternions[i],
-            "status": result.found.status[i],
-            "joints": joints(result.found, i),
-            "error_mm": float(result.found.error_mm[i]),
-            "error_rad": float(result.found.error_rad[i]),
-            "payload_kg": None if mass is None else float(mass[i]),
-        }
-        if result.nominal:
-            usable = bool(result.nominal.usable[i])
-            row |= {
-                "nominal_status": result.nominal.status[i],
-                "nominal_joints": joints(result.nominal, i),
-                "nominal_error_mm": float(result.before_mm[i]) if usable else None,
-                "nominal_error_rad": float(result.before_rad[i]) if usable else None,
-            }
-        rows.append(row)
-    counts = {status: result.found.status.count(status) for status in dict.fromkeys(result.found.status)}
-    return CompensationFile.model_validate(
-        {
-            "format": "stcal compensation 1",
-            "robot": robot.name,
-            "counts": counts,
-            "poses": rows,
-            "notes": [*result.targets.notes, *result.notes()],
-        }
+    format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
+    robot: str = Field(validation_alias=AliasPath("identified", "name"), description="name")
+    lines: list[int] = Field(description="of the poses in the file")
+    poses: Annotated[
+        np.ndarray,
+        Shape((None, 4, 4)),
+        BeforeValidator(lambda poses: poses.matrix() if isinstance(poses, Poses) else poses),
+    ] = Field(description="commanded base_from_tool, mm")
+    joints: list[dict[str, float] | None] = Field(
+        description="joint values to command, by column name; null where the pose is not reached"
+    )
+    found: Reached = Field(description="`status` of each pose, and what remains: `error_mm`, `error_rad`")
+    nominal_joints: list[dict[str, float] | None] | None = Field(description="the same of the nominal robot")
+    nominal: Reached | None = Field(description="the same of the nominal robot: `status`, `error_mm`, `error_rad`")
+    before_mm: Vector = Field(
+        description="error of the nominal joint values by the identified robot, where `nominal.status` is reached"
+    )
+    before_rad: Vector = Field(description="the same of the orientation")
+    notes: list[str] = Field(
+        validation_alias="remarks",
+        description="columns that were not read, angles by their convention; doubts of targets and robots, and rows "
+        "that are not simply reached",
     )
 
 
 def compensated_summary(result: Compensated) -> list[str]:
     """Returns sentences on all poses together."""
-    m = len(result)
-    good = int(result.found.usable.sum())
-    lines = [f"{good} of {m} poses reached by the identified robot"]
+    lines = [f"{int(result.found.usable.sum())} of {len(result)} poses reached by the identified robot"]
     both = result.compared()
     if both.any():
         before, after = result.before_mm[both], max(result.found.error_mm[both].max(), LEAST_SHOWN_MM)
         lines.append(
-            f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
+            f"position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
             f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less. The real robot errs by more: by "
             "about the error of rows held out that identify stated"
         )

@@ -6,8 +6,7 @@ inverse information matrix is updated by the few rows of a pose (Sherman, Morris
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -15,9 +14,8 @@ from pydantic import Field
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses
-from stcal.io.files import require_written
-from stcal.io.json import ResultFile
-from stcal.io.table import POSE, csv_text, pose_cells, pose_values, read_table, require_pose_table_written
+from stcal.io.json import Finite, ResultFile
+from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
     SEEN,
@@ -25,9 +23,7 @@ from stcal.robot.identification.observability import (
     identification_jacobian,
     parameter_scale,
 )
-from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.measurements import joint_values
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
 
@@ -47,19 +43,19 @@ class DesignFile(ResultFile):
     """Result file of ``design``."""
 
     format: Literal["stcal pose design 1"] = Field(description="the file's form and its version")
-    count: int = Field(description="number of poses")
     parameters: int = Field(description="of the robot and its tool")
     seen: int = Field(description="how many combinations of them any pose shows; the indices are of these")
     exchanges: int = Field(description="single poses exchanged after the greedy choice")
-    chosen: dict[str, float] = Field(
-        description="`O1` … `O5` of the chosen poses; defined and in units as `identify --json` has them"
+    chosen: ObservabilityIndices = Field(
+        description="`o1`, `o2`, `o3`, `o4`, `o5` of the chosen poses, as `identify --json` has them"
     )
-    random_median: dict[str, float] = Field(description="medians of `random`")
-    random: list[dict[str, float]] = Field(description="`O1` … `O5` of 20 random sets of as many poses")
-    predicted_sigma_mm: float = Field(
+    random: list[ObservabilityIndices] = Field(
+        description="`o1`, `o2`, `o3`, `o4`, `o5` of 20 random sets of as many poses"
+    )
+    sigma_mm: float = Field(
         description="σ per axis of the position that the identified robot predicts, RMS over random poses"
     )
-    random_predicted_sigma_mm: float | None = Field(
+    random_sigma_mm: Finite = Field(
         description="the same, median of the random sets (null where they leave parameters open)"
     )
 
@@ -68,18 +64,13 @@ class DesignFile(ResultFile):
 class PoseDesign(Brief):
     """The chosen poses, compared with random sets of poses.
 
-    Parameters
-    ----------
-    q : (count, n) joint vectors, in order of choice: the first ones alone are a good set too
-    poses : base_from_tool there
-    parameters, seen : parameters, and how many of them (in combination) the candidates show; the indices are of these
-    chosen : ObservabilityIndices
-    random : of random sets of the same size
-    sigma_mm, random_sigma_mm : σ of the position that the identified robot will predict, RMS per axis over random
-        poses; of the chosen set, and median of the random ones
-    exchanges : int
+    ``q`` : (count, n) joint vectors, in order of choice: the first ones alone are a good set too; ``poses`` :
+    base_from_tool there; ``parameters``, ``seen`` : parameters, and how many of them (in combination) the candidates
+    show, of which the indices are; ``random`` : of random sets of the same size; ``sigma_mm`` : σ of the position that
+    the identified robot will predict, RMS per axis over random poses; ``random_sigma_mm`` : median of the random sets.
     """
 
+    format: ClassVar = "stcal pose design 1"
     q: Array
     poses: Poses
     parameters: int
@@ -343,31 +334,3 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):
         rows.append([i, *joint_cells(robot, q), *pose_cells(pose)])
     return csv_text(rows)
-
-
-def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, tool: str = "") -> None:
-    """Read a written table again, and require the same poses, and joint values that lead the robot to them."""
-    require_pose_table_written(path, {"nominal_": result.poses})
-
-    def again() -> np.ndarray:
-        return pose_values(forward(robot, joint_values(read_table(path, "poses"), robot), tool))
-
-    require_written(path, again, pose_values(result.poses), WRITTEN_MM, "mm")
-
-
-def design_file(result: PoseDesign) -> DesignFile:
-    """Returns the result without the poses in machine-readable form."""
-    return DesignFile.model_validate(
-        {
-            "format": "stcal pose design 1",
-            "count": len(result.q),
-            "parameters": result.parameters,
-            "seen": result.seen,
-            "exchanges": result.exchanges,
-            "chosen": result.chosen.values(),
-            "random_median": result.median(),
-            "random": [each.values() for each in result.random],
-            "predicted_sigma_mm": result.sigma_mm,
-            "random_predicted_sigma_mm": result.random_sigma_mm if np.isfinite(result.random_sigma_mm) else None,
-        }
-    )

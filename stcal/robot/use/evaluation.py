@@ -2,17 +2,17 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from scipy.stats import t as t_distribution
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.io.json import Part, ResultFile, Vector
+from stcal.io.json import Matrix, Part, ResultFile
 from stcal.robot.identification.adjustment import (
     WIDTH,
     Observed,
@@ -23,12 +23,12 @@ from stcal.robot.identification.adjustment import (
     observed,
     only_of,
     parameter_names,
+    require_enough,
     residuals,
     tips_of,
 )
-from stcal.robot.identification.prior import BASE, Placed, tool_name
-from stcal.robot.identification.report import FoundLeft, PlacedPart
-from stcal.robot.identification.result import position_errors
+from stcal.robot.identification.prior import Placed
+from stcal.robot.identification.result import Figures, PlacedPose, position_errors
 from stcal.robot.identification.start import Fit, start
 from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements
@@ -49,44 +49,6 @@ CHANCE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """Summary of the errors of a number of rows; mm, or rad for orientations."""
-
-    rows: int
-    mean: float
-    median: float
-    rms: float
-    p95: float
-    max: float
-
-    @classmethod
-    def of(cls, errors: np.ndarray) -> "Figures":
-        rms, p95 = np.sqrt((errors**2).mean()), np.percentile(errors, 95)
-        return cls(len(errors), *(float(v) for v in (errors.mean(), np.median(errors), rms, p95, errors.max())))
-
-
-class EvaluatedRobot(Part):
-    name: str
-    position_mm: Figures
-    good_mm: Figures
-    orientation_rad: Figures | None
-    placed: list[PlacedPart] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
-    left: list[FoundLeft] | None = Field(
-        description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
-        "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
-        "number of tests, `line` after a jump; null where rows are too few to tell"
-    )
-    beyond: list[FoundLeft] | None = Field(
-        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`) of what "
-        "parameters identified from these rows would leave"
-    )
-    residuals: list[Vector] = Field(
-        description="of each row: measured minus modelled position, mm, in the axes of the robot's base; or of the "
-        "distance"
-    )
-
-
-@dataclass(frozen=True, slots=True)
 class Difference:
     """Mean error of ``worse`` minus ``better`` on the same rows; ``p`` : by chance, times the number of comparisons."""
 
@@ -101,69 +63,61 @@ class Difference:
         return self.p < CHANCE
 
 
-class EvaluationFile(ResultFile):
-    """Result file of ``evaluate``."""
-
-    format: Literal["stcal evaluation 1"] = Field(description="the file's form and its version")
-    refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
-    observed: str = Field(description="positions or distances")
-    lines: list[int] = Field(description="of the data file, of each row")
-    wrong: list[int] = Field(
-        description="lines that no robot explains (wrong, or something all models lack); nothing was fitted to them"
-    )
-    best: str | None = Field(description="the robot that is better than all others by more than chance; null: none is")
-    robots: list[EvaluatedRobot] = Field(
-        description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "
-        "the wrong ones, `orientation_rad` where measured: `rows`, `mean`, `median`, `rms`, `p95`, `max`"
-    )
-    differences: list[Difference] = Field(
-        description="`mm`: mean error of the `worse` robot less that of the `better` on the same rows without the "
-        "wrong ones, its `sigma_mm`, and `p` times the number of comparisons"
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """Errors of one robot at the r observations.
+    """Errors of one robot at the r observations, with base and tools as fitted.
 
-    Parameters
-    ----------
-    robot : with base and tools as fitted
-    state : its chain and tools
-    residuals : (r, 3) measured minus modelled position in the base's axes, or distance; mm
-    rotation_rad : (r,) errors of orientations; empty if none were measured
-    placed : base and tools
-    left : effects found in the residuals; None if there are too few rows for a test
-    beyond : the same for the residuals after a fit of all kinematic parameters to these rows
+    ``residuals`` : (r, 3) measured minus modelled position in the base's axes, or (r, 1) distance; mm; ``good`` : (r,)
+    rows that some robot explains; ``rotation_rad`` : (r,) errors of orientations, empty if none were measured;
+    ``left`` : effects found in the residuals, None if there are too few rows for a test; ``beyond`` : the same after a
+    fit of all kinematic parameters to these rows.
     """
 
     robot: Robot
     state: State
     residuals: np.ndarray
+    good: np.ndarray
     rotation_rad: np.ndarray
     placed: tuple[Placed, ...]
     left: tuple[Finding, ...] | None
     beyond: tuple[Finding, ...] | None
 
     @property
+    def name(self) -> str:
+        """Name of the robot."""
+        return self.robot.name
+
+    @property
     def errors_mm(self) -> np.ndarray:
         """Lengths (r,) of the position errors, mm."""
         return position_errors(self.residuals)
 
+    @property
+    def position_mm(self) -> Figures:
+        """Summary of the errors of all rows."""
+        return Figures.of(self.errors_mm)
+
+    @property
+    def good_mm(self) -> Figures:
+        """Summary of the errors of good rows."""
+        return Figures.of(self.errors_mm[self.good])
+
+    @property
+    def orientation_rad(self) -> Figures | None:
+        """Summary of the errors of orientations, if any were measured."""
+        return Figures.of(self.rotation_rad) if len(self.rotation_rad) else None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
-    """Robots on one set of measurements.
+    """Robots, in the order given, on one set of r observations: positions or distances.
 
-    Parameters
-    ----------
-    refit : what was fitted of each robot: base, tool, both or nothing
-    seen : the r observations: positions or distances
-    robots : in the order given
-    wrong : (r,) rows that no robot explains: they are wrong, or all models lack an effect; nothing was fitted to them
-    differences : the robot of least mean error against each other one, in order of their means
+    ``refit`` : what was fitted of each robot; ``wrong`` : (r,) rows that no robot explains: they are wrong, or all
+    models lack an effect; nothing was fitted to them; ``differences`` : the robot of least mean error against each
+    other one, in order of their means.
     """
 
+    format: ClassVar = "stcal evaluation 1"
     refit: Refit
     seen: Observed
     robots: tuple[Evaluated, ...]
@@ -175,9 +129,61 @@ class Evaluation:
         """Name of the robot that is better than all others beyond chance; empty if there is none."""
         return self.differences[0].better if self.differences and all(d.real for d in self.differences) else ""
 
-    def line(self, row: int) -> int:
-        """Returns the line of the file of ``row``."""
-        return int(self.seen.data.lines[self.seen.first[row]])
+    @property
+    def observed(self) -> str:
+        """What was compared: positions or distances."""
+        return f"{self.seen.kind}s"
+
+    @property
+    def lines(self) -> list[int]:
+        """Lines (r,) of the file."""
+        return self.seen.lines
+
+    @property
+    def wrong_lines(self) -> list[int]:
+        """Lines of the rows that no robot explains."""
+        return [line for line, wrong in zip(self.lines, self.wrong, strict=True) if wrong]
+
+
+class EvaluatedRobot(Part):
+    name: str
+    position_mm: Figures
+    good_mm: Figures
+    orientation_rad: Figures | None
+    placed: list[PlacedPose] = Field(description="as of `identify`: `name`, `pose`, `sigma`; null what is the file's")
+    left: list[Finding] | None = Field(
+        description="what the residuals go with, `what`, `joint`, `turns`, `effect_mm`, `effect_rad`, "
+        "`share`, `p`, `line`, `advice`; null where rows are too few to tell"
+    )
+    beyond: list[Finding] | None = Field(
+        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`, `advice`) of "
+        "what parameters identified from these rows would leave"
+    )
+    residuals: Matrix = Field(
+        description="of each row: measured minus modelled position, mm, in the axes of the robot's base; or of the "
+        "distance"
+    )
+
+
+class EvaluationFile(ResultFile):
+    """Result file of ``evaluate``."""
+
+    format: Literal["stcal evaluation 1"] = Field(description="the file's form and its version")
+    refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
+    observed: str = Field(description="positions or distances")
+    lines: list[int] = Field(description="of the data file, of each row")
+    wrong_lines: list[int] = Field(
+        description="those that no robot explains (wrong, or something all models lack); nothing was fitted to them"
+    )
+    best: str = Field(description="the robot that is better than all others by more than chance; empty: none is")
+    robots: list[EvaluatedRobot] = Field(
+        description="`name`, and of their errors `position_mm` (of distances for those) of all rows, `good_mm` without "
+        "the wrong ones, `orientation_rad` where measured: `rows`, `mean`, `median`, `rms`, `p95`, `max`"
+    )
+    differences: list[Difference] = Field(
+        description="`mm`: mean error of the `worse` robot less that of the `better` on the same rows without the "
+        "wrong ones, its `sigma_mm`, and `p` times the number of comparisons"
+    )
 
 
 @require_arguments
@@ -214,7 +220,8 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
                 f"{data.where}: {data.q.shape[1]} joint values, robot {name} has {len(robot.rows)} joints",
             )
     seen = observed(data, None if data.positions is None else "position")
-    _enough(seen, fit)
+    what = f"parameters of {' and '.join(sorted(fit))}"
+    require_enough(seen, _parameters(seen, fit), what, "or fit less (--refit)")
     states, wrong = _fitted(list(named.values()), data, seen, fit)
     found = tuple(
         _evaluated(robot, state, seen, fit, wrong) for robot, state in zip(named.values(), states, strict=True)
@@ -225,16 +232,6 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 def _parameters(measured: Observed, fit: Fit) -> int:
     base = 6 if "base" in fit and measured.kind != "distance" else 0
     return base + (3 * len(set(measured.data.targets)) if "tool" in fit else 0)
-
-
-def _enough(measured: Observed, fit: Fit) -> None:
-    numbers, seeks = WIDTH[measured.kind] * len(measured), _parameters(measured, fit)
-    if numbers <= seeks:
-        raise DegenerateError(
-            "E-IDENTIFY-FEW",
-            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} parameters of "
-            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[measured.kind] + 1} or more needed, or fit less (--refit)",
-        )
 
 
 def _fitted(robots: list[Robot], data: Measurements, measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
@@ -279,6 +276,7 @@ def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: 
         replace(robot, world_from_base=base, tools=state.tools),
         state,
         in_base,
+        ~wrong,
         rotation,
         placed,
         left(state, base, good, one, fitted),
@@ -315,13 +313,13 @@ def _placed(
         sigma = np.full(6, np.nan)
         if "base" in fit:
             sigma, at = np.sqrt(np.diag(covariance)[:6]), 6
-        placed.append(Placed(BASE, base, sigma))
+        placed.append(Placed("base", base, sigma))
     for name, tool in state.tools.items():
         sigma = np.full(6, np.nan)
         if "tool" in fit:
             own = tool.rotation @ covariance[at : at + 3, at : at + 3] @ tool.rotation.T
             sigma[3:], at = np.sqrt(np.diag(own)), at + 3
-        placed.append(Placed(tool_name(name), tool, sigma))
+        placed.append(Placed(f"tool {name}".rstrip(), tool, sigma))
     return tuple(placed)
 
 

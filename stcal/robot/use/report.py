@@ -9,21 +9,19 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.io.files import require_written
-from stcal.io.table import QUATERNION, csv_text, read_table
+from stcal.io.table import QUATERNION, csv_text
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
-from stcal.report.svg import COLOURS, DASH, INK, Axes, Box, Drawing, count_ticks, limits, log_limits
+from stcal.report.svg import COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import tips_of
-from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
-from stcal.robot.identification.report import placed_parts, placed_table
-from stcal.robot.kinematics.file import WRITTEN_MM
+from stcal.robot.identification.report import Drawn, left_lines, placed_table, residual_plot
+from stcal.robot.identification.result import Figures
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
 from stcal.robot.use.design import PoseDesign
-from stcal.robot.use.evaluation import Evaluated, Evaluation, EvaluationFile, Figures
+from stcal.robot.use.evaluation import Evaluated, Evaluation
 from stcal.robot.use.verification import Verification
 
 
@@ -34,7 +32,8 @@ def verification_figure(result: Verification) -> Drawing:
     sizes = [np.abs(each.error_mm) for each in result.sets]
     box = drawing.panels(top=12 + 14 * -(-len(sizes) // 2))[0]
     x, y = (1, at[-1] + 0.02 * len(at) + 0.5), limits(np.concatenate(sizes), low=0)
-    axes = _pose_by_pose(Axes(drawing, box, x, y), "|distance error|, mm")
+    axes = Axes(drawing, box, x, y)
+    axes.frame("pose, in order of the file", "|distance error|, mm", "y", count_ticks(*x))
     colours = cycle([COLOURS[1], COLOURS[0], *COLOURS[2:]])  # warm for before, cool for after, then the others
     for k, (each, size, colour) in enumerate(zip(result.sets, sizes, colours, strict=False)):
         axes.lines([(at, size)], colour, 1.1)
@@ -90,44 +89,21 @@ def _percent(less: float) -> str:
     return f"{less:.1f} %" if less >= 0 else f"{-less:.1f} % more"
 
 
-def compensation_report(result: Compensated, robot: Robot) -> Document:
+def compensation_report(result: Compensated) -> Document:
     """Returns the report of ``compensate``: nominal and compensated joint values of each pose."""
+    robot = result.identified
     counts = ", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status))
     joints = [name.replace("_", " ") for name in joint_columns(robot)]
     heads = ["line", *(["<target"] if any(result.targets.tools) else []), "<status", "<", *joints, "error mm"]
-    before = plot(
-        lambda: _before_figure(result),
-        "error of the nominal joint values",
-        "Position error of the nominal joint values by the identified robot: the error that compensation removes",
-    )
     return Document(
         f"Compensation of {robot.name}",
         f"{len(result)} poses: {counts}",
         [
-            Section(
-                "Result", [*compensated_summary(result), before if result.compared().any() else None], terminal=True
-            ),
-            Section("To know", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
+            Section("Result", compensated_summary(result), terminal=True),
+            Section("To know", [bullets(result.remarks[:MOST_NOTES])]),
             Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
         ],
     )
-
-
-def _before_figure(result: Compensated) -> Drawing:
-    drawing = Drawing(7.5, 2.8)
-    rows = np.flatnonzero(result.compared())
-    size = result.before_mm[rows]
-    axes = Axes(drawing, drawing.panels()[0], (0.2, len(result) + 0.8), limits(size, low=0))
-    _pose_by_pose(axes, "position error, mm")
-    bars = [((row + 1, row + 1), (0, each)) for row, each in zip(rows, size, strict=True)]
-    axes.lines(bars, COLOURS[1], max(0.5, min(3, 300 / len(result))))
-    return drawing
-
-
-def _pose_by_pose(axes: Axes, what: str) -> Axes:
-    """Draws the frame of an error of each pose."""
-    axes.frame("pose, in order of the file", what, "y", count_ticks(*axes.x))
-    return axes
 
 
 def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
@@ -164,86 +140,45 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
         f"{unseen} of {result.parameters} combinations of parameters move nothing that is measured, in any pose (as "
         "with a tool on the last axis), and are left out"
     )
+    indices, median = [], result.median()
+    for name, value in result.chosen.values().items():
+        every = [each.values()[name] for each in result.random]
+        ratio = number(value / median[name], 2) if median[name] > 0 else NONE
+        cells = (f"{v:.4g}" for v in (value, median[name], min(every), max(every)))
+        indices.append([name, *cells, ratio, "" if name == "O2" else "1/mm", MEANING[name]])
     heads = ["<", "chosen", "median", "least", "most", "chosen / median", "<unit", "<"]
-    over = [("", 2), (f"{len(result.random)} random sets", 3), ("", 3)]
     poses = [
-        [str(i), *(number(float(v), 3) for v in joint_cells(robot, q)), *(number(v, 2) for v in pose.translation)]
+        [str(i), *(number(float(v), 3) for v in (*joint_cells(robot, q), *pose.translation))]
         for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1)
     ]
     joints = [name.replace("_", " ") for name in joint_columns(robot)]
+    against = [
+        sigma_sentence,
+        left_out if unseen else "",
+        Table(heads, indices, [("", 2), (f"{len(result.random)} random sets", 3), ("", 3)]),
+        page_only(
+            "Larger is better. Of the Jacobian over the σ of the instrument, parameters in mm, an angle being the arc "
+            "that it makes at the arm's whole reach"
+        ),
+        "collisions are not checked: only joint limits and the box of the tool",
+    ]
+    places = [
+        "Tool in the robot's base (square: its origin); the arrow is the tool's z axis",
+        plots(
+            plot(lambda: _tool_figure(result, 1), "tool positions from above", "From above", ""),
+            plot(lambda: _tool_figure(result, 2), "tool positions from the side", "From the side", ""),
+        ),
+    ]
+    chosen = Table(["pose", *joints, "x mm", "y mm", "z mm"], poses)
     return Document(
         f"Measurement poses for {robot.name}",
         f"{len(result.q)} poses for {result.seen} parameters, {result.exchanges} exchanges after the greedy choice",
         [
-            Section(
-                "Against random poses",
-                [
-                    sigma_sentence,
-                    left_out if unseen else "",
-                    Table(heads, _indices(result), over),
-                    page_only(
-                        "Larger is better. Of the Jacobian over the σ of the instrument, parameters in mm, an angle "
-                        "being the arc that it makes at the arm's whole reach"
-                    ),
-                    "collisions are not checked: only joint limits and the box of the tool",
-                    plots(
-                        plot(
-                            lambda: _index_figure(result),
-                            "indices of chosen and random poses",
-                            "Each index over the median of the random sets; grey: the random sets, of as many poses "
-                            "each",
-                            "",
-                        )
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Where the tool is",
-                [
-                    "Tool in the robot's base (square: its origin); the arrow is the tool's z axis",
-                    plots(
-                        plot(lambda: _tool_figure(result, 1), "tool positions from above", "From above", ""),
-                        plot(lambda: _tool_figure(result, 2), "tool positions from the side", "From the side", ""),
-                    ),
-                ],
-            ),
-            Section(
-                "Poses",
-                [
-                    "In order of choice: the first ones alone are a good set too",
-                    Table(["pose", *joints, "x mm", "y mm", "z mm"], poses),
-                ],
-            ),
+            Section("Against random poses", against, terminal=True),
+            Section("Where the tool is", places),
+            Section("Poses", ["In order of choice: the first ones alone are a good set too", chosen]),
         ],
     )
-
-
-def _indices(result: PoseDesign) -> list[list[str]]:
-    median = result.median()
-    rows = []
-    for name, value in result.chosen.values().items():
-        every = [each.values()[name] for each in result.random]
-        ratio = number(value / median[name], 2) if median[name] > 0 else NONE
-        unit = "" if name == "O2" else "1/mm"
-        rows.append([name, *(f"{v:.4g}" for v in (value, median[name], min(every), max(every)))])
-        rows[-1] += [ratio, unit, MEANING[name]]
-    return rows
-
-
-def _index_figure(result: PoseDesign) -> Drawing:
-    drawing = Drawing(5, 2.9)
-    median = result.median()
-    chosen = {name: value / median[name] for name, value in result.chosen.values().items() if median[name] > 0}
-    every = [[each.values()[name] / median[name] for each in result.random] for name in chosen]
-    highest = limits([1, *chosen.values(), *np.ravel(every)], low=0)
-    axes = Axes(drawing, drawing.panels(bottom=20)[0], (-0.5, max(len(chosen), 1) - 0.5), highest)
-    axes.frame("", "over the median of random sets", "y", (range(len(chosen)), list(chosen)))
-    axes.level(1)
-    for i, (values, value) in enumerate(zip(every, chosen.values(), strict=True)):
-        axes.marks(i + np.linspace(-0.15, 0.15, len(values)), values, "dot", 3, "#9aa0a8")
-        axes.marks(i, value, "diamond", 7, COLOURS[0])
-    return drawing
 
 
 def _tool_figure(result: PoseDesign, up: int) -> Drawing:
@@ -284,28 +219,21 @@ def names_of(files: Sequence[Path]) -> list[str]:
     return stems if len(set(stems)) == len(stems) else whole
 
 
-def observations(result: Evaluation) -> str:
-    """Returns the file with the number and kind of its observations, as text."""
-    kind = "pose" if result.seen.data.rotations is not None else result.seen.kind
-    return f"{result.seen.data.where}: {len(result.seen)} {kind}s"
-
-
-def _table(result: Evaluation) -> list[list[str]]:
-    """Returns a heading and rows of the robots, for all observations, and without the wrong ones if there are any."""
-    turned = len(result.robots[0].rotation_rad) > 0
-    rows = [["<error, mm", *HEADS, *(("orientation, deg: RMS", "max") if turned else ())]]
-    parts = {"": np.ones(len(result.wrong), bool)}
-    if result.wrong.any():
-        parts[", without unexplained"] = ~result.wrong
+def _table(result: Evaluation) -> Table:
+    """Returns the errors of all observations, and of those without the wrong ones if there are any."""
+    turned = any(each.orientation_rad for each in result.robots)
+    heads, rows = ["<error, mm", *HEADS, *(("orientation, deg: RMS", "max") if turned else ())], []
     for each in result.robots:
-        for said, among in parts.items():
-            figures = Figures.of(each.errors_mm[among])
-            cells = [each.robot.name + said, str(figures.rows), *(number(getattr(figures, f), 4) for f in FIGURES)]
+        parts = {"": (each.position_mm, each.rotation_rad)}
+        if result.wrong.any():
+            parts[", without unexplained"] = each.good_mm, each.rotation_rad[each.good] if turned else each.rotation_rad
+        for said, (figures, rotation_rad) in parts.items():
+            cells = [each.name + said, str(figures.rows), *(number(getattr(figures, f), 4) for f in FIGURES)]
             if turned:
-                rotation = Figures.of(np.degrees(each.rotation_rad[among]))
+                rotation = Figures.of(np.degrees(rotation_rad))
                 cells += [number(rotation.rms, 4), number(rotation.max, 4)]
             rows.append(cells)
-    return rows
+    return Table(heads, rows)
 
 
 def _verdicts(result: Evaluation) -> list[str]:
@@ -319,19 +247,13 @@ def _verdicts(result: Evaluation) -> list[str]:
     return [*found, *([f"best: {result.best}"] if result.best and len(result.robots) > 2 else [])]
 
 
-def _rigid(result: Evaluation) -> list[str]:
-    """Returns notes on robots without elasticity."""
-    rigid = (each.robot.name for each in result.robots if each.robot.elasticity is None)
-    return [note for name in rigid for note in result.seen.data.conditions.ignored(f"robot {name}")]
-
-
 def _wrong(result: Evaluation) -> list[str]:
     at = np.flatnonzero(result.wrong)
     if not len(at):
         return []
     least = np.min([each.errors_mm for each in result.robots], axis=0)
-    at = at[np.argsort(-least[at])]
-    named = ", ".join(f"line {result.line(i)} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG].tolist())
+    at = at[np.argsort(-least[at])].tolist()
+    named = ", ".join(f"line {result.lines[i]} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG])
     more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
     fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
     return [
@@ -340,19 +262,14 @@ def _wrong(result: Evaluation) -> list[str]:
     ]
 
 
-def left_lines(each: Evaluated) -> list[str]:
-    """Returns lines on the causes of a robot's residuals."""
-    if each.left is None:
-        return ["too few rows to find what the residuals depend on"]
-    if not each.left:
-        return ["the residuals depend on nothing that was tested (joints, gravity, place)"]
-    lines = [finding.sentence() for finding in each.left]
-    if each.beyond is not None and not each.beyond:
-        lines.append("parameters identified from these rows would explain all of it")
-    elif each.beyond:
-        beyond = "; ".join(finding.what for finding in each.beyond)
-        lines.append(f"parameters of the kinematics do not explain all of it; what remains depends on {beyond}")
-    return lines
+def _beyond(each: Evaluated) -> list[str]:
+    """Returns whether parameters of the kinematics explain what a robot leaves."""
+    if not each.left or each.beyond is None:
+        return []
+    if not each.beyond:
+        return ["parameters identified from these rows would explain all of it"]
+    beyond = "; ".join(finding.what for finding in each.beyond)
+    return [f"parameters of the kinematics do not explain all of it; what remains depends on {beyond}"]
 
 
 @require_arguments
@@ -384,7 +301,7 @@ def evaluated_csv(result: Evaluation) -> str:
     wrong = dict(zip(seen.tolist(), result.wrong.astype(int).tolist(), strict=True))
     columns.append(("wrong", [wrong.get(row, "") for row in range(len(data))]))  # a distance from itself is not judged
     for each in robots:
-        name = re.sub(r"\W+", "_", each.robot.name)
+        name = re.sub(r"\W+", "_", each.name)
         residuals = np.zeros((len(data), each.residuals.shape[1]))
         residuals[seen] = each.residuals
         if data.positions is not None:
@@ -405,154 +322,61 @@ def _places(head: str, xyz: np.ndarray) -> list[tuple[str, list[str]]]:
     return [(head.format(axis), _cells(values)) for axis, values in zip("xyz", xyz.T, strict=True)]
 
 
-def require_evaluated_written(path: str | Path, result: Evaluation) -> None:
-    """Read a written table of residuals again, and require the errors of each robot."""
-
-    def again() -> np.ndarray:
-        table = read_table(path, "residuals")
-        names = [column for column in table.columns if column.endswith("_error_mm")]
-        return np.array([[float(cell) for cell in table.text(name)] for name in names])[:, result.seen.first]
-
-    reported = np.array([np.linalg.norm(each.residuals[:, -3:], axis=1) for each in result.robots])
-    require_written(path, again, reported, WRITTEN_MM, "mm")
-
-
 def _cells(values) -> list[str]:
     return [f"{v:.6f}" for v in values]
 
 
-def evaluation_file(result: Evaluation) -> EvaluationFile:
-    """Returns the complete result in machine-readable form (keys: ``data_layout.md``)."""
-    robots = [
-        {
-            "name": each.robot.name,
-            "position_mm": Figures.of(each.errors_mm),
-            "good_mm": Figures.of(each.errors_mm[~result.wrong]),
-            "orientation_rad": Figures.of(each.rotation_rad) if len(each.rotation_rad) else None,
-            "placed": placed_parts(each.placed),
-            "left": each.left,
-            "beyond": each.beyond,
-            "residuals": list(each.residuals),
-        }
-        for each in result.robots
-    ]
-    content = {
-        "format": "stcal evaluation 1",
-        "refit": result.refit,
-        "observed": f"{result.seen.kind}s",
-        "lines": [result.line(i) for i in range(len(result.wrong))],
-        "wrong": [result.line(i) for i in np.flatnonzero(result.wrong).tolist()],
-        "best": result.best or None,
-        "robots": robots,
-        "differences": result.differences,
-    }
-    return EvaluationFile.model_validate(content)
-
-
 def evaluation_report(result: Evaluation) -> Document:
     """Returns the report of ``evaluate``: errors of each robot, the better one, and the effects found in residuals."""
-    points = result.seen.kind != "distance"
-    heads, *rows = _table(result)
+    seen, conditions = result.seen, result.seen.data.conditions
     answer: list[Block] = [
-        Table(heads, rows),
+        _table(result),
         *_verdicts(result),
         *_wrong(result),
-        *_rigid(result),
+        *(
+            note
+            for each in result.robots
+            if each.robot.elasticity is None
+            for note in conditions.ignored(f"robot {each.name}")
+        ),
         page_only(
             "95 %: limit that 95 of 100 rows do not exceed. A few bad rows do not change the median, and the lines "
             "without rows that no robot explains"
         ),
+        plot(lambda: _row_figure(result), "Error of each row"),
     ]
-    place = plot(lambda: _place_figure(result), "Error by distance from the base's axis, and by height")
     robots: list[Block] = []
-    for each in result.robots:
-        robots += [subheading(each.robot.name), *(f"{each.robot.name}: {line}" for line in left_lines(each))]
-        robots += residual_plots(_drawn(result, each), each.left or ())
-        if points:
-            heads = ["<Residual along", "mean mm", "± mm", "RMS mm", "max mm"]
-            robots.append(page_only(Table(heads, _directions(result, each))))
+    for each, colour in zip(result.robots, cycle(COLOURS)):
+        base = each.robot.world_from_base
+        found = each.residuals @ base.rotation.T if each.residuals.shape[1] == 3 else each.residuals
         robots += [
+            subheading(each.name),
+            *(f"{each.name}: {line}" for line in (*left_lines(each.left), *_beyond(each))),
+            residual_plot(Drawn(each.state, seen, found, each.good, colour), each.left or ()),
             page_only("Base in the instrument's frame, tools in the flange's; without σ: as the file has them"),
             page_only(placed_table(each.placed)),
         ]
+    kind = "pose" if seen.data.rotations is not None else seen.kind
     return Document(
         "Robots evaluated",
-        f"{observations(result)}; {FITTED[result.refit]}",
-        [
-            Section("Result", answer, terminal=True),
-            Section(
-                "By row and place", [plot(lambda: _row_figure(result), "Error of each row"), place if points else None]
-            ),
-            Section("What each robot leaves", robots, terminal=True),
-        ],
+        f"{seen.data.where}: {len(seen)} {kind}s; {FITTED[result.refit]}",
+        [Section("Result", answer, terminal=True), Section("What each robot leaves", robots, terminal=True)],
     )
 
 
-def _drawn(result: Evaluation, each: Evaluated) -> Drawn:
-    """Returns the data of the pictures."""
-    base = each.robot.world_from_base
-    found = each.residuals @ base.rotation.T if each.residuals.shape[1] == 3 else each.residuals
-    return Drawn(each.state, base, result.seen, found, ~result.wrong, _colour(result, each))
-
-
-def _directions(result: Evaluation, each: Evaluated) -> list[list[str]]:
-    """Returns mean with its standard error, RMS and largest residual along directions of the base."""
-    good, place = ~result.wrong, _place(result, each)
-    out = place[:, :2] / np.maximum(np.linalg.norm(place[:, :2], axis=1), 1e-9)[:, None]
-    x, y, z = each.residuals.T
-    found = {"x of the base": x, "y of the base": y, "z of the base, up": z}
-    found["outwards from the base's axis"] = out[:, 0] * x + out[:, 1] * y
-    found["around the base's axis"] = out[:, 0] * y - out[:, 1] * x
-    rows = []
-    for name, values in found.items():
-        own = values[good]
-        error = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.nan
-        sizes = (own.mean(), error, np.sqrt((own**2).mean()), np.abs(own).max())
-        rows.append([name, *(number(v, 4) for v in sizes)])
-    return rows
-
-
-def _place(result: Evaluation, each: Evaluated) -> np.ndarray:
-    """Returns the positions (r, 3) of the tool in the robot's base, mm."""
-    data = result.seen.data
-    return each.robot.world_from_base.inverse() @ tips_of(each.state, data).translation
-
-
-def _colour(result: Evaluation, each: Evaluated) -> str:
-    return COLOURS[list(result.robots).index(each) % len(COLOURS)]
-
-
-def _errors(drawing: Drawing, box: Box, result: Evaluation, at: Sequence[np.ndarray], label: str, name: str) -> None:
-    """Plots the errors of all robots over ``at``, by row, with unexplained rows ringed, logarithmically if needed."""
+def _row_figure(result: Evaluation) -> Drawing:
+    """Returns the errors of all robots by row, with unexplained rows ringed, logarithmically if needed."""
+    drawing, rows = Drawing(9, 2.8), result.seen.first + 1
     every = np.concatenate([each.errors_mm for each in result.robots])
-    middle = [float(np.median(each.errors_mm)) for each in result.robots]
+    middle = [each.position_mm.median for each in result.robots]
     wide = min(middle) > 0 and (max(middle) > FAR_APART * min(middle) or every.max() > 4 * FAR_APART * max(middle))
     y = log_limits(every) if wide else limits(every, low=0)
-    axes = Axes(drawing, box, limits(np.concatenate(at)), y, "y" if wide else "")
-    axes.frame(label, name, "y")
-    for each, places in zip(result.robots, at, strict=True):
-        axes.marks(places, each.errors_mm, "dot", 3.6 if len(result.wrong) <= 200 else 1.6, _colour(result, each), 0.85)
-        axes.marks(places[result.wrong], each.errors_mm[result.wrong], "ring", 7, INK)
-
-
-def _row_figure(result: Evaluation) -> Drawing:
-    drawing = Drawing(9, 2.8)
-    rows = [result.seen.first + 1] * len(result.robots)
-    _errors(drawing, drawing.panels(top=24)[0], result, rows, "row, in order of the file", "error, mm")
-    return _with_key(drawing, result)
-
-
-def _with_key(drawing: Drawing, result: Evaluation) -> Drawing:
-    entries = {each.robot.name: ("dot", _colour(result, each)) for each in result.robots}
-    drawing.key((46, 10), entries | ({"no robot explains": ("ring", INK)} if result.wrong.any() else {}))
+    axes = Axes(drawing, drawing.panels(top=24)[0], limits(rows), y, "y" if wide else "")
+    axes.frame("row, in order of the file", "error, mm", "y")
+    key = {}
+    for each, colour in zip(result.robots, cycle(COLOURS)):
+        axes.marks(rows, each.errors_mm, "dot", 3.6 if len(rows) <= 200 else 1.6, colour, 0.85)
+        axes.marks(rows[result.wrong], each.errors_mm[result.wrong], "ring", 7, INK)
+        key[each.name] = "dot", colour
+    drawing.key((46, 10), key | ({"no robot explains": ("ring", INK)} if result.wrong.any() else {}))
     return drawing
-
-
-def _place_figure(result: Evaluation) -> Drawing:
-    drawing = Drawing(9, 2.8)
-    left, right = drawing.panels(2, top=24)
-    places = [_place(result, each) for each in result.robots]
-    away = [np.linalg.norm(place[:, :2], axis=1) for place in places]
-    _errors(drawing, left, result, away, "distance from the base's axis, mm", "error, mm")
-    _errors(drawing, right, result, [place[:, 2] for place in places], "height above the base, mm", "")
-    return _with_key(drawing, result)

@@ -2,20 +2,21 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import KDTree
 
 from stcal.errors import InputError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, other_axes
 from stcal.io.poses.rotations import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.identification.observability import over_ranges
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
-from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention
+from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_orientations
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse, inverse, reach_mm
 from stcal.robot.kinematics.measurements import ORIENTATION, joint_values, targets_of, within
@@ -179,12 +180,6 @@ def read_targets(
     )
 
 
-def rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
-    """Returns the names of tools, each with its rows."""
-    names = np.array(targets.tools, dtype=object)
-    return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
-
-
 def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
     """Returns the pairs of tool and mass at the flange (None: the robot's), each with its rows."""
     mass = targets.conditions.payload_kg
@@ -225,8 +220,6 @@ SAMPLE = 50
 DOUBTED, LEAST, TRIED = 0.25, 4, 8
 """Share and number of targets out of reach from which another convention is tried, and the number that it must all
 bring within reach. By chance each is, half the time, so that one of six conventions is in 2 of 100 sets of 8."""
-PAIRED = 0.01
-"""Largest distance of poses that belong to joint values in other rows, as shares of the reach and chords of turns."""
 INVERSE = "poses were inverse (base seen from the tool); give the tool in the base's frame"
 
 
@@ -268,7 +261,7 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
     reached, reach = poses_of(robot, targets, targets.q), reach_mm(robot, set(targets.tools))
     own = _rms(reached.translation - targets.poses.translation)
     if own <= FITS * reach:
-        require_convention(targets.where, targets.tools, reached.rotation, targets.poses.rotation)
+        require_orientations(targets.where, targets.tools, reached.rotation, targets.poses.rotation, many=False)
     else:
         _explain(robot, targets, targets.poses, targets.q, own, reach)
     notes = _elsewhere(targets, targets.poses.difference(reached), reach)
@@ -290,50 +283,32 @@ def _rms(shift: np.ndarray) -> float:
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
     """Refuses poses that joint values reach but for a frequent mistake; chance is 10⁻⁶ a row within 5 % of the reach
     and 11°."""
-    for reason, meant, of in _guesses(robot, targets, poses, q):
-        off = meant.difference(of)
-        left, turn = _rms(off[:, 3:]), _rms(off[:, :3])
-        if left < min(FITS * reach, EXPLAINS * own) and turn < TURNED_RAD:
-            raise InputError(
-                "E-ROBOT-MISMATCH",
-                f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses, "
-                f"{FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach; but {left:.3g} mm if {reason}",
-            )
+
+    def misfit(case: tuple[Poses, np.ndarray]) -> float:
+        off = case[0].difference(poses_of(robot, targets, case[1]))
+        return np.inf if _rms(off[:, :3]) >= TURNED_RAD else _rms(off[:, 3:])
+
+    for best, left in explain(_mistakes(robot, poses, q), misfit, min(FITS * reach, EXPLAINS * own))[:1]:
+        raise InputError(
+            "E-ROBOT-MISMATCH",
+            f"{targets.where}: joint values of robot {robot.name} lead {own:.4g} mm (RMS) away from their poses, "
+            f"{FITS * reach:.3g} mm allowed, {FITS:.0%} of the reach; but {left:.3g} mm if {best.words}",
+        )
 
 
-def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Iterator[tuple[str, Poses, Poses]]:
-    """Yields frequent mistakes: the remedy, with the poses and the joint values' poses after it."""
-    reached = poses_of(robot, targets, q)
+def _mistakes(robot: Robot, poses: Poses, q: np.ndarray) -> Iterator[Candidate]:
+    """Yields frequent mistakes with the poses and the joint values that were meant."""
     for unit in UNITS:
-        yield (
-            f"lengths were {UNIT_WORDS[unit]}; call the columns x_{unit} …",
-            Poses(poses.rotation, LENGTHS[unit] * poses.translation),
-            reached,
-        )
-    yield INVERSE, poses.inverse(), reached
+        meant = Poses(poses.rotation, LENGTHS[unit] * poses.translation)
+        yield Candidate(f"lengths were {UNIT_WORDS[unit]}; call the columns x_{unit} …", partial(tuple, (meant, q)))
+    yield Candidate(INVERSE, lambda: (poses.inverse(), q))
     turned = q * np.where(robot.prismatic, 1.0, np.degrees(1.0))  # degrees in columns of radians: told where read
-    reason = "joint values were radians in columns of degrees; call the columns q1_rad …"
-    yield reason, poses, poses_of(robot, targets, turned)
+    yield Candidate(
+        "joint values were radians in columns of degrees; call the columns q1_rad …", lambda: (poses, turned)
+    )
     for names, places in other_axes(poses.translation):
-        reason = f"x, y, z were {names}; correct order and signs of the columns of positions"
-        yield reason, Poses(poses.rotation, places), reached
-    paired = _paired(targets, poses, reached, reach_mm(robot, set(targets.tools)))
-    if paired is not None:
-        yield "joint values stood in other rows; give each pose its own", poses, paired
-
-
-def _paired(targets: Targets, poses: Poses, reached: Poses, reach: float) -> Poses | None:
-    """Returns the nearest pose ``reached`` with each pose's tool; None unless one to one and very near."""
-    rows = np.arange(len(poses))
-    for _, own in rows_by_tool(targets):
-        tree, asked = (
-            np.hstack([p.rotation[own].reshape(-1, 9), p.translation[own] / reach]) for p in (reached, poses)
-        )
-        away, found = KDTree(tree).query(asked)
-        rows[own] = own[found]
-        if away.max() > PAIRED:
-            return None
-    return reached[rows] if len(set(rows.tolist())) == len(rows) else None
+        words = f"x, y, z were {names}; correct order and signs of the columns of positions"
+        yield Candidate(words, partial(tuple, (Poses(poses.rotation, places), q)))
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:

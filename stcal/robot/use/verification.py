@@ -4,17 +4,18 @@ This is the test of the stereo-target paper. Distances from the first position n
 instrument. They all carry the error of the first position; the distances of all pairs depend less on any one position.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, freeze
-from stcal.io.json import Finite, Part, ResultFile, Vector
+from stcal.io.json import Part, ResultFile, Texts, Vector
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
@@ -47,43 +48,6 @@ Arms are off by parts of a thousand; more indicates another unit or other poses.
 BySet = Annotated[str, "set"]
 
 
-class ErrorReduction(Part):
-    mean_percent: Finite
-    std_percent: Finite
-    max_percent: Finite
-    all_pairs_rms_percent: Finite
-
-
-class MeasuredSet(Part):
-    set: str
-    mean_mm: float
-    std_mm: float
-    max_mm: float
-    all_pairs_rms_mm: float
-    scale: float
-    reduced: ErrorReduction | None = Field(
-        description="each figure's reduction from the first set: `mean_percent`, `std_percent`, `max_percent`, "
-        "`all_pairs_rms_percent`; null for the first"
-    )
-    error_mm: Vector
-
-
-class VerificationFile(ResultFile):
-    """Result file of ``verify``."""
-
-    format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
-    poses: list[str] = Field(description="names, the first being the one that distances start from")
-    distance_mm: Vector = Field(description="commanded distances of the others from it")
-    sets: list[MeasuredSet] = Field(
-        description="`set`; `mean_mm`, `std_mm` (sample), `max_mm` of the absolute errors of those distances, "
-        "`error_mm` measured minus commanded; `all_pairs_rms_mm` of the distance errors of all pairs; `scale` measured "
-        "over commanded distances of all pairs by least squares; `reduced`"
-    )
-    missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
-    warnings: list[str] = Field(description="what to look at")
-    notes: list[str] = Field(description="columns that were not read")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredPoses:
     """Rows of a file. ``sets``, ``names`` : (m,) set and pose of each; ``commanded``, ``measured`` : (m, 3) mm, each in
@@ -103,19 +67,11 @@ class MeasuredPoses:
         freeze(self, "measured", (m, 3), "measured positions")
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class SetResult:
-    """Distance errors of one set, mm.
-
-    ``error_mm`` : (m − 1,) measured minus commanded distance from the first position; ``mean_mm``, ``std_mm``,
-    ``max_mm`` : of their absolute values, the standard deviation with m − 2 in the denominator; ``pairs_rms_mm`` :
-    of the errors of all pairs; ``pairs_mm`` : of their commanded distances; ``scale`` : measured over commanded
-    distances of all pairs, by least squares; ``elsewhere`` : the poses that alone are not where they were commanded, in
-    words.
-    """
+class SetResult(Part):
+    """Distance errors of one set, mm."""
 
     name: str
-    error_mm: np.ndarray
+    error_mm: Vector
     mean_mm: float
     std_mm: float
     max_mm: float
@@ -126,30 +82,40 @@ class SetResult:
 
     def doubt(self) -> str:
         """Returns why the measured positions may not belong to the commands; empty if they may."""
-        if self.elsewhere:
-            return f"set {self.name}: {self.elsewhere}"
-        if abs(self.scale - 1) > SCALE_WITHIN:
-            return (
-                f"set {self.name}: measured distances are {self.scale:.4g} times the commanded ones; "
-                f"{_remedy_of_scale(self.scale)}"
-            )
         allowed = max(MISSES * self.pairs_mm, MISSES_MM)
-        if self.pairs_rms_mm <= allowed:
+        if self.elsewhere:
+            said = self.elsewhere
+        elif abs(self.scale - 1) > SCALE_WITHIN:
+            said = f"measured distances are {self.scale:.4g} times the commanded ones; {_remedy_of_scale(self.scale)}"
+        elif self.pairs_rms_mm > allowed:
+            said = (
+                f"measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all pairs), "
+                f"{allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
+            )
+        else:
             return ""
-        return (
-            f"set {self.name}: measured distances miss the commanded ones by {self.pairs_rms_mm:.4g} mm (RMS of all "
-            f"pairs), {allowed:.3g} mm allowed; check the order of the poses, and the robot that commanded them"
-        )
-
-    def by_scale(self) -> bool:
-        """Returns whether most of the squared errors are those of one scale."""
-        return (
-            (self.scale - 1) * self.pairs_mm
-        ) ** 2 > MOST_OF_IT * self.pairs_rms_mm**2 and self.pairs_rms_mm > OFF_MM
+        return f"set {self.name}: {said}"
 
     def figures(self) -> dict[str, float]:
         """Returns the figures that are compared between sets, mm."""
         return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
+
+
+class VerificationFile(ResultFile):
+    """Result file of ``verify``."""
+
+    format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
+    poses: list[str] = Field(description="names, the first being the one that distances start from")
+    distance_mm: Vector = Field(description="commanded distances of the others from it")
+    sets: list[SetResult] = Field(
+        description="`name`; `error_mm` measured minus commanded; `mean_mm`, `std_mm` (sample), `max_mm` of their "
+        "absolute values; `pairs_rms_mm` of the errors of all pairs, `pairs_mm` of their commanded distances (RMS); "
+        "`scale` measured over commanded distances of all pairs by least squares; `elsewhere`: the poses that alone "
+        "are not where they were commanded, in words"
+    )
+    missing: dict[BySet, list[str]] = Field(description="poses that a set lacks")
+    warnings: Texts = Field(description="what to look at")
+    notes: list[str] = Field(description="columns that were not read")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -160,6 +126,7 @@ class Verification(Brief):
     by set, the poses that it lacks; they are left out of all sets; ``notes`` : on columns that were not read.
     """
 
+    format: ClassVar = "stcal verification 1"
     where: str
     poses: tuple[str, ...]
     distance_mm: np.ndarray
@@ -186,24 +153,25 @@ class Verification(Brief):
                 f"commanded positions lie within {most:.3g} mm of the first one; if lengths are in another unit than "
                 "the names of their columns say, correct these"
             )
-        for each in self.sets:
-            if not each.doubt() and each.by_scale():
+        for i, each in enumerate(self.sets):
+            if each.doubt():
+                continue
+            by_scale = ((each.scale - 1) * each.pairs_mm) ** 2
+            if by_scale > MOST_OF_IT * each.pairs_rms_mm**2 and each.pairs_rms_mm > OFF_MM:
                 found.append(
                     f"set {each.name}: measured distances are {each.scale:.5f} times the commanded ones, which is most "
                     "of their error: check the instrument's scale"
                 )
-        for each in self.sets[1:]:
-            if NO_BETTER * first.pairs_rms_mm < each.pairs_rms_mm <= WORSE * first.pairs_rms_mm and not each.doubt():
+            against = f"{each.pairs_rms_mm:.3g} against {first.pairs_rms_mm:.3g} mm (RMS of all pairs)"
+            if i and each.pairs_rms_mm > WORSE * first.pairs_rms_mm:
                 found.append(
-                    f"set {each.name} errs as set {first.name} does, {each.pairs_rms_mm:.3g} against "
-                    f"{first.pairs_rms_mm:.3g} mm (RMS of all pairs): were these positions commanded with compensated "
-                    "joint values, and was --robot of compensate the file of identify?"
+                    f"set {each.name} errs more than set {first.name}, the first in the file, {against}: were the sets "
+                    "exchanged? The one before compensation comes first"
                 )
-            if each.pairs_rms_mm > WORSE * first.pairs_rms_mm and not each.doubt():
+            elif i and each.pairs_rms_mm > NO_BETTER * first.pairs_rms_mm:
                 found.append(
-                    f"set {each.name} errs more than set {first.name}, the first in the file, {each.pairs_rms_mm:.3g} "
-                    f"against {first.pairs_rms_mm:.3g} mm (RMS of all pairs): were the sets exchanged? The one before "
-                    "compensation comes first"
+                    f"set {each.name} errs as set {first.name} does, {against}: were these positions commanded with "
+                    "compensated joint values, and was --robot of compensate the file of identify?"
                 )
         return found
 
@@ -271,22 +239,17 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
         names = tuple(table.text("pose"))
         seen: dict[tuple[str, str], int] = {}
         for line, key in zip(table.lines, zip(sets, names, strict=True), strict=True):
-            if key in seen:
+            if seen.setdefault(key, line) != line:
                 raise InputError(
                     "E-TABLE-ROW-REPEATED",
                     f"{table.where}: line {line}: pose {key[1]} of set {key[0]} stands on line {seen[key]} already; "
                     "give the sets different names",
                 )
-            seen[key] = line
         return names
-    places: dict[tuple, int] = {}
-    numbers: list[int] = []
-    times: dict[tuple, int] = {}
+    places, numbers, times = {}, [], Counter()
     for name, xyz in zip(sets, np.round(commanded / SAME_MM).astype(np.int64).tolist(), strict=True):
-        place = tuple(xyz)
-        times[name, place] = times.get((name, place), 0) + 1
-        key = (place, times[name, place])
-        numbers.append(places.setdefault(key, len(places) + 1))
+        times[name, *xyz] += 1
+        numbers.append(places.setdefault((*xyz, times[name, *xyz]), len(places) + 1))
     return tuple(map(str, numbers))
 
 
@@ -333,15 +296,14 @@ def verify(data: MeasuredPoses) -> Verification:
                 f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {next(iter(index))} and "
                 f"{group} (line {data.lines[rows_of_set[k]]}); the same commands needed",
             )
-    results = [_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items()]
-    same = "measured positions are those of the first set to the last digit; give those of the instrument"
-    sets = tuple(
-        replace(each, elsewhere=same) if k and (data.measured[rows_of_set] == data.measured[first]).all() else each
-        for k, (each, rows_of_set) in enumerate(zip(results, index.values(), strict=True))
-    )
+    sets = [_set_result(data, group, rows_of_set, common) for group, rows_of_set in index.items()]
+    for k, rows_of_set in enumerate(list(index.values())[1:], 1):
+        if (data.measured[rows_of_set] == data.measured[first]).all():
+            same = "measured positions are those of the first set to the last digit; give those of the instrument"
+            sets[k] = sets[k].model_copy(update={"elsewhere": same})
     at = data.commanded[first]
     distances = np.linalg.norm(at[1:] - at[0], axis=1)
-    return Verification(data.where, tuple(common), distances, sets, missing, data.notes)
+    return Verification(data.where, tuple(common), distances, tuple(sets), missing, data.notes)
 
 
 def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]) -> str:
@@ -379,19 +341,16 @@ def _elsewhere(commanded: np.ndarray, measured: np.ndarray, names: Sequence[str]
 def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequence[str]) -> SetResult:
     commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
-    size = np.abs(error)
-    squares = pairs = product = commanded_squares = 0.0
-    for i in range(1, len(measured)):  # row by row: all pairs of thousands at once are gigabytes
-        measured_distance = np.linalg.norm(measured[:i] - measured[i], axis=1)
-        commanded_distance = np.linalg.norm(commanded[:i] - commanded[i], axis=1)
-        squares += float(((measured_distance - commanded_distance) ** 2).sum())
-        product += float(measured_distance @ commanded_distance)
-        commanded_squares += float(commanded_distance @ commanded_distance)
-        pairs += i
+    sums = np.zeros(4)  # row by row: all pairs of thousands at once are gigabytes
+    for i in range(1, len(measured)):
+        seen, wanted = (np.linalg.norm(xyz[:i] - xyz[i], axis=1) for xyz in (measured, commanded))
+        sums += ((seen - wanted) ** 2).sum(), seen @ wanted, wanted @ wanted, i
+    squares, product, commanded_squares, pairs = sums.tolist()
     if commanded_squares == 0:
         raise InputError(
             "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
         )
+    size = np.abs(error)
     return SetResult(
         name=name,
         error_mm=error,
@@ -402,28 +361,6 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray, names: Sequenc
         pairs_mm=float(np.sqrt(commanded_squares / pairs)),
         scale=product / commanded_squares,
         elsewhere=_elsewhere(commanded, measured, names) if len(names) <= MOST_COMPARED else "",
-    )
-
-
-def verification_file(result: Verification) -> VerificationFile:
-    """Returns the complete result in machine-readable form."""
-    keys = ("mean", "std", "max", "all_pairs_rms")
-    sets = []
-    for k, each in enumerate(result.sets):
-        figures = {f"{key}_mm": value for key, value in zip(keys, each.figures().values(), strict=True)}
-        reduced = {f"{key}_percent": less for key, less in zip(keys, result.reduction(k).values(), strict=True)}
-        reduced = reduced if k else None
-        sets.append({"set": each.name, **figures, "scale": each.scale, "reduced": reduced, "error_mm": each.error_mm})
-    return VerificationFile.model_validate(
-        {
-            "format": "stcal verification 1",
-            "poses": result.poses,
-            "distance_mm": result.distance_mm,
-            "sets": sets,
-            "missing": {name: list(poses) for name, poses in result.missing.items()},
-            "warnings": result.warnings(),
-            "notes": list(result.notes),
-        }
     )
 
 

@@ -179,7 +179,10 @@ def test_errors_of_pairs_are_as_large_as_their_sigma():
         pairs = pairs_of([f.world_from_axis for f in fits], covariance, nominal)
         for one, two in zip(pairs[:3], wanted[:3], strict=True):  # the others cross: the sign of 0 is not kept
             scores.append(
-                [(one.distance - two.distance) / one.distance_sigma, (one.angle - two.angle) / one.angle_sigma]
+                [
+                    (one.distance_mm - two.distance_mm) / one.distance_sigma_mm,
+                    (one.angle_rad - two.angle_rad) / one.angle_sigma_rad,
+                ]
             )
     # 180 each, not all independent: the mean square scatters by √(2 / 180) = 11 % or somewhat more
     assert np.mean(np.square(scores), axis=0) == pytest.approx([1, 1], abs=0.33)
@@ -196,9 +199,9 @@ def test_leaving_out_a_row_is_fitting_without_it():
         again = robot_from_sweeps(data[rows], nominal)
         found = np.abs(whole.without_one.distance[index])
         # the same weights are kept, which is a small part of σ where a residual is above 3 σ
-        sigma = np.array([p.distance_sigma for p in whole.pairs])
-        assert (np.abs(found - [p.distance for p in again.pairs]) < 0.1 * sigma).all()
-        assert np.abs(found - [p.distance for p in whole.pairs]).max() > 1e-4
+        sigma = np.array([p.distance_sigma_mm for p in whole.pairs])
+        assert (np.abs(found - [p.distance_mm for p in again.pairs]) < 0.1 * sigma).all()
+        assert np.abs(found - [p.distance_mm for p in whole.pairs]).max() > 1e-4
 
 
 @pytest.mark.full
@@ -263,7 +266,7 @@ def test_a_gross_error_is_named_and_left_out(off_mm):
     assert [note for note in result.notes if f"line {data.lines[40]}, reflector B" in note and "left out" in note]
     assert len(result.notes) == 1
     for one, two in zip(result.pairs, clean.pairs, strict=True):
-        assert abs(one.distance - two.distance) < 3 * two.distance_sigma  # one of 18 points less
+        assert abs(one.distance_mm - two.distance_mm) < 3 * two.distance_sigma_mm  # one of 18 points less
 
 
 def test_a_reflector_on_the_axis_says_nothing_and_breaks_nothing():
@@ -327,7 +330,7 @@ def test_exactly_parallel_axes_have_no_common_normal():
     result = robot_from_sweeps(measured(placed(nominal, Rigid(), TOOLS), sweep_values(nominal)), nominal)
     pair = result.pairs[1]
     assert pair.parallel
-    assert pair.distance == pytest.approx(870, abs=1e-8)
+    assert pair.distance_mm == pytest.approx(870, abs=1e-8)
     assert pair.refused
 
 
@@ -362,16 +365,16 @@ def test_tracked_sweeps_lie_on_their_circles_and_give_the_arms_lengths(fanuc):
     assert not result.notes
     for pair, wanted in zip(result.pairs, (311.45, 1075.58, 226.08), strict=False):
         # other estimators of the same data: they differ by less than the σ of the data
-        assert abs(pair.distance - wanted) < pair.distance_sigma + 0.005
-        assert 0.02 < pair.distance_sigma < 0.2
-    assert [abs(row.a) for row in result.robot.rows[:3]] == pytest.approx([p.distance for p in result.pairs[:3]])
+        assert abs(pair.distance_mm - wanted) < pair.distance_sigma_mm + 0.005
+        assert 0.02 < pair.distance_sigma_mm < 0.2
+    assert [abs(row.a) for row in result.robot.rows[:3]] == pytest.approx([p.distance_mm for p in result.pairs[:3]])
 
 
 def test_denavit_and_hartenberg_is_refused_for_the_nearly_parallel_pair(fanuc):
     _, result = fanuc
     pair = result.pairs[1]
-    assert np.pi - pair.angle == pytest.approx(np.radians(0.0104), abs=2 * pair.angle_sigma)
-    assert abs(pair.foot) == pytest.approx(5.9e6, abs=2 * pair.foot_sigma)
+    assert np.pi - pair.angle_rad == pytest.approx(np.radians(0.0104), abs=2 * pair.angle_sigma_rad)
+    assert abs(pair.foot_mm) == pytest.approx(5.9e6, abs=2 * pair.foot_sigma_mm)
     assert pair.parallel
     assert "foot 59" in pair.refused
     assert "1 mm needed" in pair.refused

@@ -239,7 +239,7 @@ def test_an_outlier_is_named_and_does_no_harm():
     assert [row for row, _ in spoilt.outliers()] == [17]
     change = [abs(a.a - b.a) for a, b in zip(clean.robot.rows, spoilt.robot.rows, strict=True)]
     assert max(change) < 0.05  # of σ about 0.03 mm; 5 mm in one of 50 rows would make tenths of a mm
-    assert "line 19" in identified_report(spoilt, mh80()).text()
+    assert "line 19" in identified_report(spoilt).text()
     assert spoilt.weighting.sigma_mm == pytest.approx(clean.weighting.sigma_mm, rel=0.05)
 
 

@@ -18,7 +18,7 @@ from stcal.robot.identification.adjustment import (
     residuals,
     tips,
 )
-from stcal.robot.identification.drawings import Drawn, joints_figure
+from stcal.robot.identification.report import Drawn, joints_figure
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.dh import robot_from_chain
@@ -174,7 +174,7 @@ def test_joints_are_drawn_with_the_rows_that_they_move():
     robot, rng = two_arms(), np.random.default_rng(3)
     seen = observed(seen_by(robot, rng, each=4))
     state = State(robot.chain(), dict(robot.tools))
-    drawn = Drawn(state, robot.world_from_base, seen, residuals(state, seen), np.ones(12, bool))
+    drawn = Drawn(state, seen, residuals(state, seen), np.ones(12, bool))
     dots = re.findall(r'd="([^"]*)" stroke="[^"]*" stroke-opacity', joints_figure(drawn, ()).svg())
     points = [path.count("M") for path in dots]
     assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm

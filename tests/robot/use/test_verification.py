@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.use.report import verification_report
-from stcal.robot.use.verification import MeasuredPoses, Verification, read_measured, verification_file, verify
+from stcal.robot.use.verification import MeasuredPoses, Verification, VerificationFile, read_measured, verify
 from tests.outcome import refuses
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
@@ -109,9 +109,9 @@ def test_too_few_and_other_units_are_named(tmp_path):
 
 def test_no_error_at_all_gives_no_reduction(tmp_path):
     rows = [f"{s},{','.join(f'{v:g}' for v in (*c, *c))}" for s in ("a", "b") for c in COMMANDED]
-    content = verification_file(verify(read_measured(written(tmp_path, rows)))).content()
-    assert content["sets"][1]["reduced"]["mean_percent"] is None
-    json.dumps(content, allow_nan=False)
+    result = verify(read_measured(written(tmp_path, rows)))
+    assert np.isnan(result.reduction(1)["mean"])
+    json.dumps(VerificationFile.model_validate(result).content(), allow_nan=False)
 
 
 @pytest.mark.parametrize(("off_mm", "warned"), [(0.01, False), (15.0, False), (4100.0, True)])
