@@ -205,7 +205,7 @@ def own_digest(content: dict) -> str:
 def require_unchanged(path: str | Path) -> None:
     """Refuses a file of a run's folder that is not as the run left it, by the hash in the run's marker; others pass."""
     path = Path(path)
-    run = path.parent if (path.parent / RUN_MARKER).is_file() else path.parent.parent
+    run = next((folder for folder in path.parents[:3] if (folder / RUN_MARKER).is_file()), path.parent)
     name = path.relative_to(run).as_posix()
     try:
         marker = json.loads(text_of(read_bytes(run / RUN_MARKER, TABLE_BYTES)))

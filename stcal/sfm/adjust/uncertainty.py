@@ -1,13 +1,11 @@
 """Covariances of faces and circles, and what each kind of observation contributes to them."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.clusters import released
 from stcal.geometry.rigid import Poses, Rigid
@@ -106,7 +104,7 @@ def calibrated_target(
 def _position_sources_mm(state: Adjusted, scale: float, own: Derivatives) -> dict[str, dict[str, np.ndarray]]:
     """Returns, by face and kind of observation, what the kind contributes to σ of the face's x, y, z, (3,) mm."""
     positions = np.concatenate([jacobian[3:] for jacobian in own.faces.values()])
-    covariance = _parts_of(state, positions.T).covariance
+    covariance = _parts_of(state, positions.T)[0]
     return {
         face: {
             kind: scale * np.sqrt(np.maximum(np.diag(matrix)[3 * i : 3 * i + 3], 0.0))
@@ -130,49 +128,45 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
     faces = [_MovedFace.of(face, result, start.target_from_face[face.id].rotation[:, 2], kind) for face in designs]
     poses = {moved.face.id: moved.frames(np.zeros((1, len(moved.rows), 3)))[0] for moved in faces}
     target_from_model = poses[start.reference_face].inverse()
-    by_circle = _Moves.none(poses, len(result.labels), 3 * len(result.labels))
-    by_place = [_Moves.none(poses, len(result.labels), 0)]
+    mapped, c = 3 * len(result.labels), len(result.labels)  # after the circles come the placed ones, by two coordinates
+    width = mapped + 2 * sum(len(moved.placed) for moved in faces)
+    by_face, circles, at = {face_id: np.zeros((6, width)) for face_id in poses}, np.zeros((c, 3, width)), mapped
     for moved in faces:
-        moves = np.eye(3 * len(moved.rows)).reshape(-1, len(moved.rows), 3)
-        by_circle.put(
-            _moves(moved, moves, None, poses, start, result), (3 * moved.rows[:, None] + np.arange(3)).ravel()
-        )
-        if moved.placed:  # in the plane of the face, where the design gives their places
-            shifts = np.einsum("pq,ja->pjqa", np.eye(len(moved.placed)), poses[moved.face.id].rotation[:, :2].T)
-            shifts = shifts.reshape(-1, len(moved.placed), 3)
-            no_moves = np.zeros((len(shifts), len(moved.rows), 3))
-            by_place.append(_moves(moved, no_moves, shifts, poses, start, result))
+        m, p = 3 * len(moved.rows), len(moved.placed)
+        columns = np.append(coordinates(moved.rows), at + np.arange(2 * p))
+        at += 2 * p
+        moves = np.eye(m + 2 * p, m).reshape(-1, len(moved.rows), 3)
+        shifts = np.zeros((m + 2 * p, p, 3))  # in the plane of the face, where the design gives their places
+        shifts[m:] = np.einsum("pq,ja->pjqa", np.eye(p), poses[moved.face.id].rotation[:, :2].T).reshape(2 * p, p, 3)
+        ahead, behind = (moved.frames(sign * STEP_MM * moves, sign * STEP_MM * shifts) for sign in (1, -1))
+        if moved.face.id != start.reference_face:
+            twist = (target_from_model @ ahead).difference(target_from_model @ behind)
+            by_face[moved.face.id][:, columns] = twist.T / (2 * STEP_MM)
+            rotated = np.transpose(moves @ target_from_model.rotation.T, (1, 2, 0))
+            circles[np.ix_(moved.rows, range(3), columns)] = rotated
+            continue
+        ahead, behind = ahead.inverse(), behind.inverse()
+        for face_id, pose in poses.items():
+            if face_id != moved.face.id:
+                by_face[face_id][:, columns] = (ahead @ pose).difference(behind @ pose).T / (2 * STEP_MM)
+        for sign, target_from_moved in ((1, ahead), (-1, behind)):
+            xyz = np.tile(result.xyz_model, (len(moves), 1, 1))
+            xyz[:, moved.rows] += sign * STEP_MM * moves
+            placed = xyz @ np.swapaxes(target_from_moved.rotation, 1, 2) + target_from_moved.translation[:, None]
+            circles[:, :, columns] += sign * np.transpose(placed, (1, 2, 0)) / (2 * STEP_MM)
     sigma = 0.0
-    if len(by_place) > 1:
+    if width > mapped:
         sigma = placement_sigma_mm(target, dict(zip(result.labels, result.xyz_model, strict=True)))
     return Derivatives(
         {face_id: target_from_model @ pose for face_id, pose in poses.items()},
         target_from_model @ result.xyz_model,
         target_from_model,
-        by_circle.faces,
-        by_circle.circles,
-        {face_id: np.hstack([moved.faces[face_id] for moved in by_place]) for face_id in poses},
-        np.concatenate([moved.circles for moved in by_place], axis=2),
+        {face_id: jacobian[:, :mapped] for face_id, jacobian in by_face.items()},
+        circles[:, :, :mapped],
+        {face_id: jacobian[:, mapped:] for face_id, jacobian in by_face.items()},
+        circles[:, :, mapped:],
         sigma,
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Moves:
-    """Derivatives by k parameters: ``faces`` (6, k) each, rotation and translation, and ``circles`` (c, 3, k)."""
-
-    faces: dict[str, np.ndarray]
-    circles: np.ndarray
-
-    @classmethod
-    def none(cls, faces: Iterable[str], circles: int, count: int) -> "_Moves":
-        return cls({face_id: np.zeros((6, count)) for face_id in faces}, np.zeros((circles, 3, count)))
-
-    def put(self, other: "_Moves", columns: np.ndarray) -> None:
-        """Copies the derivatives by other parameters into ``columns``."""
-        self.circles[:, :, columns] = other.circles
-        for face_id, jacobian in other.faces.items():
-            self.faces[face_id][:, columns] = jacobian
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,37 +201,6 @@ class _MovedFace:
         return face_frames(self.face, names, completed, self.kind, self.towards)
 
 
-def _moves(
-    moved: _MovedFace,
-    moves: np.ndarray,
-    shifts: np.ndarray | None,
-    own: dict[str, Rigid],
-    start: CalibratedTarget,
-    result: JointResult,
-) -> _Moves:
-    """Returns derivatives by k parameters that move circles of one face, (k, m, 3), or its placed ones, (k, p, 3)."""
-    derivative = _Moves.none(own, len(result.labels), len(moves))
-    ahead, behind = (
-        moved.frames(sign * STEP_MM * moves, None if shifts is None else sign * STEP_MM * shifts) for sign in (1, -1)
-    )
-    if moved.face.id != start.reference_face:
-        target_from_model = own[start.reference_face].inverse()
-        twist = (target_from_model @ ahead).difference(target_from_model @ behind)
-        derivative.faces[moved.face.id][:] = twist.T / (2 * STEP_MM)
-        derivative.circles[moved.rows] = np.transpose(moves @ target_from_model.rotation.T, (1, 2, 0))
-        return derivative
-    ahead, behind = ahead.inverse(), behind.inverse()
-    for face_id, pose in own.items():
-        if face_id != moved.face.id:
-            derivative.faces[face_id][:] = (ahead @ pose).difference(behind @ pose).T / (2 * STEP_MM)
-    for sign, target_from_model in ((1, ahead), (-1, behind)):
-        xyz = np.tile(result.xyz_model, (len(moves), 1, 1))
-        xyz[:, moved.rows] += sign * STEP_MM * moves
-        placed = xyz @ np.swapaxes(target_from_model.rotation, 1, 2) + target_from_model.translation[:, None]
-        derivative.circles[:] += sign * np.transpose(placed, (1, 2, 0)) / (2 * STEP_MM)
-    return derivative
-
-
 FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES = "flatness", "intrinsics", "print", "sizes", "distances"
 OBSERVED = (CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES)
 """Kinds of observations: centres of circles and of dots in the images, positions of the dots on the board, flatness of
@@ -254,19 +217,12 @@ class Contributions:
     by_intrinsics: np.ndarray  # (3c, 16) per error of the intrinsics if these are fixed, else zero
     centre_sigma_px: dict[str, float]  # of circles and of dots, RMS per axis, scaled by σ₀
 
-    def __post_init__(self):
-        c = 3 * len(self.joint.labels)
-        fixed = {kind: frozen(matrix, (c, c), f"{kind}: covariance") for kind, matrix in self.covariance_mm2.items()}
-        object.__setattr__(self, "covariance_mm2", fixed)
-        freeze(self, "by_scale", (c,), "scale")
-        freeze(self, "by_intrinsics", (c, len(PARAMETER_NAMES)), "intrinsics")
 
-
-def result_of(state: Adjusted, parts: "_Parts | None" = None) -> JointResult:
+def result_of(state: Adjusted, covariance: dict[str, np.ndarray] | None = None) -> JointResult:
     """Returns the result of an adjustment, with covariances by how much its photographs differ."""
     joint, variance = state.result(), state.differ**2
     if variance > 1:
-        of_kind = (parts or _parts_of(state)).covariance
+        of_kind = covariance or _parts_of(state)[0]
         added = (1 - 1 / variance) * joint.sigma_scale**2 * (of_kind[CIRCLES] + of_kind[DOTS])
         joint = replace(
             joint,
@@ -279,28 +235,23 @@ def result_of(state: Adjusted, parts: "_Parts | None" = None) -> JointResult:
 
 def contributions_of(state: Adjusted) -> Contributions:
     """Splits the covariance at the minimum of an adjustment into the contributions of the observations."""
-    parts = _parts_of(state)
-    joint = result_of(state, parts)
+    covariance, by_scale, by_intrinsics = _parts_of(state)
+    joint = result_of(state, covariance)
     variance = joint.sigma_scale**2
     return Contributions(
         joint,
-        {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in parts.covariance.items()},
-        parts.by_scale,
-        parts.by_intrinsics,
+        {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in covariance.items()},
+        by_scale,
+        by_intrinsics,
         {kind: state.differ * joint.sigma_scale * centre_sigma_px(state, kind) for kind in (CIRCLES, DOTS)},
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Parts:
-    """Effects of errors of the observations on k quantities, as in :class:`Contributions`."""
-
-    covariance: dict[str, np.ndarray]
-    by_scale: np.ndarray
-    by_intrinsics: np.ndarray
+Parts = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]
+"""Effects of errors of the observations on k quantities, as the three in :class:`Contributions`; σ₀ is 1."""
 
 
-def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
+def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
     """Returns the parts for quantities with derivatives (3c, k) by the circles, or for the 3c coordinates if None."""
     setting, solution = state.setting, state.solution
     camera, xyz = state.camera, solution.values[CIRCLES].array
@@ -334,7 +285,7 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
     for members, along, _, sigma in bars(xyz, setting):
         row = along @ (inverse[3 * members[0] + np.arange(3)] - inverse[3 * members[1] + np.arange(3)]) / sigma
         covariance[DISTANCES] += np.outer(row, row)
-    return _Parts(covariance, by_scale, by_intrinsics)
+    return covariance, by_scale, by_intrinsics
 
 
 def centre_sigma_px(state: Adjusted, kind: str) -> float:
@@ -353,13 +304,11 @@ def with_differences(state: Adjusted, start: CalibratedTarget, target: TargetDes
     pixels would do. A photograph's own residuals are smaller than its errors, as it took part in the answer; they are
     corrected for that (CR2, Bell & McCaffrey 2002).
     """
-    return replace(state, differ=_differ(state, derivatives(state.result(), start, target, kind)))
-
-
-def _differ(state: Adjusted, own: Derivatives) -> float:
-    faces = np.concatenate([by_circles for by_circles in own.faces.values() if by_circles.any()] or [np.zeros((0, 0))])
-    if not faces.size:
-        return 1.0
+    result = state.result()
+    by_circles = [own for own in derivatives(result, start, target, kind).faces.values() if own.any()]
+    if not by_circles:
+        return state
+    faces = np.concatenate(by_circles)
     extensible, camera, basis = points_of(state.setting, state.solution), state.camera, state.setting.basis
     scatter, told = np.zeros((2, len(faces), len(faces)))
     for model in state.models:
@@ -377,4 +326,4 @@ def _differ(state: Adjusted, own: Derivatives) -> float:
     for i in range(0, len(faces), 6):
         own_part = np.ix_(range(i, i + 6), range(i, i + 6))
         ratios.append(np.trace(np.linalg.lstsq(told[own_part], scatter[own_part], rcond=None)[0]) / 6)
-    return max(1.0, float(np.sqrt(np.mean(ratios))) / scale_of(state.result().sigma0))
+    return replace(state, differ=max(1.0, float(np.sqrt(np.mean(ratios))) / scale_of(result.sigma0)))

@@ -16,10 +16,10 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.interop.export import FORMS, ExportedRun
-from stcal.sfm.interop.export_database import Exported, copy_database
+from stcal.sfm.interop.export_database import Exported, write_copy
 from stcal.sfm.interop.export_model import ExportedModel
 from stcal.sfm.interop.native import NativeColmap, faces_from_models, find_colmap, map_natively, require_listable
-from stcal.sfm.interop.schema import schema_of_version
+from stcal.sfm.interop.schema import find_schema, schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import labelled_model, pipeline_options, seeded_mapping
@@ -123,8 +123,8 @@ def _compared(
     native_models, pycolmap_models, adjusted = [], [], []
     groups = run.groups()
     with scratch_folder("crosscheck") as folder:
-        copy_database(run.database, folder / "native.db", schema, run)
-        copy_database(run.database, folder / "ours.db", "4.2", run)
+        write_copy(run, folder / "native.db", find_schema(schema))
+        write_copy(run, folder / "ours.db", find_schema("4.2"))
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
             names = [image.name for image in group]

@@ -1,7 +1,6 @@
 """Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
 import os
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,21 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.files import save
-from stcal.io.poses.programs import (
-    Static,
-    fixed_joint,
-    messages,
-    read_messages,
-    read_ros1_launch,
-    read_ros2_launch,
-    ros1_launch,
-    ros2_launch,
-    static_of_joint,
-)
-from stcal.io.table import csv_rows, csv_text, require_poses_written
-from stcal.io.toml import load_yaml, opencv_matrix
+from stcal.io.files import require_same, save
+from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, ros2_launch
+from stcal.io.table import csv_text
+from stcal.io.toml import opencv_matrix
 from stcal.sfm.interop import gltf
 from stcal.sfm.interop.export_content import Content, content_of
 from stcal.sfm.runs.saved import AnyRun, saved_run
@@ -44,17 +32,13 @@ def table(content: Content) -> str:
     for face, pose in content.faces.items():
         x, y, z, w = Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True).tolist()
         turned = [w, x, y, z, *pose.rotation[:, 2].tolist()]
-        sigma = content.face_sigma(face)
-        sigma_cells = (
-            [""] * 6 if sigma is None else [_digits(v) for v in (*(1e3 * sigma[1]), *(1e3 * np.degrees(sigma[0])))]
-        )
-        rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *sigma_cells])
+        turn, shift = content.face_sigma(face) or (np.zeros(0), np.zeros(0))
+        cells = [f"{v:.4g}" for v in (*(1e3 * shift), *(1e3 * np.degrees(turn)))]
+        rows.append(["face", face, "", *pose.translation.tolist(), *turned, "", *(cells or [""] * 6)])
         for circle in content.of_face(face):
-            sigma_cells = [""] * 3 if circle.sigma_mm is None else [_digits(1e3 * v) for v in circle.sigma_mm]
-            place = circle.xyz_mm.tolist()
-            rows.append(
-                ["circle", face, circle.label.circle, *place, *turned, circle.radius_mm, *sigma_cells, "", "", ""]
-            )
+            cells = [""] * 3 if circle.sigma_mm is None else [f"{1e3 * v:.4g}" for v in circle.sigma_mm]
+            place = [*circle.xyz_mm.tolist(), *turned, circle.radius_mm]
+            rows.append(["circle", face, circle.label.circle, *place, *cells, "", "", ""])
     return csv_text(rows)
 
 
@@ -84,10 +68,6 @@ def opencv(content: Content) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _digits(value: float) -> str:
-    return f"{value:.4g}"
-
-
 def _quoted(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
@@ -103,8 +83,10 @@ MM_M = 1e-3
 
 def urdf(content: Content) -> str:
     """Returns a ``robot`` of massless links: the target, the faces with visible circles, and the circles."""
-    head = ['<?xml version="1.0"?>', *_comments(content), f"<robot name={quoteattr(content.root)}>"]
-    return "\n".join([*head, f"<link name={quoteattr(content.root)}/>", *_body(content, str), "</robot>\n"])
+    root = quoteattr(content.root)
+    comments = [f"<!-- {line} -->" for line in _in_comments(content)]
+    head = ['<?xml version="1.0"?>', *comments, f"<robot name={root}>", f"<link name={root}/>"]
+    return "\n".join([*head, *_body(content, str), "</robot>\n"])
 
 
 def xacro(content: Content) -> str:
@@ -115,7 +97,7 @@ def xacro(content: Content) -> str:
 
     macro = "".join(c if c.isalnum() else "_" for c in content.root)
     root = prefixed(content.root)
-    lines = ['<?xml version="1.0"?>', *map(_escaped, _comments(content))]
+    lines = ['<?xml version="1.0"?>', *(_escaped(f"<!-- {line} -->") for line in _in_comments(content))]
     lines += ['<robot xmlns:xacro="http://www.ros.org/wiki/xacro">']
     lines += [f"<xacro:macro name={quoteattr(macro)} params=\"prefix:='' parent *origin\">"]
     lines += [f"<link name={quoteattr(root)}/>"]
@@ -127,16 +109,6 @@ def xacro(content: Content) -> str:
 def tf2(content: Content) -> str:
     """Returns a YAML document of ``geometry_msgs/TransformStamped`` for each frame; metres."""
     return "".join(f"# {line}\n" for line in content.said()) + messages(content.statics())
-
-
-def launch_ros2(content: Content) -> str:
-    """Returns a launch file of ROS 2 that publishes the frames."""
-    return ros2_launch(content.statics(), content.said())
-
-
-def launch_ros1(content: Content) -> str:
-    """Returns a launch file of ROS 1 that publishes the frames."""
-    return ros1_launch(content.statics(), [line.replace("--", "- -") for line in content.said()])
 
 
 def _body(content: Content, named: Callable[[str], str]) -> list[str]:
@@ -162,43 +134,14 @@ def _body(content: Content, named: Callable[[str], str]) -> list[str]:
     return [*links, *(joint.rstrip("\n") for joint in joints)]
 
 
-def _comments(content: Content) -> list[str]:
-    """Returns XML comments. ``--`` is not allowed in them and is written with a space."""
-    return [f"<!-- {line.replace('--', '- -')} -->" for line in content.said()]
+def _in_comments(content: Content) -> list[str]:
+    """Returns lines for XML comments, in which ``--`` is not allowed; it is written with a space."""
+    return [line.replace("--", "- -") for line in content.said()]
 
 
 def _escaped(text: str) -> str:
     """Escapes expressions that xacro would evaluate."""
     return text.replace("$(", "$$(").replace("${", "$${")
-
-
-def read_urdf(text: str) -> list[Static]:
-    """Returns the frames in a text of :func:`urdf` or :func:`xacro`."""
-    joints = ElementTree.fromstring(text).iter("joint")
-    return [static_of_joint(joint) for joint in joints if joint.find("origin") is not None]
-
-
-def read_table(text: str) -> list[Static]:
-    """Returns the frames in a text of :func:`table`."""
-    frames: list[Static] = []
-    for row in csv_rows(text):
-        turn, place = ([float(row[name]) for name in COLUMNS[at]] for at in (slice(6, 10), slice(3, 6)))
-        pose = Poses.from_quaternions([turn], [place])[0]
-        if row["kind"] == "face":
-            face = pose
-        frames.append(Static(row["face"], row["circle"], pose if row["kind"] == "face" else face.inverse() @ pose))
-    return frames
-
-
-def read_opencv(text: str) -> list[Static]:
-    """Returns the frames in a text of :func:`opencv`."""
-    frames = []
-    for face in load_yaml(text)["faces"]:
-        pose = Rigid.from_matrix(np.reshape(face["target_from_face"]["data"], (4, 4)))
-        frames.append(Static("", face["id"], pose))
-        centres = np.reshape(face["centres"]["data"], (-1, 3)) if "centres" in face else ()
-        frames += [Static(face["id"], "", Rigid(np.eye(3), pose.inverse() @ centre)) for centre in centres]
-    return frames
 
 
 ROOT = "target"
@@ -212,19 +155,17 @@ class Form:
     suffix: str
     write: Callable[[Content], str | bytes]
     lost: str  # results among faces, circles, σ and cameras that the files do not hold
-    # returns :meth:`Content.statics` from a text, None for viewers
-    read: Callable[[str], Sequence[Static]] | None = None
 
 
 FRAMES_ONLY = "cameras, radii, σ of circles; σ of faces is in comments"
 FORMS = {
-    "urdf": Form(".urdf", urdf, "cameras, σ of circles; σ of faces is in comments", read_urdf),
-    "xacro": Form(".xacro", xacro, "cameras, σ of circles; σ of faces is in comments", read_urdf),
-    "tf2": Form(".yaml", tf2, FRAMES_ONLY, read_messages),
-    "ros2": Form(".py", launch_ros2, FRAMES_ONLY, read_ros2_launch),
-    "ros1": Form(".launch", launch_ros1, FRAMES_ONLY, read_ros1_launch),
-    "opencv": Form(".yml", opencv, "cameras", read_opencv),
-    "csv": Form(".csv", table, "cameras, correlations", read_table),
+    "urdf": Form(".urdf", urdf, "cameras, σ of circles; σ of faces is in comments"),
+    "xacro": Form(".xacro", xacro, "cameras, σ of circles; σ of faces is in comments"),
+    "tf2": Form(".yaml", tf2, FRAMES_ONLY),
+    "ros2": Form(".py", lambda content: ros2_launch(content.statics(), content.said()), FRAMES_ONLY),
+    "ros1": Form(".launch", lambda content: ros1_launch(content.statics(), _in_comments(content)), FRAMES_ONLY),
+    "opencv": Form(".yml", opencv, "cameras"),
+    "csv": Form(".csv", table, "cameras, correlations"),
     "gltf": Form(".gltf", gltf.gltf, "the lens's distortion but as numbers in extras"),
     "glb": Form(".glb", gltf.glb, "the lens's distortion but as numbers in extras"),
 }
@@ -267,7 +208,13 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
         Not a finished run, the file exists, the form is unknown, or the name is bad.
     """
     path = Path(out)
-    form = form or form_of(path)
+    suffixes = {known.suffix: each for each, known in FORMS.items()}
+    if not form and path.suffix.lower() not in suffixes:
+        raise InputError(
+            "E-OUTPUT-SUFFIX",
+            f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form",
+        )
+    form = form or suffixes[path.suffix.lower()]
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
     if os.path.lexists(path):
@@ -275,22 +222,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
     if not path.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     content = content_of(saved_run(run), name)
-    save(path, FORMS[form].write(content))
-    if (read := FORMS[form].read) is not None:
-        require_poses_written(
-            path,
-            lambda: Poses.of(static.pose for static in read(path.read_text(encoding="utf-8"))),
-            Poses.of(static.pose for static in content.statics()),
-        )
+    written = FORMS[form].write(content)
+    save(path, written)
+    require_same(path, path.read_bytes, written.encode() if isinstance(written, str) else written)
     return ExportedRun(path, form, content)
-
-
-def form_of(path: Path) -> str:
-    """Returns the form for the suffix of a path."""
-    suffixes = {form.suffix: name for name, form in FORMS.items()}
-    if path.suffix.lower() not in suffixes:
-        raise InputError(
-            "E-OUTPUT-SUFFIX",
-            f"{path}: suffix {path.suffix or 'missing'}; one of {', '.join(suffixes)} needed, or --form",
-        )
-    return suffixes[path.suffix.lower()]

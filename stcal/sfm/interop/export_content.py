@@ -162,20 +162,3 @@ def content_of(run: SavedRun, root: str) -> Content:
 def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
     """Returns the colour of each face, by id."""
     return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target_design.faces)}
-
-
-def ellipsoid(circle: Circle, target_from_face: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Returns σ (3,) of a centre along the principal axes, and these as columns (3, 3) in the face's frame."""
-    turn = np.array(target_from_face.rotation)
-    values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
-    return np.sqrt(np.maximum(values, 0)), axes * [np.sign(np.linalg.det(axes)), 1, 1]
-
-
-def exaggeration(content: Content) -> float:
-    """Returns the factor with which σ is drawn, a power of ten. The median ball is no larger than the median circle."""
-    sigmas = [(circle, circle.sigma_mm) for circle in content.circles]
-    sigma = [float(np.linalg.norm(sigma_mm)) for _, sigma_mm in sigmas if sigma_mm is not None]
-    if not sigma or max(sigma) == 0:
-        return 1.0
-    radius = float(np.median([circle.radius_mm for circle, sigma_mm in sigmas if sigma_mm is not None]))
-    return 10.0 ** np.floor(np.log10(radius / np.median(sigma)))

@@ -1,9 +1,9 @@
-"""Export of the final model for other programs: COLMAP's two forms, NVM and Bundler, checked against the run."""
+"""Export of the final model for other programs: COLMAP's two forms, NVM and Bundler."""
 
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -12,106 +12,16 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
-from stcal.geometry.rigid import Rigid
-from stcal.io.files import TARGET_MODEL
-from stcal.io.json import Part
+from stcal.io.cameras.model import camera_from_colmap
+from stcal.io.files import TARGET_MODEL, require_unchanged
 from stcal.io.table import csv_text
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.interop.export_content import BOARD_RGB, colours
 from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import colmap_camera, from_colmap_px
-from stcal.sfm.mapping.models import (
-    open_model,
-    pose_of_image,
-    require_keypoints,
-    rigid_from_colmap,
-    write_reconstruction,
-)
-from stcal.sfm.runs.report import CameraInSpace, ImageResiduals, ReportCamera
+from stcal.sfm.mapping.database import from_colmap_px
+from stcal.sfm.mapping.models import open_model, require_keypoints, rigid_from_colmap, write_reconstruction
 from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
-
-ROUNDING = 1e-6
-"""Relative rounding error of a residual that is computed again from the model's files."""
-ROUNDING_PX = 1e-4
-"""Absolute part of this rounding error, px."""
-SAME_PLACE_MM = 1e-6
-SAME_AXES = 1e-9
-"""Largest deviation of a camera's axes. Model and ``report.json`` have the same doubles."""
-
-
-class Cameras(Part):
-    """The cameras of the report's spatial picture."""
-
-    cameras: list[CameraInSpace]
-
-
-class ReportOfModel(Part):
-    """The parts of ``report.json`` on the run's final model."""
-
-    camera: ReportCamera
-    residuals_by_image: list[ImageResiduals]
-    scene: Cameras
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """The n points that an image shows."""
-
-    camera_from_target: Rigid
-    labels: Sequence[Label]
-    xyz: np.ndarray  # (n, 3) mm, target frame
-    xy_px: np.ndarray  # (n, 2) their keypoints, OpenCV pixel origin
-
-    def off_px(self, camera: Camera) -> np.ndarray:
-        """Returns the distances (n,) of keypoints from their projected points, px; infinite behind the camera."""
-        xyz_camera = self.camera_from_target @ self.xyz
-        with np.errstate(all="ignore"):
-            distance_px = np.linalg.norm(camera.project(xyz_camera) - self.xy_px, axis=1)
-        return np.where((xyz_camera[:, 2] > 0) & np.isfinite(distance_px), distance_px, np.inf)
-
-
-def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: ReportOfModel) -> None:
-    """Checks residuals of keypoints and poses of cameras against the report, and names the worst point and image."""
-    limits = {row.image: row for row in report.residuals_by_image}
-    worst = (1.0, "")
-    for image, view in views.items():
-        row = limits.get(image)
-        if row is None or row.observations != len(view.labels) or not len(view.labels):
-            expected = 0 if row is None else row.observations
-            raise _not_of_run(path, f"image {image} shows {len(view.labels)} points, {expected} by report.json")
-        limit = (1 + ROUNDING) * max(row.max_px, 0.0) + ROUNDING_PX
-        off_px = view.off_px(camera)
-        farthest = int(np.argmax(off_px))
-        if off_px[farthest] / limit > worst[0]:
-            distance = f"{off_px[farthest]:.3g} px from its keypoint, {row.max_px:.3g} px allowed by report.json"
-            where = distance if np.isfinite(off_px[farthest]) else "behind the camera"
-            worst = off_px[farthest] / limit, f"{view.labels[farthest]} in {image} is {where}"
-    if worst[1]:
-        raise InputError(
-            "E-MODEL-NOT-OF-RUN",
-            f"model {path}: {worst[1]}; is it mirrored, or was a point or a pose moved? Run it again",
-        )
-    _require_places(path, views, report)
-
-
-def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel) -> None:
-    """Checks the poses of the cameras: residuals cannot show that a model was moved, turned or scaled as a whole."""
-    camera_of_image = {camera.image: camera for camera in report.scene.cameras}
-    missing = sorted(camera_of_image.keys() ^ views.keys())
-    if missing:
-        raise _not_of_run(path, f"image {missing[0]} is not in both model and report.json")
-    for image, view in views.items():
-        off = np.linalg.norm(view.camera_from_target.inverse().translation - camera_of_image[image].position_mm)
-        axes_off = np.abs(view.camera_from_target.rotation - camera_of_image[image].axes).max()
-        if not (off <= SAME_PLACE_MM and axes_off <= SAME_AXES):
-            moved = f"its camera is {off:.3g} mm from where report.json has it (axes differ by {axes_off:.2g})"
-            raise _not_of_run(path, f"image {image}: {moved}, {SAME_PLACE_MM:g} mm allowed")
-
-
-def _not_of_run(path: Path, fault: str) -> InputError:
-    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
-
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")
@@ -147,8 +57,7 @@ class _Point:
 def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     """Writes the final model of a run in another program's format: mm, target frame, labels beside it.
 
-    It appears complete or not at all. The model must agree with the report in the residual of every keypoint and the
-    pose of every camera.
+    It appears complete or not at all. The model's files must be as the run wrote them.
 
     NVM and Bundler support one focal length, little distortion and a centred principal point. They get an ideal camera
     without distortion, and the keypoints as this camera sees them. This is exact, but photographs have to be
@@ -180,10 +89,11 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     labels = out / "labels.csv" if kind in FOLDERS else out.with_name(f"{out.name}.labels.csv")
     _require_free(out, labels, kind)
     saved = saved_run(run)
-    report = saved.report_as(ReportOfModel)
-    saved = replace(saved, camera=saved.adjusted_camera(report.camera))
     reconstruction, points = _labelled_points(saved)
-    require_fit(saved.folder / TARGET_MODEL, _views(saved, reconstruction, points), saved.camera, report)
+    (native,) = reconstruction.cameras.values()
+    camera = camera_from_colmap(
+        native.model.name, native.width, native.height, list(native.params), saved.folder
+    ).sized(0, 0)
     spaced = [image.name for image in saved.observations if " " in image.name]
     if spaced and kind in ("colmap-txt", "bundler"):
         raise InputError(
@@ -192,7 +102,6 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
             "or rename the image and run again",
         )
     ideal = kind in ("nvm", "bundler")
-    camera = saved.camera
     focal_px = float(camera.focal.mean())
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -206,9 +115,9 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
                 case "colmap-bin" | "colmap-txt":
                     write_reconstruction(reconstruction, partial, text=kind == "colmap-txt")
                 case "nvm":
-                    partial.write_text(_nvm(reconstruction, points, saved, focal_px), encoding="utf-8")
+                    partial.write_text(_nvm(reconstruction, points, camera, focal_px), encoding="utf-8")
                 case "bundler":
-                    bundle, names = _bundler(reconstruction, points, saved, focal_px)
+                    bundle, names = _bundler(reconstruction, points, camera, focal_px)
                     (partial / "bundle.out").write_text(bundle, encoding="utf-8")
                     (partial / "list.txt").write_text(names, encoding="utf-8")
             if kind not in FOLDERS:
@@ -239,18 +148,16 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     path = run.folder / TARGET_MODEL
     if not path.is_dir():
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
+    for file in path.iterdir():
+        require_unchanged(file)
     reconstruction = open_model(path)
-    native = colmap_camera(run.camera)
-    if [camera.params.tolist() for camera in reconstruction.cameras.values()] != [native.params.tolist()]:
-        raise _not_of_run(path, "its camera is not that of the run's cameras.txt")
-    place = {image.name: i for i, image in enumerate(run.observations)}
+    observations = {image.name: (image, xy) for image, xy in zip(run.observations, run.corrected_px, strict=True)}
     image_of = {}
     for image_id, image in reconstruction.images.items():
-        if image.name not in place or not image.has_pose:
+        if image.name not in observations:
             raise _not_of_run(path, f"image {image.name} is not as in the run's labels.csv")
-        i = place[image.name]
-        image_of[image_id] = run.observations[i]
-        require_keypoints(path, image, run.observations[i].labels, run.corrected_px[i])
+        image_of[image_id], corrected_px = observations[image.name]
+        require_keypoints(path, image, image_of[image_id].labels, corrected_px)
     rgb = colours(run)
     points = []
     for point_id, point in sorted(reconstruction.points3D.items()):
@@ -267,21 +174,8 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     return reconstruction, points
 
 
-def _views(run: SavedRun, reconstruction: pycolmap.Reconstruction, points: Sequence[_Point]) -> dict[str, View]:
-    """Returns the view of each image, by name."""
-    images = _images(reconstruction)
-    points_of_image: dict[int, list[tuple[_Point, int]]] = {image.image_id: [] for image in images}
-    for point in points:
-        for image_id, k in point.views:
-            points_of_image[image_id].append((point, k))
-    view_of_image = {}
-    for image in images:
-        seen_points = points_of_image[image.image_id]
-        xy = np.array([image.points2D[k].xy for _, k in seen_points]).reshape(-1, 2)
-        xyz = np.array([point.xyz for point, _ in seen_points]).reshape(-1, 3)
-        pose = pose_of_image(run.folder / TARGET_MODEL, image)
-        view_of_image[image.name] = View(pose, [point.label for point, _ in seen_points], xyz, from_colmap_px(xy))
-    return view_of_image
+def _not_of_run(path: Path, fault: str) -> InputError:
+    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
 
 
 def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
@@ -297,7 +191,7 @@ def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
     return csv_text(rows)
 
 
-def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float) -> str:
+def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], camera: Camera, focal_px: float) -> str:
     """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, principal point zero.
     MeshLab needs the spaces at the ends of the first lines. A space in a name is written as a quotation mark."""
     images = _images(reconstruction)
@@ -308,13 +202,13 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
         centre = image.projection_center().tolist()
         lines.append(f"{image.name.replace(' ', chr(34))} {_numbers(focal_px, w, x, y, z, *centre, 0, 0)}")
     lines += ["", str(len(points))]
-    for point, views in zip(points, _ideal_views(reconstruction, points, run, focal_px), strict=True):
+    for point, views in zip(points, _ideal_views(reconstruction, points, camera, focal_px), strict=True):
         lines.append(_numbers(*point.xyz, *point.rgb, len(views), *(value for view in views for value in view)))
     return "\n".join([*lines, "", "0", ""])
 
 
 def _bundler(
-    reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
+    reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], camera: Camera, focal_px: float
 ) -> tuple[str, str]:
     """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, view along −z, image centre zero."""
     images = _images(reconstruction)
@@ -324,7 +218,7 @@ def _bundler(
         pose = rigid_from_colmap(image.cam_from_world())
         rows = [*(up_from_down @ pose.rotation), up_from_down @ pose.translation]
         lines += [_numbers(focal_px, 0, 0), *(_numbers(*row.tolist()) for row in rows)]
-    for point, views in zip(points, _ideal_views(reconstruction, points, run, focal_px), strict=True):
+    for point, views in zip(points, _ideal_views(reconstruction, points, camera, focal_px), strict=True):
         lines += [_numbers(*point.xyz), _numbers(*point.rgb)]
         lines.append(_numbers(len(views), *(value for i, k, x, y in views for value in (i, k, x, -y))))
     return "\n".join([*lines, ""]), "".join(f"{image.name}\n" for image in images)
@@ -335,14 +229,14 @@ def _images(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 
 
 def _ideal_views(
-    reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
+    reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], camera: Camera, focal_px: float
 ) -> list[list[tuple[int, int, float, float]]]:
     """Returns the views of every point in the ideal camera: place of the image, keypoint, and x and y, px, relative to
     the principal point, y down."""
     place = {image.image_id: i for i, image in enumerate(_images(reconstruction))}
     xy_px = [[reconstruction.image(i).points2D[k].xy for i, k in point.views] for point in points]
     counts = np.cumsum([len(views) for views in xy_px])
-    ideal = focal_px * run.camera.normalised_from_pixel(from_colmap_px(np.concatenate(xy_px)))
+    ideal = focal_px * camera.normalised_from_pixel(from_colmap_px(np.concatenate(xy_px)))
     return [
         [(place[i], k, x, y) for (i, k), (x, y) in zip(point.views, xy.tolist(), strict=True)]
         for point, xy in zip(points, np.split(ideal, counts[:-1]), strict=True)

@@ -9,37 +9,12 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.io.poses.programs import metres, xyzw
-from stcal.sfm.interop.export_content import BOARD_RGB, Circle, Content, Photograph, ellipsoid, exaggeration
+from stcal.sfm.interop.export_content import BOARD_RGB, Circle, Content
 
 EDGES = 48
 """Number of edges of a disc. Its triangles leave out 0.3 % of its area."""
 CAMERA_SHARE = 0.06
 """Depth of a camera's pyramid as a share of the scene's extent."""
-
-
-def disc(radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points (EDGES + 1, 3), the centre first, and triangles (EDGES, 3), counter-clockwise seen from +Z."""
-    angle = 2 * np.pi * np.arange(EDGES) / EDGES
-    rim = radius_mm * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
-    around = 1 + np.arange(EDGES)
-    return np.vstack([np.zeros(3), rim]), np.column_stack([np.zeros(EDGES, int), around, 1 + around % EDGES])
-
-
-def camera_depth_mm(content: Content) -> float:
-    """Returns the depth of the pyramids that show cameras, mm."""
-    places = [circle.xyz_mm for circle in content.circles]
-    places += [photograph.target_from_camera.translation for photograph in content.photographs]
-    return CAMERA_SHARE * float(np.ptp(np.array(places), axis=0).max())
-
-
-def pyramid(content: Content, photograph: Photograph, depth_mm: float) -> np.ndarray:
-    """Returns the projection centre and the image's corners at that depth, without distortion, (5, 3), target frame."""
-    camera = content.camera
-    corners = [[-0.5, -0.5], [camera.width - 0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]]
-    corners += [[-0.5, camera.height - 0.5]]
-    ideal = (np.array(corners) - camera.centre) / camera.focal
-    rays = np.column_stack([ideal, np.ones(4)]) * depth_mm
-    return photograph.target_from_camera @ np.vstack([np.zeros(3), rays])
 
 
 MM_M = 1e-3
@@ -98,7 +73,7 @@ def glb(content: Content) -> bytes:
 
 def _tree(content: Content) -> tuple[dict, bytes]:
     buffer, meshes, nodes = _Buffer(), [], []
-    factor = exaggeration(content)
+    factor = _exaggeration(content)
     ball, around = _ball()
     sphere = buffer.add(ball, VERTICES), buffer.add(around, INDICES)
 
@@ -116,17 +91,20 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         grey = mesh(f"sigma of face {face}", sphere, len(content.faces))
         circles = []
         for circle in content.of_face(face):
-            points, triangles = disc(circle.radius_mm * MM_M)
+            points, triangles = _disc(circle.radius_mm * MM_M)
             parts = buffer.add(points, VERTICES), buffer.add(triangles.ravel(), INDICES)
             own = mesh(str(circle.label), parts, place)
             balls = [node(**_sigma(circle, pose, factor), mesh=grey)] if circle.covariance_mm2 is not None else []
+            extras = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
+            if circle.covariance_mm2 is not None:
+                extras["covariance_mm2"] = circle.covariance_mm2.tolist()
             circles.append(
                 node(
                     name=content.circle_frame(circle.label),
                     mesh=own,
                     translation=(MM_M * (pose.inverse() @ circle.xyz_mm)).tolist(),
                     children=balls,
-                    extras=_of_circle(circle),
+                    extras=extras,
                 )
             )
         extras = {"face": face, "target_from_face_mm": pose.matrix().tolist()}
@@ -155,8 +133,12 @@ def _tree(content: Content) -> tuple[dict, bytes]:
 
 
 def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
-    camera_from_target = content.photographs[0].target_from_camera.inverse()
-    shape = camera_from_target @ pyramid(content, content.photographs[0], camera_depth_mm(content))
+    camera, places = content.camera, [circle.xyz_mm for circle in content.circles]
+    places += [photograph.target_from_camera.translation for photograph in content.photographs]
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+    rays = np.column_stack([(corners - camera.centre) / camera.focal, np.ones(4)])  # without distortion
+    shape = np.vstack([np.zeros(3), CAMERA_SHARE * np.ptp(np.array(places), axis=0).max() * rays])
     lines = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1])
     parts = buffer.add(MM_M * shape @ GL_FROM_CV, VERTICES), buffer.add(lines, INDICES)
     frustum = mesh("image at depth", parts, len(content.faces) + 1, LINES)
@@ -192,15 +174,28 @@ def _lens(content: Content) -> dict:
 
 def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
     """Returns the node that turns the unit ball into the ellipsoid of σ in the face's axes, times ``factor``."""
-    sigma, axes = ellipsoid(circle, pose)
-    turned = xyzw(Rigid(axes, np.zeros(3)))
-    size = (factor * MM_M * sigma).tolist()
+    turn = np.array(pose.rotation)
+    values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
+    turned = xyzw(Rigid(axes * [np.sign(np.linalg.det(axes)), 1, 1], np.zeros(3)))
+    size = (factor * MM_M * np.sqrt(np.maximum(values, 0))).tolist()
     return {"name": f"sigma of {circle.label}, times {factor:g}", "rotation": turned, "scale": size}
 
 
-def _of_circle(circle: Circle) -> dict:
-    extras = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
-    return extras if circle.covariance_mm2 is None else extras | {"covariance_mm2": circle.covariance_mm2.tolist()}
+def _disc(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points (EDGES + 1, 3), the centre first, and triangles (EDGES, 3), counter-clockwise seen from +Z."""
+    angle = 2 * np.pi * np.arange(EDGES) / EDGES
+    rim = radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
+    around = 1 + np.arange(EDGES)
+    return np.vstack([np.zeros(3), rim]), np.column_stack([np.zeros(EDGES, int), around, 1 + around % EDGES])
+
+
+def _exaggeration(content: Content) -> float:
+    """Returns the factor with which σ is drawn, a power of ten. The median ball is no larger than the median circle."""
+    known = [(float(np.linalg.norm(c.sigma_mm)), c.radius_mm) for c in content.circles if c.sigma_mm is not None]
+    if not any(sigma for sigma, _ in known):
+        return 1.0
+    sigma, radius = np.median(known, axis=0)
+    return 10.0 ** np.floor(np.log10(radius / sigma))
 
 
 def _placed(pose: Rigid) -> dict:

@@ -3,21 +3,19 @@
 import contextlib
 import os
 import re
-import selectors
 import shutil
 import signal
 import subprocess
-import time
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Literal
+from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
 from stcal.io.files import json_text, save
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
@@ -33,8 +31,6 @@ ASK_SECONDS = 60.0
 LAST_WORDS = 200
 MAX_OUTPUT = 1 << 20
 """Number of bytes kept of a program's output. The last ones are kept, as a program may print without end."""
-LOOK_SECONDS = 0.1
-"""Interval at which a silent program is checked for its end, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,36 +131,26 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
         raise InputError(
             "E-COLMAP-PROGRAM", f"native COLMAP: {command[0]} cannot be started ({error.strerror}); {INSTALL}"
         ) from error
-    pipe = process.stdout
-    assert pipe is not None  # as stdout=PIPE
-    try:
-        output = _listen(process, pipe, time.monotonic() + timeout_s)
-        code = process.poll()
-    finally:
-        with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS: not permitted for an ended process
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        pipe.close()
+    output = bytearray()
+
+    def listen() -> None:
+        while chunk := os.read(pipe.fileno(), 1 << 16):
+            output.extend(chunk)
+            del output[:-MAX_OUTPUT]
+
+    with process.stdout as pipe:  # type: ignore[union-attr]  # as stdout=PIPE
+        listener = threading.Thread(target=listen, daemon=True)
+        listener.start()
+        try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout_s)
+            code = process.returncode
+        finally:
+            with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS: not permitted for an ended process
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            listener.join()
     return code, output.decode(errors="replace")
-
-
-def _listen(process: subprocess.Popen, pipe: IO[bytes], until: float) -> bytes:
-    """Returns the last output of a process until it ends, which is watched as a child may keep the pipe open."""
-    output = b""
-    with selectors.DefaultSelector() as selector:
-        selector.register(pipe, selectors.EVENT_READ)
-        while (remaining_s := until - time.monotonic()) > 0:
-            ended = process.poll() is not None
-            if selector.select(0 if ended else min(remaining_s, LOOK_SECONDS)):
-                chunk = os.read(pipe.fileno(), 1 << 16)
-                if not chunk:
-                    with contextlib.suppress(subprocess.TimeoutExpired):
-                        process.wait(remaining_s)
-                    break
-                output = (output + chunk)[-MAX_OUTPUT:]
-            elif ended:
-                break
-    return output
 
 
 Chained = Literal["chain", "paper"]
@@ -189,9 +175,11 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
                 "or give one model at a time",
             )
         if not source.camera.same_as(run.camera):
+            ideal = np.concatenate([image.centre for image in run.observations])
+            off_px = np.abs(source.camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max()
             notes.append(
-                f"model {source.path}: its camera is up to {_camera_change_px(source.camera, run):.2g} px off the "
-                "run's at the keypoints; the model's is used"
+                f"model {source.path}: its camera is up to {off_px:.2g} px off the run's at the keypoints; the model's "
+                "is used"
             )
         counts = {
             "points left out, since their keypoints name no one circle": source.unlabelled,
@@ -251,19 +239,8 @@ def calibrate_models(
     read = [read_model(path, run.observations, ids, run.corrected_px) for path in find_models(model)]
     calibration = faces_from_models(read, run, solve)
     if out is not None:
-        write_faces(Path(out), calibration, run, solve)
+        factor = calibration.sigma_factors.of_target
+        faces = FacesFile.of(calibration.target, run.target_design, _options(run, solve), factor)
+        save(Path(out), json_text(faces.content()))
+        require_faces_written(out, calibration.target)
     return calibration
-
-
-def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:
-    """Writes ``faces.json`` of chained models."""
-    options = _options(run, solve)
-    faces = FacesFile.of(calibration.target, run.target_design, options, calibration.sigma_factors.of_target)
-    save(path, json_text(faces.content()))
-    require_faces_written(path, calibration.target)
-
-
-def _camera_change_px(camera: Camera, run: SavedRun) -> float:
-    """Returns the largest change of the run's keypoints, per coordinate, by projection with another camera, px."""
-    ideal = np.concatenate([image.centre for image in run.observations])
-    return float(np.abs(camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max())

@@ -12,10 +12,10 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
-from stcal.sfm.data.model import MIN_POINTS, ImageObservations, M, Outlier, WorldModel
+from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, unwritable
-from stcal.sfm.mapping.models import rigid_from_colmap
+from stcal.sfm.mapping.models import assemble, points_by_votes, rigid_from_colmap
 from stcal.sfm.mapping.pairs import PairScore, share_board_alone
 
 MIN_SHARE = 0.25
@@ -37,32 +37,6 @@ def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, 
     placed = [image for image in group if image.name in poses]
     xyz |= _triangulated(placed, poses, xyz.keys())
     return assemble(WorldModel, model.group, placed, [poses[image.name] for image in placed], xyz)
-
-
-def assemble(
-    kind: type[M], group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
-) -> M:
-    """Returns the model of placed images and labelled points, with all observations of these points in these images."""
-    labels = sorted(xyz)
-    index = {label: i for i, label in enumerate(labels)}
-    rows = [
-        (i, index[label], k) for i, image in enumerate(images) for k, label in enumerate(image.labels) if label in index
-    ]
-    image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
-    row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
-    return kind(
-        group=group,
-        images=tuple(image.name for image in images),
-        camera_from_model=tuple(poses),
-        labels=tuple(labels),
-        xyz_model=np.array([xyz[label] for label in labels]).reshape(-1, 3),
-        image_index=image_index,
-        point_index=point_index,
-        keypoint=keypoint,
-        measured_px=np.concatenate([image.centre_px for image in images])[row],
-        shift_px=np.zeros((len(rows), 2)),
-        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[row],
-    )
 
 
 def _resect(
@@ -292,15 +266,10 @@ def labelled_model(
     registered = [
         image for image in group if ids[image.name] in colmap_images and colmap_images[ids[image.name]].has_pose
     ]
-    poses = [rigid_from_colmap(colmap_images[ids[image.name]].cam_from_world()) for image in registered]
-    votes_of_label: dict[Label, Counter[int]] = {}
-    for image in registered:
-        for k, point in enumerate(colmap_images[ids[image.name]].points2D):
-            if point.has_point3D():
-                votes_of_label.setdefault(image.labels[k], Counter())[point.point3D_id] += 1
-    xyz = {
-        label: reconstruction.point3D(max(votes, key=votes.__getitem__)).xyz for label, votes in votes_of_label.items()
-    }
+    native = [colmap_images[ids[image.name]] for image in registered]
+    poses = [rigid_from_colmap(image.cam_from_world()) for image in native]
+    chosen, _ = points_by_votes(registered, native)
+    xyz = {label: reconstruction.point3D(point).xyz for label, point in chosen.items()}
     model = assemble(WorldModel, group[0].group, registered, poses, xyz)
     if len(registered) < len(group):
         model = complete(model, group, camera, MAX_REPROJECTION_PX)

@@ -5,8 +5,8 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from stcal.io.cameras.model import camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.io.poses.programs import image_lines
 from stcal.labels import DotLabel, Label
-from stcal.sfm.data.model import GroupModel, ImageObservations, MetricModel, WorldModel
+from stcal.sfm.data.model import GroupModel, ImageObservations, M, MetricModel, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
@@ -41,24 +41,23 @@ def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
     return Rigid(pose.rotation.matrix(), pose.translation)
 
 
-def to_reconstruction(
+def write_model(
+    folder: Path,
     models: Sequence[GroupModel],
     observations: Sequence[ImageObservations],
     ids: dict[str, int],
     camera: Camera,
-) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
-    """Returns models that share one world in COLMAP's form, and (group, label) by point id; all keypoints, in the
-    database's order. A circle at the same place in two groups is one point with an empty group."""
+) -> None:
+    """Writes models that share one world as COLMAP's binary files, and reads them back; all keypoints, in the
+    database's order. A circle at the same place in two groups is one point."""
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(colmap_camera(camera))
     by_name = {image.name: image for image in observations}
-    tracks: dict[tuple[str, tuple[float, ...]], pycolmap.Track] = {}
-    groups: dict[tuple[str, tuple[float, ...]], set[str]] = {}
+    tracks: dict[tuple[Label, tuple[float, ...]], pycolmap.Track] = {}
     for model in models:
         places = [(label, tuple(xyz)) for label, xyz in zip(model.labels, model.xyz_model.tolist(), strict=True)]
         for place in places:
             tracks.setdefault(place, pycolmap.Track())
-            groups.setdefault(place, set()).add(model.group)
         for name, pose, rows in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
             keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
@@ -68,27 +67,11 @@ def to_reconstruction(
             )
             for row in rows:
                 tracks[places[model.point_index[row]]].add_element(ids[name], int(model.keypoint[row]))
-    names = {}
-    for (label, xyz), track in tracks.items():
-        groups_of_point = groups[label, xyz]
-        names[reconstruction.add_point3D(np.array(xyz), track)] = (
-            groups_of_point.pop() if len(groups_of_point) == 1 else "",
-            label,
-        )
+    for (_, xyz), track in tracks.items():
+        reconstruction.add_point3D(np.array(xyz), track)
     reconstruction.update_point_3d_errors()
-    return reconstruction, names
-
-
-def write_model(
-    folder: Path,
-    models: Sequence[GroupModel],
-    observations: Sequence[ImageObservations],
-    ids: dict[str, int],
-    camera: Camera,
-) -> None:
-    """Writes models that share one world as COLMAP's binary files, and reads them back."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_reconstruction(to_reconstruction(models, observations, ids, camera)[0], folder)
+    write_reconstruction(reconstruction, folder)
 
 
 def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, text: bool = False) -> None:
@@ -191,11 +174,11 @@ def read_model(
         xy = require_keypoints(path, image, observations[i].labels, corrected_px[i], tolerance_px)
         corrected = xy if corrected_again else corrected_px[i]
         members.setdefault(observations[i].group, []).append((observations[i], corrected, image))
-    point_label, unlabelled = _labels_of_points(reconstruction, index_of_name, observations)
+    labelled = _labelled_points(reconstruction, {image.name: image for image in observations})
     groups, split = [], 0
     for name, images in sorted(members.items()):
         images.sort(key=lambda entry: ids[entry[0].name])
-        model, split_of_group = _group_model(path, name, images, reconstruction, point_label)
+        model, split_of_group = _group_model(path, name, images, reconstruction, labelled)
         split += split_of_group
         if model is not None:
             _require_fit(path, model, camera.sized(0, 0))
@@ -204,6 +187,7 @@ def read_model(
         raise InputError("E-MODEL-EMPTY", f"model {path}: no image with a pose and labelled points; map again")
     named_points = {p.point3D_id for image in reconstruction.images.values() for p in image.points2D if p.has_point3D()}
     absent = len(named_points - set(reconstruction.points3D))
+    unlabelled = len(reconstruction.points3D) - len(labelled)
     return ReadModel(path, camera.sized(0, 0), tuple(groups), unlabelled, split, absent)
 
 
@@ -211,10 +195,10 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
     """Opens a model's files; InputError if one is damaged or missing."""
     pycolmap.logging.minloglevel = LOG_NOTHING
     try:
-        for name, skip in _RECORDS.items():
+        for name in ("cameras", "rigs", "frames", "images", "points3D"):
             file = Path(path) / f"{name}.bin"
             if file.exists():
-                _require_whole(file, skip)
+                _require_whole(file)
         for file in Path(path).glob("*.txt"):
             require_size(file, TABLE_BYTES)
         _require_second_lines(Path(path) / "images.txt")
@@ -243,85 +227,47 @@ def _require_second_lines(file: Path) -> None:
             )
 
 
-class _Walk:
-    """A position in a binary file that only moves forward."""
-
-    def __init__(self, data: bytes):
-        self.data, self.at = data, 0
-
-    def skip(self, size: int) -> None:
-        """Skips bytes; raises ValueError at the end of the file."""
-        self.at += size
-        if self.at > len(self.data):
-            raise ValueError("ends too soon")
-
-    def number(self, kind: str) -> int:
-        """Reads the next number, in a format of :mod:`struct`."""
-        start = self.at
-        self.skip(struct.calcsize(f"<{kind}"))
-        return struct.unpack_from(f"<{kind}", self.data, start)[0]
-
-    def skip_text(self) -> None:
-        """Skips a text and its terminating zero."""
-        end = self.data.find(b"\0", self.at)
-        self.skip(end + 1 - self.at if end >= 0 else len(self.data) + 1)
-
-
 def parameter_count(model: int) -> int:
     """Returns the number of parameters of the camera model with COLMAP's id; raises ValueError for an unknown id."""
     return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
 
 
-def _skip_camera(walk: _Walk) -> None:
-    walk.skip(4)
-    walk.skip(16 + 8 * parameter_count(walk.number("i")))
+def _end_of(kind: str, data: bytes, at: int) -> int:
+    """Returns where the record at ``at`` of a binary file ends; struct.error if a number of it is missing."""
 
+    def number(form: str, place: int) -> int:
+        return struct.unpack_from(f"<{form}", data, place)[0]
 
-def _skip_rig(walk: _Walk) -> None:
-    walk.skip(4)
-    sensors = walk.number("I")
-    walk.skip(8 if sensors else 0)
+    match kind:
+        case "cameras":
+            return at + 24 + 8 * parameter_count(number("i", at + 4))
+        case "frames":
+            return at + 68 + 16 * number("I", at + 64)
+        case "images":
+            text = data.find(b"\0", at + 64) + 1 or len(data)
+            return text + 8 + 24 * number("Q", text)
+        case "points3D":
+            return at + 51 + 8 * number("Q", at + 43)
+    sensors = number("I", at + 4)  # of a rig
+    at += 16 if sensors else 8
     for _ in range(sensors - 1):
-        walk.skip(8)
-        walk.skip(56 if walk.number("B") else 0)
+        at += 65 if number("B", at + 8) else 9
+    return at
 
 
-def _skip_frame(walk: _Walk) -> None:
-    walk.skip(64)
-    walk.skip(16 * walk.number("I"))
-
-
-def _skip_image(walk: _Walk) -> None:
-    walk.skip(64)
-    walk.skip_text()
-    walk.skip(24 * walk.number("Q"))
-
-
-def _skip_point(walk: _Walk) -> None:
-    walk.skip(43)
-    walk.skip(8 * walk.number("Q"))
-
-
-_RECORDS: dict[str, Callable[[_Walk], None]] = {
-    "cameras": _skip_camera,
-    "rigs": _skip_rig,
-    "frames": _skip_frame,
-    "images": _skip_image,
-    "points3D": _skip_point,
-}
-"""Functions that skip one record of each binary file. A file is a count followed by that many records."""
-
-
-def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
+def _require_whole(file: Path) -> None:
     """Checks the counts in a file: pycolmap reads past its end, for hours and until memory is full."""
-    walk = _Walk(read_bytes(file, MODEL_BYTES))
+    data, at = read_bytes(file, MODEL_BYTES), 8
     try:
-        for _ in range(walk.number("Q")):
-            skip(walk)
-    except ValueError as error:
-        raise ValueError(f"{file.name}, {len(walk.data)} bytes: {error}") from error
-    if walk.at != len(walk.data):
-        raise ValueError(f"{file.name}: {len(walk.data)} bytes, {walk.at} by its own counts")
+        for _ in range(struct.unpack_from("<Q", data)[0]):
+            at = _end_of(file.stem, data, at)
+            if at > len(data):
+                raise ValueError("ends too soon")
+    except (ValueError, struct.error) as error:
+        reason = "ends too soon" if isinstance(error, struct.error) else error
+        raise ValueError(f"{file.name}, {len(data)} bytes: {reason}") from error
+    if at != len(data):
+        raise ValueError(f"{file.name}: {len(data)} bytes, {at} by its own counts")
 
 
 def require_keypoints(
@@ -379,58 +325,76 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
     return rigid_from_colmap(pose)
 
 
-def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tuple[str, str]], int]:
-    """Returns (group, label) by point id, an empty group for the target's circles, and the number of others."""
-    label_of_point, unlabelled = {}, 0
+def _labelled_points(reconstruction: pycolmap.Reconstruction, observations: dict[str, ImageObservations]) -> set[int]:
+    """Returns the ids of the points all of whose keypoints have one label; dots of two groups are different ones."""
+    labelled = set()
     for point_id, point in reconstruction.points3D.items():
         names = set()
         for element in point.track.elements:
-            image = observations[place[reconstruction.image(element.image_id).name]]
+            image = observations[reconstruction.image(element.image_id).name]
             label = image.labels[element.point2D_idx]
             names.add((image.group if isinstance(label, DotLabel) else "", label))
         if len(names) == 1:
-            label_of_point[point_id] = names.pop()
-        else:
-            unlabelled += 1
-    return label_of_point, unlabelled
+            labelled.add(point_id)
+    return labelled
 
 
-def _group_model(path: Path, group: str, images, reconstruction, point_label) -> tuple[WorldModel | None, int]:
-    """Returns the model of one group (None without labelled points) and the number of labels with several points."""
-    rows = []  # image, keypoint, point id
-    for i, (_, _, image) in enumerate(images):
-        for k, point in enumerate(image.points2D):
-            if point.has_point3D() and point.point3D_id in point_label:
-                rows.append((i, k, point.point3D_id))
-    if not rows:
-        return None, 0
+def points_by_votes(
+    observations: Sequence[ImageObservations], images: Sequence[pycolmap.Image], known: Collection[int] | None = None
+) -> tuple[dict[Label, int], int]:
+    """Returns by label the point, of the ``known`` ones, that most keypoints of it name, and the number of labels with
+    several."""
     votes_of_label: dict[Label, Counter[int]] = {}
-    for _, _, point_id in rows:
-        votes_of_label.setdefault(point_label[point_id][1], Counter())[point_id] += 1
+    for observed, image in zip(observations, images, strict=True):
+        for label, point in zip(observed.labels, image.points2D, strict=True):
+            if point.has_point3D() and (known is None or point.point3D_id in known):
+                votes_of_label.setdefault(label, Counter())[point.point3D_id] += 1
     chosen = {label: max(sorted(votes), key=votes.__getitem__) for label, votes in votes_of_label.items()}
-    labels = sorted(chosen)
-    index = {chosen[label]: i for i, label in enumerate(labels)}
-    image_index, keypoint, point_id = np.array([row for row in rows if row[2] in index]).T
-    observed = [images[i][0] for i in image_index]
-    measured = np.array([o.centre_px[k] for o, k in zip(observed, keypoint, strict=True)])
-    corrected = np.array([images[i][1][k] for i, k in zip(image_index, keypoint, strict=True)])
-    xyz = np.array([reconstruction.point3D(chosen[label]).xyz for label in labels])
-    if not np.isfinite(xyz).all():
-        lost = labels[int(np.argmin(np.isfinite(xyz).all(axis=1)))]
-        raise InputError(
-            "E-MODEL-POSE", f"model {path}: point {chosen[lost]} ({lost}) is not finite; write or copy it again"
-        )
-    model = WorldModel(
+    return chosen, sum(len(votes) > 1 for votes in votes_of_label.values())
+
+
+def assemble(
+    kind: type[M], group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
+) -> M:
+    """Returns the model of placed images and labelled points, with all observations of these points in these images."""
+    labels = sorted(xyz)
+    index = {label: i for i, label in enumerate(labels)}
+    rows = [
+        (i, index[label], k) for i, image in enumerate(images) for k, label in enumerate(image.labels) if label in index
+    ]
+    image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
+    row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
+    return kind(
         group=group,
-        images=tuple(o.name for o, _, _ in images),
-        camera_from_model=tuple(pose_of_image(path, image) for _, _, image in images),
+        images=tuple(image.name for image in images),
+        camera_from_model=tuple(poses),
         labels=tuple(labels),
-        xyz_model=xyz,
+        xyz_model=np.array([xyz[label] for label in labels]).reshape(-1, 3),
         image_index=image_index,
-        point_index=np.array([index[p] for p in point_id.tolist()]),
+        point_index=point_index,
         keypoint=keypoint,
-        measured_px=measured,
-        shift_px=measured - corrected,
-        covariance_px2=np.array([o.covariance_px2[k] for o, k in zip(observed, keypoint, strict=True)]),
+        measured_px=np.concatenate([image.centre_px for image in images])[row],
+        shift_px=np.zeros((len(rows), 2)),
+        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[row],
     )
-    return model, sum(len(votes) > 1 for votes in votes_of_label.values())
+
+
+def _group_model(path: Path, group: str, images, reconstruction, labelled) -> tuple[WorldModel | None, int]:
+    """Returns the model of one group (None without labelled points) and the number of labels with several points."""
+    observations, native = [observed for observed, _, _ in images], [image for _, _, image in images]
+    chosen, split = points_by_votes(observations, native, labelled)
+    if not chosen:
+        return None, 0
+    xyz = {label: reconstruction.point3D(point).xyz for label, point in chosen.items()}
+    lost = [label for label in sorted(xyz) if not np.isfinite(xyz[label]).all()]
+    if lost:
+        raise InputError(
+            "E-MODEL-POSE",
+            f"model {path}: point {chosen[lost[0]]} ({lost[0]}) is not finite; write or copy it again",
+        )
+    model = assemble(WorldModel, group, observations, [pose_of_image(path, image) for image in native], xyz)
+    names = [[point.point3D_id for point in image.points2D] for image in native]
+    at = zip(model.image_index.tolist(), model.point_index.tolist(), model.keypoint.tolist(), strict=True)
+    model = model.observed(np.array([names[i][k] == chosen[model.labels[p]] for i, p, k in at]))
+    corrected = [images[i][1][k] for i, k in zip(model.image_index, model.keypoint, strict=True)]
+    return replace(model, shift_px=model.measured_px - np.array(corrected)), split

@@ -26,11 +26,11 @@ from stcal.sfm.mapping.body import (
 from stcal.sfm.mapping.incremental import (
     MAX_REPROJECTION_PX,
     MIN_RAY_ANGLE_RAD,
-    assemble,
     complete,
     rays_of,
     widest_angle_rad,
 )
+from stcal.sfm.mapping.models import assemble
 from stcal.sfm.mapping.pairs import PairScore
 
 BY_FACES = "faces of known shape, placed together"

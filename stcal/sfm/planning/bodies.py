@@ -26,7 +26,7 @@ from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel
-from stcal.sfm.mapping.incremental import assemble
+from stcal.sfm.mapping.models import assemble
 from stcal.sfm.mapping.placed import unknown_lens
 from stcal.sfm.planning.forecast import CentreNoise, Forecast, Setup, forecast, nominal_poses
 from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_as_asked, plan_with_board, remedy

@@ -25,7 +25,7 @@ from stcal.sfm.adjust.joint import Extensible, covariance_of, extensible
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
-from stcal.sfm.mapping.incremental import assemble
+from stcal.sfm.mapping.models import assemble
 from stcal.synthetic.scene import Scene, image_circles
 
 

@@ -14,7 +14,7 @@ import pycolmap
 import pytest
 
 from stcal.errors import InputError
-from stcal.sfm.interop.export_database import copy_database
+from stcal.sfm.interop.export_database import export_database
 from stcal.sfm.interop.native import calibrate_models, faces_from_models
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import seeded_mapping
@@ -82,7 +82,7 @@ NOT_THERE = "group 14: in none of the models"
 def mapped(saved, tmp_path_factory):
     """Group 12 of a copy of the run's database, mapped by pycolmap as the run does; its folder."""
     folder = tmp_path_factory.mktemp("mapped")
-    copy_database(saved.database, folder / "copy.db", "4.2")
+    export_database(saved, folder / "copy.db", "4.2")
     ids = image_ids(saved.observations)
     pair = saved.report["groups"][0]["pairs"][0]
     names = [image.name for image in saved.groups()["12"]]
