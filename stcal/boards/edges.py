@@ -69,8 +69,8 @@ the border's band that is used, px."""
 CLEAR_BLURS = 1.5
 """Distance from the pattern next to a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what
 the blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
-SHADED_HALF_PX, LEAST_REDUNDANCY = 4, 5
-"""Half the side of a window from which on grey values may change along it; the fewest pixels beyond the unknowns."""
+SHADED_HALF_PX = 4
+"""Half the side of a window from which on grey values may change along it."""
 CROSSING_STEPS = 4
 """Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
 MOST_LEFT = 0.15
