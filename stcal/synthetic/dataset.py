@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -87,7 +87,7 @@ class TruthFile(ResultFile):
         """Returns the truth of a scene, with images named by :func:`image_name`."""
         options = options or RenderOptions()
         lens = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
-        optics = lens | ({"rim_mm": options.rim_mm} if options.rim_mm else {})
+        optics: dict[str, Any] = lens | ({"rim_mm": options.rim_mm} if options.rim_mm else {})
         truth = cls(
             unit="mm",
             reference_face=scene.reference_face,
