@@ -442,7 +442,7 @@ CIRCLES = {
     "hexagonal-circles": (HexagonalCirclesDesign, "what neighbours are apart"),
 }
 """Grids of circles with shifted rows, and what their spacing is."""
-READERS: dict[str, tuple[type[Sized], Callable[..., BoardDesign | FlatBoard]]] = {
+READERS: dict[str, tuple[type[Strict], Callable[..., BoardDesign | FlatBoard]]] = {
     "circles": (BoardEntry, board_design),
     "chessboard": (_Chessboard, _grid),
     "charuco": (_Charuco, _grid),
