@@ -1,7 +1,7 @@
 """Lines between the cells of tags, by the areas in each pixel: their scatter shows how far sampling displaces edges."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -25,15 +25,11 @@ BY_CHANCE = 3.0
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the share of the bright side of an edge in pixels, and derivatives of this share.
+    """Return the share of the bright side of m edges in pixels, and its derivatives by distance and by variance.
 
-    The square pixel as the edge's normal sees it is a trapezoid, the convolution of two boxes. The wider one, and with
-    it an edge along the rows, is integrated exactly; the narrower one, like the blur, as a Gaussian of its variance.
-
-    ``distance`` : (m, ...) distances of the pixels' centres from the edges, positive on the bright side, px;
-    ``normal`` : (m, 2) normals of the edges; ``variance`` : (m,) variances of the blur, px².
-
-    Returns the share; its derivatives by distance and by variance.
+    The square pixel as the edge's normal (m, 2) sees it is a trapezoid, the convolution of two boxes. The wider one,
+    and with it an edge along the rows, is integrated exactly; the narrower one, like the blur of ``variance`` (m,) px²,
+    as a Gaussian. ``distance`` : (m, ...) of the pixels' centres, positive on the bright side, px.
     """
     narrow, wide = (side.reshape(-1, *(1,) * (distance.ndim - 1)) for side in np.sort(np.abs(normal), axis=1).T)
     sigma = np.sqrt(variance.reshape(narrow.shape) + narrow**2 / 12)
@@ -46,12 +42,25 @@ def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarr
 
 
 def reach_of(reach: np.ndarray, rise: np.ndarray) -> int:
-    """Return how many pixels to either side of the middle one lie within ``reach`` (m,) of any of m edges, px.
-
-    ``rise`` : (m,) change of the distance from one pixel to the next; the middle pixel is half a pixel off the edge.
-    """
+    """Return how many pixels to either side of the middle one, half a pixel off the edge, lie within ``reach`` (m,)."""
     across = reach.ravel() / np.abs(rise)
     return int(np.ceil(np.max(across, initial=1.0, where=np.isfinite(across)) + 0.5))
+
+
+def across_edges(
+    grey: np.ndarray, major: np.ndarray, column: np.ndarray, middle: np.ndarray, half: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return levels (m, p, s), places (m, p, s, 2) and whether they are in the image, of pixels across m edges.
+
+    ``major`` : (m,) 0 for an edge along the rows, whose pixels are taken by columns; ``column``, ``middle`` : (m, p).
+    """
+    across = middle[..., None] + np.arange(-half, half + 1)
+    along = np.broadcast_to(column[..., None], across.shape)
+    by_column = (major == 0)[:, None, None]
+    x, y = np.where(by_column, along, across), np.where(by_column, across, along)
+    height, width = grey.shape
+    level = grey[y.clip(0, height - 1).astype(int), x.clip(0, width - 1).astype(int)].astype(float)
+    return level, np.stack([x, y], axis=-1), (x >= 0) & (y >= 0) & (x < width) & (y < height)
 
 
 def products(left: np.ndarray, weight: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -76,11 +85,9 @@ def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[n
 def passed_by_blur(rise: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Return the displacements (m,) of edges by sampling, relative to that of an edge along the rows.
 
-    They come from what the image contains at the frequency of the pixels across the edge: 1/px along the rows, √2/px
-    along the diagonals, where all profiles of an edge have one phase too. A Gaussian blur of variance σ² passes
-    exp(−2π²σ²f²) of a frequency f.
-
-    ``rise`` : (m,) change of the distance from the edge from one pixel to the next; ``variance`` : (m,) of the blur.
+    They come from what the image contains at the frequency f of the pixels across the edge: 1/px along the rows, √2/px
+    along the diagonals. A Gaussian blur of ``variance`` σ² passes exp(−2π²σ²f²) of it. ``rise`` : (m,) change of the
+    distance from the edge from one pixel to the next.
     """
     return np.exp(-2 * np.pi**2 * variance * (rise**-2 - 1))
 
@@ -88,12 +95,8 @@ def passed_by_blur(rise: np.ndarray, variance: np.ndarray) -> np.ndarray:
 def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     """Return the gradients (m, p, s, 2) by a displacement of 1 px that follows the cosine, or the sine, of the phase.
 
-    Sampling displaces an edge by an amount that depends on its place between two pixels and comes again from pixel to
-    pixel: in an edge along the rows it is one for all profiles, in a turned one it averages out. Its first harmonic is
-    what is modelled.
-
-    ``distance`` : (m, p, s) distances of the pixels from the edges; ``rise`` : (m,) change of the distance from one
-    pixel to the next; ``gradient`` : (m, p, s) derivative of the grey values by the place of the edge.
+    Sampling displaces an edge by its place between two pixels: all profiles of an edge along the rows alike. The first
+    harmonic is modelled. ``gradient`` : (m, p, s) derivative of the grey values by the place of the edge.
     """
     angle = -2 * np.pi * distance / rise[:, None, None]
     return gradient[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -101,28 +104,20 @@ def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Displacement:
-    """What lines say about the variance of the displacement of edges by sampling, px².
+    """What lines say about the variance of the displacement of edges by sampling, px²; k estimates."""
 
-    ``square`` : (k,) estimates of the variance, which may be negative; ``noise`` : (k,) the mean of their part by other
-    errors; ``lines`` : (k,) the equivalent number of lines of each; ``passed`` : (k,) as of :func:`passed_by_blur`.
-    """
-
-    square: np.ndarray
-    noise: np.ndarray
-    lines: np.ndarray
-    passed: np.ndarray
+    square: np.ndarray  # the variance, which may be negative
+    noise: np.ndarray  # mean of its part by other errors
+    lines: np.ndarray  # equivalent number of lines
+    passed: np.ndarray  # as of :func:`passed_by_blur`
 
 
 @dataclass(frozen=True, slots=True)
 class SamplingVariance:
-    """Variances of the displacement of edges by sampling, px².
+    """Variances of the displacement of edges by sampling, px²."""
 
-    ``of_area`` : that of an edge along the rows, of which the blur passes less in turned ones; ``of_points`` : that of
-    all edges in images that were resampled in points before they were blurred, as by a warp that takes no means.
-    """
-
-    of_area: float
-    of_points: float
+    of_area: float  # of an edge along the rows; the blur passes less of it in turned ones
+    of_points: float  # of all edges in images that were resampled in points before they were blurred
 
     def of(self, passed: np.ndarray) -> np.ndarray:
         """Return the variances of edges of which the blur passes ``passed`` (m,)."""
@@ -152,12 +147,10 @@ def displacement_variance(by_phase: Sequence[Displacement], otherwise: Sequence[
 
 def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
     """Return square, noise, lines and passed of the estimates that are known."""
-    names = ("square", "noise", "lines", "passed")
-    square, noise, lines, passed = (
-        np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0)]) for name in names
-    )
-    known = np.isfinite(square) & (lines > 0)
-    return [values[known] for values in (square, noise, lines, passed)]
+    names = [part.name for part in fields(Displacement)]
+    every = [np.concatenate([getattr(part, name) for part in parts] or [np.zeros(0)]) for name in names]
+    known = np.isfinite(every[0]) & (every[2] > 0)
+    return [values[known] for values in every]
 
 
 CLEAR_BLURS = 2.5
@@ -172,27 +165,20 @@ FARTHEST_PX = 0.1
 size; their lines are farther away."""
 MOST_PX = 0.04
 """Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
-SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-"""Corners of the unit square in cyclic order."""
 STEPS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OuterLines:
-    """What was measured of the outer edges of n tags, from each corner to the next.
+    """What was measured of the outer edges of n tags, from each corner to the next."""
 
-    ``corners_px`` : (n, 4, 2); ``blur`` : (n,) variance, px²; ``dark``, ``rise`` : (n,) grey values; ``noise`` : (n,)
-    variance of pixels; ``variance`` : (n, 4) of the edges' offsets; ``by_sampling`` : (n, 4, 2) their derivatives by
-    the harmonics of sampling.
-    """
-
-    corners_px: np.ndarray
-    blur: np.ndarray
-    dark: np.ndarray
+    corners_px: np.ndarray  # (n, 4, 2)
+    blur: np.ndarray  # (n,) variance, px²
+    dark: np.ndarray  # (n,) grey values, as ``rise``
     rise: np.ndarray
-    noise: np.ndarray
-    variance: np.ndarray
-    by_sampling: np.ndarray
+    noise: np.ndarray  # (n,) variance of pixels
+    variance: np.ndarray  # (n, 4) of the edges' offsets
+    by_sampling: np.ndarray  # (n, 4, 2) their derivatives by the harmonics of sampling
 
 
 def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
@@ -201,15 +187,13 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Disp
     Apart from perspective and lens, the lines of a tag are evenly spaced. What is left of them follows the phase of the
     pixels if sampling displaces them; the rest of their scatter, beyond noise, has other reasons, such as the print.
     """
-    square = np.broadcast_to(cells * SQUARE, outer.corners_px.shape)
+    square = np.broadcast_to(cells * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
     middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
     xy = apply_homography(image_from_grid, middle).astype(np.float32)
     level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
     bright = (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
-    pieces = _pieces(image_from_grid, bright, cells)
-    lines = _offsets(grey, pieces, outer, cells)
-    return _scatter(lines, outer, cells)
+    return _scatter(_offsets(grey, _pieces(image_from_grid, bright, cells), outer, cells), cells)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,7 +221,7 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
         tag, line, along = np.nonzero(change)
         line = line + 1
         corner = np.stack([line, along] if axis == 0 else [along, line], axis=-1).astype(float)
-        step, across = (np.eye(2)[1], np.eye(2)[0]) if axis == 0 else (np.eye(2)[0], np.eye(2)[1])
+        step, across = np.eye(2)[[1 - axis, axis]]
         start, end, before, after = (
             apply_homography(image_from_grid[tag], (corner + move)[:, None])[:, 0]
             for move in (0 * step, step, -across, across)
@@ -247,8 +231,7 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
         normal *= np.sign(((after - before) * normal).sum(1))[:, None]
         widths = [np.abs(((there - start) * normal).sum(1)) for there in (before, after)]
         lean = ((after - before) * direction).sum(1) / ((after - before) * normal).sum(1)
-        sign = change[change != 0].astype(float)
-        place = (2 * along + 1) / cells - 1
+        sign, place = change[change != 0].astype(float), (2 * along + 1) / cells - 1
         found.append((tag, np.full(len(tag), axis), line, sign, place, start, end, normal, lean, np.minimum(*widths)))
     return _Pieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
@@ -318,23 +301,19 @@ def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.nd
     column = first[:, None] + np.arange(most)
     slope = along[each, 1 - major] / along[each, major]
     middle = np.rint(pieces.start[each, 1 - major, None] + slope[:, None] * (column - pieces.start[each, major, None]))
-    across = middle[..., None] + np.arange(-half, half + 1)
-    by_column = (major == 0)[:, None, None]
-    x, y = np.where(by_column, column[..., None], across), np.where(by_column, across, column[..., None])
-    height, width = grey.shape
-    level = grey[y.clip(0, height - 1).astype(int), x.clip(0, width - 1).astype(int)].astype(float)
-    off = np.stack([x, y], axis=-1) - pieces.start[:, None, None]
+    level, xy, inside = across_edges(grey, major, column, middle, half)
+    off = xy - pieces.start[:, None, None]
     place, distance = (np.einsum("spai,si->spa", off, axis) for axis in (direction, pieces.normal))
     place = place - pieces.lean[:, None, None] * distance
     used = (np.abs(distance) <= reach[:, None, None]) & (column <= last[:, None])[..., None]
     used &= np.abs(place - length[:, None, None] / 2) <= (length / 2 - END_BLURS * sigma)[:, None, None]
-    used &= (reach > LEAST_BLURS * sigma)[:, None, None] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    used &= (reach > LEAST_BLURS * sigma)[:, None, None] & inside
     return level, distance, used.astype(float), pieces.normal[each, 1 - major]
 
 
-def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
+def _scatter(lines: _Offsets, cells: int) -> tuple[Displacement, Displacement]:
     """Return what evenly spaced lines say by tag and direction: how they move with the phase, and scatter otherwise."""
-    n = len(outer.blur)
+    n = len(lines.offset)
     place = 2 * np.arange(cells + 1) / cells - 1
     sign, place = np.tile([-1.0, 1.0], cells + 1), np.repeat(place, 2)
     k = len(place)

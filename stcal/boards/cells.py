@@ -3,6 +3,8 @@
 Cells are merged into areas, because viewers draw hairlines between squares that touch.
 """
 
+from itertools import product
+
 import cv2
 import numpy as np
 
@@ -10,6 +12,7 @@ from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.boards.dictionaries import dictionary_of
 
 SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign
+SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 UNKNOWN_BITS = 2
 """Border of an AprilGrid, in cells, if its file does not state it: Kalibr's."""
 
@@ -19,9 +22,11 @@ def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:
     if isinstance(board, ChessboardDesign):
         return _squares(board.rows + 1, board.columns + 1, board.square_mm, 0, -board.square_mm)
     if isinstance(board, CharucoDesign):
-        first = int(board.legacy and board.rows % 2 == 0)
-        squares = _squares(board.rows, board.columns, board.square_mm, first, 0.0)
-        return squares + [_tag(board.dictionary, *tag, 1) for tag in zip(board.tag_ids(), _charuco(board), strict=True)]
+        first, size = int(board.legacy and board.rows % 2 == 0), (board.rows, board.columns, board.square_mm)
+        white = _squares(*size, 1 - first, (board.square_mm - board.marker_mm) / 2)
+        places = (at[0] + board.marker_mm * SQUARE for (at,) in white)  # the last square may be white without a tag
+        tags = [_tag(board.dictionary, tag, at, 1) for tag, at in zip(board.tag_ids(), places, strict=False)]
+        return _squares(*size, first, 0.0) + tags
     if isinstance(board, AprilGridDesign):
         bits = board.border_bits or UNKNOWN_BITS
         layout = board.layout()
@@ -49,7 +54,7 @@ def outlines(black: np.ndarray) -> list[np.ndarray]:
     padded = np.pad(black, 1)
     after: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for row, column in np.argwhere(black).tolist():
-        corners = [(column, row), (column + 1, row), (column + 1, row + 1), (column, row + 1)]
+        corners = [(column + x, row + y) for x, y in SQUARE.tolist()]
         beside = [padded[row, column + 1], padded[row + 1, column + 2], padded[row + 2, column + 1]]
         beside.append(padded[row + 1, column])
         for k in range(4):
@@ -82,18 +87,7 @@ def _squares(rows: int, columns: int, side: float, first: int, origin: float) ->
     """Return the black squares one by one; square (0, 0) begins at ``origin``, and is black if ``first`` is 0."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     black = (row + column) % 2 == first
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    return [[side * (at + corners) + origin] for at in np.column_stack([column, row])[black]]
-
-
-def _charuco(board: CharucoDesign) -> np.ndarray:
-    """Return the corners of the board's tags, (n, 4, 2), mm; they are centred in the white squares."""
-    first = int(board.legacy and board.rows % 2 == 0)
-    row, column = np.divmod(np.arange(board.rows * board.columns), board.columns)
-    white = (row + column) % 2 != first
-    at = board.square_mm * np.column_stack([column, row])[white] + (board.square_mm - board.marker_mm) / 2
-    count = len(board.tag_ids())  # the last of an odd number of squares may be white without a tag
-    return at[:count, None] + board.marker_mm * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    return [[side * (at + SQUARE) + origin] for at in np.column_stack([column, row])[black]]
 
 
 def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.ndarray]:
@@ -112,8 +106,5 @@ def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.
 def _between(board: AprilGridDesign) -> list[list[np.ndarray]]:
     """Return the small squares at the tags' corners."""
     gap = board.spacing * board.tag_mm
-    step = board.tag_mm + gap
-    places = [
-        (column * step - gap, -row * step) for row in range(board.rows + 1) for column in range(board.columns + 1)
-    ]
-    return [[np.array(at) + gap * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])] for at in places]
+    step, cells = board.tag_mm + gap, product(range(board.rows + 1), range(board.columns + 1))
+    return [[np.array([column * step - gap, -row * step]) + gap * SQUARE] for row, column in cells]

@@ -2,11 +2,8 @@
 
 Corners of a chessboard are found by both detectors of OpenCV. ``cv2.findChessboardCornersSB`` (after Duda & Frese 2018)
 tolerates noise, shade and small squares; the older detector, which joins dark squares, tolerates steep views and blur.
-Images are searched at the smallest size that shows the squares, which is fastest, and then at others: a board that
-neither detector finds in one size may be found in another. Corners are measured in the original image.
-
-A ChArUco board is read by its tags (through ``cv2.aruco``); its corners are measured where edges meet. No camera is
-needed. OpenCV would place corners by the camera that it is given, and several px off if that is a guess.
+Images are searched at the smallest size that shows the squares, which is fastest, and then at others. Corners are
+measured in the original image. A ChArUco board is read by its tags (through ``cv2.aruco``), without a camera.
 """
 
 from collections.abc import Callable, Iterator
@@ -53,8 +50,7 @@ def find_chessboard(
 ) -> BoardView | None:
     """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black.
 
-    A board that looks the same after half a turn may be returned rotated: :meth:`ChessboardDesign.symmetries`.
-    ``with_sigma`` : whether the view states the covariances of its corners.
+    A board that looks the same after half a turn may be returned rotated. ``with_sigma`` : whether covariances are.
     """
     grey = grey_8bit(image)
     for detected in _read_corners(grey, board):
@@ -89,10 +85,9 @@ def _read_corners(grey: np.ndarray, board: ChessboardDesign) -> Iterator[np.ndar
 
 def _is_a_grid(found: np.ndarray, refined: np.ndarray) -> bool:
     """Return True if the refinement moved no corner to another one, and no square is folded."""
-    steps = [np.linalg.norm(np.diff(refined, axis=axis), axis=2).min() for axis in (0, 1)]
     across, down = refined[:-1, 1:] - refined[:-1, :-1], refined[1:, :-1] - refined[:-1, :-1]
     turn = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
-    stayed = np.linalg.norm(refined - found, axis=2).max() < min(steps) / 2
+    stayed = np.linalg.norm(refined - found, axis=2).max() < _least_step(refined) / 2
     return bool(stayed and (np.sign(turn) == np.sign(turn[0, 0])).all())
 
 
@@ -136,10 +131,13 @@ def _by_area(grey: np.ndarray, grid: np.ndarray) -> Crossings:
     return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half), clear)
 
 
+def _least_step(grid: np.ndarray) -> float:
+    return min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
+
+
 def _window(grid: np.ndarray) -> float:
     """Return half the side of a window that holds no neighbour of a corner, px."""
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    return max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
+    return max(WINDOW_SHARE * _least_step(grid), LEAST_WINDOW)
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:
@@ -161,16 +159,14 @@ def why_no_chessboard(image: np.ndarray, board: ChessboardDesign) -> str:
     scale = min(FIRST_SIDE / max(grey.shape), 1.0)
     small = grey if scale == 1 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     found, _, meta = cv2.findChessboardCornersSBWithMeta(small, PART, PART_FLAGS)
-    inner = f"not all {board.rows}×{board.columns} inner corners of the chessboard"
+    inner, correct = f"not all {board.rows}×{board.columns} inner corners of the chessboard", "correct rows and columns"
     if not found:
         return f"{inner}, which rows and columns of its file count"
     rows, columns = sorted(meta.shape[:2])
     if rows > min(board.rows, board.columns) or columns > max(board.rows, board.columns):
-        return f"{inner}, but {rows}×{columns}; correct rows and columns in its file, which count inner corners"
-    return (
-        f"{inner}, but {rows}×{columns}: a part of a plain chessboard has no numbers; show all of it, or correct rows "
-        "and columns in its file"
-    )
+        return f"{inner}, but {rows}×{columns}; {correct} in its file, which count inner corners"
+    part = "a part of a plain chessboard has no numbers; show all of it"
+    return f"{inner}, but {rows}×{columns}: {part}, or {correct} in its file"
 
 
 LEAST_CORNERS = 4
@@ -208,15 +204,10 @@ LEAST_SIGMA_PX = 0.02
 def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardView | None:
     """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen.
 
-    One visible neighbour tag is enough for a corner, and tags that the first pass missed are searched at their expected
-    places: OpenCV's default settings lose a quarter of the corners of real image sets. Corners from a single blurred
-    tag may be several px off. Each measurement therefore starts at the place that the surrounding corners predict, and
-    the corner is left out if the measurement ends far from there.
-
-    A corner is measured in one of three ways. The first is the crossing of the edges by the areas that they cover in
-    the pixels of a window clear of the tags. If the pixels do not fit such a crossing, it is the point where the
-    gradients of the edges meet. If the edges are too blurred for that, it is the saddle of the grey values, in a window
-    in which the board is symmetric about the corner.
+    One visible neighbour tag is enough for a corner; of a blurred tag alone it may be several px off. Each measurement
+    therefore starts at the place that the surrounding corners predict, and must end near there. A corner is the
+    crossing of the edges by the areas that they cover in the pixels of a window clear of the tags; else the point where
+    the gradients of the edges meet; else, of blurred edges, the saddle of the grey values.
     """
     grey = grey_8bit(image)
     ids, corners = _read(grey, board)
@@ -248,13 +239,9 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
 
 def _read(grey: np.ndarray, board: CharucoDesign) -> tuple[np.ndarray, np.ndarray]:
     """Return the ids (n,) of the inner corners beside tags, and their approximate places (n, 2), px."""
-    plain = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows),
-        board.square_mm,
-        board.marker_mm,
-        dictionary_of(board.dictionary),
-        np.array(board.tag_ids(), np.int32),
-    )
+    size, dictionary = (board.columns, board.rows), dictionary_of(board.dictionary)
+    ids_of_board = np.array(board.tag_ids(), np.int32)
+    plain = cv2.aruco.CharucoBoard(size, board.square_mm, board.marker_mm, dictionary, ids_of_board)
     plain.setLegacyPattern(board.legacy)
     settings = cv2.aruco.CharucoParameters()
     settings.minMarkers, settings.tryRefineMarkers = 1, True
@@ -267,12 +254,11 @@ def _read(grey: np.ndarray, board: CharucoDesign) -> tuple[np.ndarray, np.ndarra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Foretold:
-    """Corners as predicted by the corners around each of them: ``xy_px`` (n, 2); ``scatter_px`` : (n,) median deviation
-    of those corners from their own smooth field; ``step_px`` : (n,) shorter side of a square there."""
+    """Corners as predicted by the corners around each of them."""
 
-    xy_px: np.ndarray
-    scatter_px: np.ndarray
-    step_px: np.ndarray
+    xy_px: np.ndarray  # (n, 2)
+    scatter_px: np.ndarray  # (n,) median deviation of those corners from their own smooth field
+    step_px: np.ndarray  # (n,) shorter side of a square there
 
     def agrees(self, xy_px: np.ndarray) -> np.ndarray:
         """Return a mask (n,) of the corners that are at their predicted places."""

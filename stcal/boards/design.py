@@ -240,13 +240,10 @@ class AprilGridDesign(Distinct):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticePart(BoardDesign):
-    """A grid of dots in which only some places have a dot.
+    """A grid of dots in which only some places have a dot."""
 
-    ``taken`` : (n, 2) rows and columns of these places; ``circles`` : the asymmetric circles that these are, if any.
-    """
-
-    taken: np.ndarray | None = None
-    circles: "AsymmetricCirclesDesign | None" = None
+    taken: np.ndarray | None = None  # (n, 2) rows and columns of these places
+    circles: "AsymmetricCirclesDesign | None" = None  # that these are, if any
 
     def cells(self) -> np.ndarray:
         """Return row and column of every dot, (n, 2)."""
@@ -368,15 +365,11 @@ PLACE_DIGITS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CornerBoard(LatticePart):
-    """The points of a board of any kind as a board of dots without extent.
+    """The points of a board of any kind as a board of dots without extent: of one Y a row, of one X a column."""
 
-    Points of one Y are a row, points of one X a column; these need not be equally spaced, and not every place of the
-    grid has a point. ``y_mm``, ``x_mm`` : places of the rows and of the columns; ``printed`` : the board itself.
-    """
-
-    y_mm: tuple[float, ...] = ()
-    x_mm: tuple[float, ...] = ()
-    printed: FlatBoard | None = None
+    y_mm: tuple[float, ...] = ()  # of the rows, which need not be equally spaced
+    x_mm: tuple[float, ...] = ()  # of the columns
+    printed: FlatBoard | None = None  # the board itself
 
     def scaled(self, factor: float) -> "CornerBoard":
         """Return the board printed larger by a factor."""
@@ -386,19 +379,17 @@ class CornerBoard(LatticePart):
     @classmethod
     def of(cls, board: FlatBoard) -> "CornerBoard":
         """Return the points of a board; ``cells()`` are in the order of its ``xy_mm``."""
-        xy = board.xy_mm()
-        (x, column), (y, row) = (_ranked(values) for values in xy.T)
+        xy, places, ranks = board.xy_mm(), [], []  # places of columns and of rows in ascending order
+        for values in xy.T:
+            _, first, rank = np.unique(np.round(values, PLACE_DIGITS), return_index=True, return_inverse=True)
+            places.append(tuple(values[first].tolist()))
+            ranks.append(rank)
         apart = np.linalg.norm(xy[:, None] - xy, axis=2)
         np.fill_diagonal(apart, np.inf)
-        step = float(np.median(apart.min(1)))
-        common = {
-            "sigma_mm": board.sigma_mm or TAG_SIGMA_MM,
-            "unusual_size": True,
-            "printed": board,
-            "y_mm": y,
-            "x_mm": x,
-        }
-        return cls(len(y), len(x), step, POINT_RADIUS_MM, "dark", taken=np.column_stack([row, column]), **common)
+        sizes = len(places[1]), len(places[0]), float(np.median(apart.min(1))), POINT_RADIUS_MM, "dark"
+        common = {"sigma_mm": board.sigma_mm or TAG_SIGMA_MM, "unusual_size": True, "printed": board}
+        taken = np.column_stack(ranks[::-1])
+        return cls(*sizes, taken=taken, y_mm=places[1], x_mm=places[0], **common)
 
     def xy_mm(self) -> np.ndarray:
         """Return the positions of the points, (n, 2), mm."""
@@ -419,23 +410,13 @@ class CornerBoard(LatticePart):
         return self.cells()[np.array(nearest)]
 
 
-def _ranked(values: np.ndarray) -> tuple[tuple[float, ...], np.ndarray]:
-    """Return the different values in ascending order, and the rank of each value."""
-    _, first, rank = np.unique(np.round(values, PLACE_DIGITS), return_index=True, return_inverse=True)
-    return tuple(values[first].tolist()), rank
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSet(Distinct):
-    """A set of several boards that are fixed relative to one another.
+    """A set of several boards that are fixed relative to one another."""
 
-    ``names`` : name of each board in messages; ``boards`` : flat boards that look different in images, each without
-    rotational symmetry; ``common_from_board`` : their poses in the frame of the set, which acts as the board frame.
-    """
-
-    names: tuple[str, ...]
-    boards: tuple[BoardDesign | FlatBoard, ...]
-    common_from_board: tuple[Rigid, ...]
+    names: tuple[str, ...]  # of the boards in messages
+    boards: tuple[BoardDesign | FlatBoard, ...]  # that look different in images, each without rotational symmetry
+    common_from_board: tuple[Rigid, ...]  # in the frame of the set, which acts as the board frame
 
     def first_ids(self) -> list[int]:
         """Return the index of the first point of each board in :meth:`xyz_mm`."""
@@ -450,41 +431,29 @@ class BoardSet(Distinct):
 def turns(xy_mm: np.ndarray, quarters: list[int]) -> list[Rigid]:
     """Return the rotations by these numbers of quarter turns about the middle of points (n, 2), as board_from_board."""
     middle = np.append((xy_mm.min(0) + xy_mm.max(0)) / 2, 0.0)
-    rotations = []
-    for quarter in quarters:
-        cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter % 4]
-        rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
-        rotations.append(Rigid(rotation, middle - rotation @ middle))
-    return rotations
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    rotations = [np.linalg.matrix_power(quarter, count) for count in quarters]
+    return [Rigid(rotation, middle - rotation @ middle) for rotation in rotations]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
-    """The points of a board in one image.
+    """The k points of a board in one image."""
 
-    ``image`` : name of the image; ``ids`` : (k,) rows of the design's ``xy_mm`` (of a set's ``xyz_mm``); ``xyz_board``
-    : (k, 3) mm; ``xy_px`` : (k, 2); ``covariance_px2`` : (k, 2, 2), or None if the detector does not estimate it;
-    ``normal`` : (k, 3) unit normals of the planes of the points, None if all normals are Z; ``unused`` : parts of the
-    board that were seen but not used, each with its reason.
-    """
-
-    image: str
-    ids: np.ndarray
-    xyz_board: np.ndarray
-    xy_px: np.ndarray
-    covariance_px2: np.ndarray | None = None
-    normal: np.ndarray | None = None
-    unused: tuple[str, ...] = ()
+    image: str  # its name
+    ids: np.ndarray  # (k,) rows of the design's ``xy_mm`` (of a set's ``xyz_mm``)
+    xyz_board: np.ndarray  # (k, 3) mm
+    xy_px: np.ndarray  # (k, 2)
+    covariance_px2: np.ndarray | None = None  # (k, 2, 2), None if the detector does not estimate it
+    normal: np.ndarray | None = None  # (k, 3) unit normals of the planes of the points, None if all are Z
+    unused: tuple[str, ...] = ()  # parts of the board that were seen but not used, each with its reason
 
     def __post_init__(self):
-        k = len(self.ids)
-        freeze(self, "ids", (k,), "ids", int)
-        freeze(self, "xyz_board", (k, 3), "board points")
-        freeze(self, "xy_px", (k, 2), "image points")
-        if self.covariance_px2 is not None:
-            freeze(self, "covariance_px2", (k, 2, 2), "covariances")
-        if self.normal is not None:
-            freeze(self, "normal", (k, 3), "normals")
+        freeze(self, "ids", (len(self.ids),), "ids", int)
+        shapes = {"xyz_board": (3,), "xy_px": (2,), "covariance_px2": (2, 2), "normal": (3,)}
+        for name, shape in shapes.items():
+            if getattr(self, name) is not None:
+                freeze(self, name, (len(self.ids), *shape), name)
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -12,6 +12,7 @@ from stcal.boards.area import (
     Displacement,
     OuterLines,
     SamplingVariance,
+    across_edges,
     displacement_variance,
     integrated_step,
     of_sampling,
@@ -68,8 +69,8 @@ the border's band that is used, px."""
 CLEAR_BLURS = 1.5
 """Distance from the pattern next to a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what
 the blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
-SHADED_HALF_PX, LEAST_REDUNDANCY = 4, 5
-"""Half the side of a window from which on grey values may change along it; the fewest pixels beyond the unknowns."""
+SHADED_HALF_PX = 4
+"""Half the side of a window from which on grey values may change along it."""
 CROSSING_STEPS = 4
 """Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
 MOST_LEFT = 0.15
@@ -80,19 +81,12 @@ WIDEST_BLUR = 0.4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeCorners:
-    """The refined corners ``corners_px`` (n, 4, 2), with ``covariance_px2`` (n, 8, 8) of the four corners together.
+    """The refined corners of n tags. Two corners share the errors of the edge between them."""
 
-    Two corners share the errors of the edge between them: they move together with its offset, against each other with
-    its slope.
-
-    ``seen`` : (n,) True if all four edges of a tag are visible; otherwise its values are meaningless; ``smear_px`` :
-    way by which motion during the exposure blurs the edges; 0 where it is short beside a cell.
-    """
-
-    corners_px: np.ndarray
-    covariance_px2: np.ndarray
-    seen: np.ndarray
-    smear_px: float = 0.0
+    corners_px: np.ndarray  # (n, 4, 2)
+    covariance_px2: np.ndarray  # (n, 8, 8) of the four corners together
+    seen: np.ndarray  # (n,) True if all four edges of a tag are visible; otherwise its values are meaningless
+    smear_px: float = 0.0  # way by which motion during the exposure blurs the edges; 0 where it is short beside a cell
 
 
 def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
@@ -136,10 +130,7 @@ def _told_by_lines(
 
 
 def corners_by_edges(corners: np.ndarray) -> np.ndarray:
-    """Return the shifts of the corners (..., 4, 2) of tags, in cyclic order, if all four edges move outwards by one.
-
-    Over-exposure, spread ink and a nonlinear response of the camera move all edges alike.
-    """
+    """Return the shifts of the corners (..., 4, 2) of tags, in cyclic order, if all four edges move outwards by one."""
     along = np.roll(corners, -1, axis=-2) - corners
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
@@ -196,9 +187,8 @@ def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
     base = frame.middle[:, :, None] + frame.place[..., None] * frame.along[:, :, None]
     xy = base[:, :, :, None] + (across[..., None] * frame.normal[:, :, None])[:, :, None]
     flat = xy.reshape(4 * n, POINTS * SAMPLES, 2).astype(np.float32)
-    level = (
-        cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(np.float32)
-    )
+    level = cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).astype(np.float32)
+    level = level.reshape(n, 4, POINTS, SAMPLES)
     inside = np.all((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1]), axis=(2, 3, 4))
     rise = np.diff(level, axis=3).clip(0)
     rise[rise < MIN_RISE * rise.max(3, keepdims=True)] = 0
@@ -250,22 +240,17 @@ def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
     offset, slope = (np.nan_to_num(value).reshape(m, 1) for value in (rough.offset, rough.slope))
     place = frame.place.reshape(m, -1)
     point = middle[:, None] + place[..., None] * along[:, None] + (offset + slope * place)[..., None] * normal[:, None]
-    major = np.abs(along).argmax(1)  # 0 : an edge along the rows, whose pixels are taken by columns
+    major = np.abs(along).argmax(1)
     # Each profile moves to the nearest column; of those in one column, one is used.
     column = np.rint(point[each, :, major])
     keep = rough.keep.reshape(m, -1).copy()
     keep[:, 1:] &= np.diff(column, axis=1) != 0
     rise = (along[each, 1 - major] / along[each, major])[:, None]
     start = np.rint(point[each, :, 1 - major] + rise * (column - point[each, :, major]))
-    half = reach_of(reach, normal[each, 1 - major])
-    across = start[..., None] + np.arange(-half, half + 1)
-    by_column = (major == 0)[:, None, None]
-    x, y = np.where(by_column, column[..., None], across), np.where(by_column, across, column[..., None])
-    height, width = grey.shape
-    level = grey[y.clip(0, height - 1).astype(int), x.clip(0, width - 1).astype(int)].astype(float)
-    off = np.stack([x, y], axis=-1) - middle[:, None, None]
+    level, xy, inside = across_edges(grey, major, column, start, reach_of(reach, normal[each, 1 - major]))
+    off = xy - middle[:, None, None]
     t, d = np.einsum("mpsi,mi->mps", off, along), np.einsum("mpsi,mi->mps", off, normal)
-    used = keep[..., None] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    used = keep[..., None] & inside
     used &= np.abs(d - offset[..., None] - slope[..., None] * t) <= reach
     used &= np.abs(t) <= np.minimum((0.5 - ALONG[0]) * length, length / 2 - END_PX)
     return _Pixels(level, t, d, used, normal[each, 1 - major])
@@ -329,7 +314,8 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
             value = np.where(np.isfinite(value), value, 0.0)
     shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
     sampling = of_sampling(distance, pixels.rise, design[..., 0])
-    harmonic = _free_of(design, weight, sampling)
+    explained = [solved(design, weight, column)[0] for column in np.moveaxis(sampling, -1, 0)]
+    harmonic = sampling - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
     scatter = residual - (harmonic @ solved(harmonic, weight, residual)[0][:, None, :, None])[..., 0]
     noise = _noise_of(scatter, distance, weight)
     factor = noise * _growth_of_tags(scatter, design[..., 0], weight, noise, good, shape)
@@ -373,25 +359,14 @@ def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) 
     inner = weight * brought * ((number >= 1) & (number <= cells[:, None, None] - 2))
     most = int(cells.max(initial=1))
     row = (number.clip(0, most - 1) + most * np.arange(m)[:, None, None]).ravel()
-    pull = np.stack(
-        [
-            np.bincount(row, (inner * design[..., i]).ravel(), m * most).reshape(m, most)
-            for i in range(design.shape[-1])
-        ],
-        axis=-1,
-    )
+    by_parameter = np.moveaxis(inner[..., None] * design, -1, 0)
+    pull = np.stack([np.bincount(row, part.ravel(), m * most).reshape(m, most) for part in by_parameter], axis=-1)
     moved = (pull @ inverse)[..., :2]
     return moved.sum(1) / 2, np.swapaxes(moved, 1, 2) @ moved / 4
 
 
 BIN_PX = 0.25
 """Width of a class of distances from an edge of a crossing: pixels in one class see the same part of its profile."""
-
-
-def _free_of(design: np.ndarray, weight: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the columns (m, p, s, k) without what the design (m, p, s, q) explains of them."""
-    explained = [solved(design, weight, column)[0] for column in np.moveaxis(columns, -1, 0)]
-    return columns - np.stack([(design @ part[:, None, :, None])[..., 0] for part in explained], axis=-1)
 
 
 def _told_along(residual, harmonic, passed, weight, noise, good) -> Displacement:
@@ -482,8 +457,7 @@ def crossings(
     """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
 
     ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest pattern
-    other than the two edges. Pixels into which blur carries light from there are not used, except in windows with half
-    sides below :data:`SHADED_HALF_PX`, which need all of their pixels.
+    other than the two edges, from where blur carries light into pixels, which are not used then.
     """
     n = len(start)
     xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
@@ -555,12 +529,8 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
     for e, displaced in enumerate((first, second)):
         passed = passed_by_blur(np.abs(normal[:, e]).max(1), value[:, 4])
         covariance += (PRIOR_PX * passed[:, None, None]) ** 2 * _common(pull * displaced[..., None], distance[e], half)
-    seen = (
-        inside
-        & (redundancy > q)
-        & np.isfinite(covariance).all((1, 2))
-        & (np.linalg.norm(value[:, :2], axis=1) <= MOST_MOVED_PX)
-    )
+    seen = inside & (redundancy > q) & np.isfinite(covariance).all((1, 2))
+    seen &= np.linalg.norm(value[:, :2], axis=1) <= MOST_MOVED_PX
     seen &= (np.sqrt(noise) <= MOST_LEFT * np.abs(value[:, 8])) & (np.sqrt(value[:, 4]) <= WIDEST_BLUR * half)
     return start + value[:, :2], covariance, seen
 
@@ -576,25 +546,18 @@ def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
 
 
 def _growth(
-    pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np.ndarray, profiles: int, blur: float
+    pull: np.ndarray,  # (n, k, 2) derivatives of a crossing by the pixels of its window
+    residual: np.ndarray,  # (n, k) grey values
+    place: np.ndarray,  # (n, k) profiles of the pixels, px along the edges; different numbers on both
+    noise: np.ndarray,  # (n,) variances of the pixels
+    profiles: int,  # number on each edge
+    blur: float,  # variance, px²
 ) -> float:
-    """Return the factor of the variances that is due to edges that are not straight, as by print, for all windows.
+    """Return the factor, 1 or more, of all variances that is due to edges that are not straight, as by print.
 
     All pixels of a profile share the displacement of the edge there. The squares of their common pulls are compared
-    with what the noise of single pixels makes of them. The blur smooths displacements along the edge, by which they
-    seem smaller from profile to profile, but not in their sum: neighbours at a distance k then correlate by
-    exp(−k²/4σ²), and the variance of the sum is 2σ√π times what the single ones add up to.
-
-    Parameters
-    ----------
-    pull : (n, k, 2) derivatives of a crossing by the pixels of its window
-    residual : (n, k) grey values
-    place : (n, k) profiles that the pixels belong to, px along the edges; those of both edges have different numbers
-    noise : (n,) variances of the pixels
-    profiles : number of profiles on each edge
-    blur : variance of the blur, px²
-
-    Returns at least 1; the median over the windows, as a single one tells little.
+    with what the noise of single pixels makes of them. The blur smooths displacements along the edge: neighbours at a
+    distance k correlate by exp(−k²/4σ²), and the variance of the sum is 2σ√π times what the single ones add up to.
     """
     n = len(pull)
     number = np.rint(place).astype(int)

@@ -32,12 +32,11 @@ def find_on_faces(
 ) -> tuple[dict[str, BoardView], list[str]]:
     """Return the views of the boards and tags in a grey image by face, and notes on what was left out.
 
-    Each dictionary is searched once for all faces: a face of which no tag is read is not searched for corners. The
-    board beside the body has the name ``board``; why it is not found is always noted.
+    Each dictionary is searched once for all faces: a face of which no tag is read is not searched for corners.
     """
     of_layouts = [d for board in boards.values() if isinstance(board, TagLayout) for d, _ in board.tags]
     of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
-    tags = find_tags(image, tuple(dict.fromkeys([*of_layouts, *of_charuco])), windows_px=APART_PX)
+    tags = find_tags(image, (*of_layouts, *of_charuco), windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
     views: dict[str, BoardView] = {}
     notes: list[str] = []
@@ -56,8 +55,8 @@ def find_on_faces(
                 view = find_chessboard(image, name, board, with_sigma=True)
                 why = "" if view else why_no_chessboard(image, board)
             elif isinstance(board, AprilGridDesign):
-                view, why = find_aprilgrid(image, name, board, camera)
-                view, oblique = _not_oblique(view)
+                found, why = find_aprilgrid(image, name, board, camera)
+                view, oblique = _not_oblique(found)
                 view = straightened(view, camera)
         except StcalError as error:  # corners on a line, say
             why = f"left out, {error}"
@@ -86,9 +85,7 @@ def _not_oblique(view: BoardView | None) -> tuple[BoardView | None, str]:
     count, tilt_deg = int((~keep).sum()) // 4, float(np.degrees(np.arccos(cosine.min())))
     tags = "a tag is" if count == 1 else f"{count} tags are"
     why = f"{tags} tilted by {tilt_deg:.0f}°, up to {MOST_TILT_DEG:g}° is measured; turn the face towards the camera"
-    if not keep.any():
-        return None, why
-    return view.rows(keep), why
+    return view.rows(keep) if keep.any() else None, why
 
 
 def straightened(view: BoardView | None, camera: Camera) -> BoardView | None:
@@ -99,8 +96,7 @@ def straightened(view: BoardView | None, camera: Camera) -> BoardView | None:
 
 
 def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
-    """Returns how far the lens moves the measured corners (n, 4, 2) of tags: it curves edges, and straight lines are
-    laid along them.
+    """Returns how far the lens moves the measured corners (n, 4, 2) of tags: straight lines are laid along its curves.
 
     A line along an edge of 100 px near the border of an image is off its ends by 0.1 px with usual lenses.
     """
@@ -115,11 +111,7 @@ def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def tags_of_no_face(files: Sequence[ImageFile], faces: Sequence[FaceDesign], unseen: Sequence[FaceDesign]) -> list[str]:
-    """Return notes on tags that images show and no face has, where tags of faces are in none of the images.
-
-    ``files`` : images, of which :data:`MOST_READ` at most are read; ``faces`` : all faces; ``unseen`` : those
-    in no image.
-    """
+    """Return notes on tags that images show and no face has, where tags of ``unseen`` faces are in none of them."""
     missing = sorted({tag for face in unseen for tag in tags_on(face.printed)})
     own = {tag for face in faces for tag in tags_on(face.printed)}
     known = sorted({dictionary for dictionary, _ in own})
@@ -138,10 +130,7 @@ def tags_of_no_face(files: Sequence[ImageFile], faces: Sequence[FaceDesign], uns
 
 
 def why_unseen(files: Sequence[ImageFile], faces: Sequence[FaceDesign]) -> str:
-    """Return why none of the images shows one of the printed faces.
-
-    Tags of other ids and of other dictionaries are looked for in the first images.
-    """
+    """Return why none of the images shows one of the printed faces, by the tags in the first images."""
     own = {tag for face in faces for tag in tags_on(face.printed)}
     known = sorted({dictionary for dictionary, _ in own})
     reason = f"no printed face of the target is seen in {len(files)} images"

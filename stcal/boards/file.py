@@ -1,5 +1,6 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -16,7 +17,6 @@ from stcal.boards.design import (
     CornerBoard,
     FlatBoard,
     HexagonalCirclesDesign,
-    LatticePart,
     TagLayout,
     require_tags,
     sides_mm,
@@ -34,8 +34,6 @@ from stcal.io.json import mistake
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_of, toml_string, validated
 from stcal.lengths import Length, radius, require_millimetres, side, stated_unusual
 
-KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles", "hexagonal-circles")
-"""Types of flat boards."""
 SET = "boards"
 REMEDY = (
     'a file with type = "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles" or "hexagonal-circles" '
@@ -100,11 +98,7 @@ class _AsymmetricCircles(Sized):
 
 
 class TagEntry(Strict):
-    """One tag of a layout.
-
-    Its place is given by ``x_mm``, ``y_mm`` of its middle and the rotation ``angle_deg``, or by its four measured
-    corners; both are absent if the place is to be determined.
-    """
+    """One tag of a layout, by its middle and angle, or by its corners; both are absent if it is to be determined."""
 
     dictionary: Dictionary
     id: TagId
@@ -123,11 +117,10 @@ class TagEntry(Strict):
         if self.x_mm is None and self.y_mm is None:
             return None
         if self.x_mm is None or self.y_mm is None or self.size_mm is None:
-            raise InputError(
-                "E-TAG-PLACE", f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
-            )
-        square = self.size_mm * UNIT_SQUARE
-        cosine, sine = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
+            needed = f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
+            raise InputError("E-TAG-PLACE", needed)
+        square, angle = self.size_mm * UNIT_SQUARE, np.radians(self.angle_deg)
+        cosine, sine = np.cos(angle), np.sin(angle)
         return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
 
 
@@ -204,11 +197,8 @@ def load_run_board(path: str | Path) -> BoardDesign:
     if not isinstance(board, AsymmetricCirclesDesign):
         return CornerBoard.of(board)
     if board.radius_mm is None:
-        raise InputError(
-            "E-BOARD-RADIUS",
-            f"board file {path}: circles without a radius, which their eccentricity needs here; write a file with "
-            'type = "asymmetric-circles" and radius_mm',
-        )
+        without = f"board file {path}: circles without a radius, which their eccentricity needs here"
+        raise InputError("E-BOARD-RADIUS", f'{without}; write a file with type = "asymmetric-circles" and radius_mm')
     return board.lattice()
 
 
@@ -230,9 +220,7 @@ TYPES = {
 
 def run_board_toml(board: BoardDesign) -> str:
     """Return the text of a board file that :func:`load_run_board` reads."""
-    printed = (
-        board.printed if isinstance(board, CornerBoard) else board.circles if isinstance(board, LatticePart) else None
-    )
+    printed = getattr(board, "printed", None) or getattr(board, "circles", None)
     if printed is None:
         return board_toml(board)
     rows = tag_rows(printed) if isinstance(printed, TagLayout) else []
@@ -242,9 +230,17 @@ def run_board_toml(board: BoardDesign) -> str:
 
 def keys_of(board: FlatBoard) -> list[str]:
     """Return ``key = value`` for each number and word of a board of squares, tags or circles, as its file has them."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, bool):
+            return str(value).lower()
+        if isinstance(value, tuple):
+            return repr(list(map(list, value)))
+        return toml_string(value) if isinstance(value, str) else repr(value)
+
     skipped = ("tags", "corners_mm") if isinstance(board, TagLayout) else ()
     stated = {entry.name: getattr(board, entry.name) for entry in fields(board) if entry.name not in skipped}
-    return [f"{key} = {_toml_value(value)}" for key, value in stated.items() if value not in (None, ())]
+    return [f"{key} = {text(value)}" for key, value in stated.items() if value not in (None, ())]
 
 
 def tag_rows(layout: TagLayout) -> list[str]:
@@ -258,14 +254,6 @@ def tag_rows(layout: TagLayout) -> list[str]:
             place = f"corners_mm = [{', '.join(f'[{x!r}, {y!r}]' for x, y in corners.tolist())}]"
         rows.append(f"  {{ dictionary = {toml_string(dictionary)}, id = {tag}, {place} }},")
     return rows
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return repr(list(map(list, value)))
-    return toml_string(value) if isinstance(value, str) else repr(value)
 
 
 def _lengths(board: FlatBoard) -> list[Length]:
@@ -334,21 +322,13 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     if "target_type" in content:
         return kalibr_board_of(content, where)
     kind = content.get("type", "circles")
-    if kind == "circles":
-        return board_design(validated(content, BoardEntry, where), where)
-    for design, entry in GRIDS.items():
-        if kind == TYPES[design]:
-            return _grid(design, validated(content, entry, where), where)
-    if kind == "tags":
-        return _tags(validated(content, TagsFile, where), where)
-    if kind in ("asymmetric-circles", "hexagonal-circles"):
-        return _asymmetric(validated(content, _AsymmetricCircles, where), where)
     if kind == SET:
-        raise InputError(
-            "E-BOARD-SINGLE",
-            f"{where}: several boards that are not in one plane; the file of a single board needed here",
-        )
-    raise InputError("E-BOARD-TYPE", f"{where}: type {kind!r}; one of {', '.join(KINDS)} needed")
+        several = f"{where}: several boards that are not in one plane; the file of a single board needed here"
+        raise InputError("E-BOARD-SINGLE", several)
+    if not isinstance(kind, str) or kind not in READERS:
+        raise InputError("E-BOARD-TYPE", f"{where}: type {kind!r}; one of {', '.join(READERS)} needed")
+    entry, board_of = READERS[kind]
+    return board_of(validated(content, entry, where), where)
 
 
 def board_content(path: str | Path) -> dict[str, Any] | None:
@@ -364,14 +344,12 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
         return yaml_content(text, ("target_type",) if "target_type" in text else BUNDLE_KEYS)
 
 
-GRIDS = {ChessboardDesign: _Chessboard, CharucoDesign: _Charuco, AprilGridDesign: _AprilGrid}
-"""Entries of boards of squares and of tags in rows, whose keys are the fields of the board."""
+GRIDS = {"chessboard": ChessboardDesign, "charuco": CharucoDesign, "aprilgrid": AprilGridDesign}
+"""Boards of squares and of tags in rows, whose fields are the keys of the file."""
 
 
-def _grid(
-    design: type[ChessboardDesign | CharucoDesign | AprilGridDesign], data: Sized, where: str
-) -> ChessboardDesign | CharucoDesign | AprilGridDesign:
-    board = design(**data.model_dump(exclude={"type", "unusual_size"}))
+def _grid(data: _Chessboard | _Charuco | _AprilGrid, where: str) -> ChessboardDesign | CharucoDesign | AprilGridDesign:
+    board = GRIDS[data.type](**data.model_dump(exclude={"type", "unusual_size"}))
     require_millimetres(_lengths(board), data.unusual_size, where)
     if isinstance(board, ChessboardDesign):
         return board
@@ -464,3 +442,12 @@ CIRCLES = {
     "hexagonal-circles": (HexagonalCirclesDesign, "what neighbours are apart"),
 }
 """Grids of circles with shifted rows, and what their spacing is."""
+READERS: dict[str, tuple[type[Strict], Callable[..., BoardDesign | FlatBoard]]] = {
+    "circles": (BoardEntry, board_design),
+    "chessboard": (_Chessboard, _grid),
+    "charuco": (_Charuco, _grid),
+    "tags": (TagsFile, _tags),
+    "aprilgrid": (_AprilGrid, _grid),
+    **dict.fromkeys(CIRCLES, (_AsymmetricCircles, _asymmetric)),
+}
+"""Form of the file of each kind of board, and its reader."""

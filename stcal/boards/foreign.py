@@ -70,21 +70,14 @@ def yaml_content(text: str, keys: Sequence[str]) -> dict[str, Any] | None:
 
 
 def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return the keys and values of a layout of tags, from those of a file of apriltag_ros, in mm and with Y down.
-
-    Without bundles, standalone tags have their sizes and no places.
-
-    Raises InputError: keys are missing or unknown, there are several bundles, or tags do not lie in one plane.
-    """
+    """Return keys and values of a layout of tags, in mm and with Y down; standalone tags have sizes and no places."""
     data = validated(content, _BundlesFile, where)
     if len(data.tag_bundles) > 1:
         names = ", ".join(bundle.name for bundle in data.tag_bundles)
         raise InputError("E-LAYOUT-BUNDLES", f"{where}: bundles {names}: one needed; leave only that one in the file")
     if not data.tag_bundles:
-        sizes = [
-            {"dictionary": data.tag_family, "id": t.id, "size_mm": METRE_MM * t.size} for t in data.standalone_tags
-        ]
-        return {"type": "tags", "tag": sizes}
+        tags = [{"dictionary": data.tag_family, "id": t.id, "size_mm": METRE_MM * t.size} for t in data.standalone_tags]
+        return {"type": "tags", "tag": tags}
     [bundle] = data.tag_bundles
     places = tuple(f"tag {tag.id}" for tag in bundle.layout)
     wxyz = np.array([[tag.qw, tag.qx, tag.qy, tag.qz] for tag in bundle.layout])
@@ -110,13 +103,13 @@ Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 
 def _metres(value: float) -> float:
-    if not LEAST_M <= value <= MOST_M:
-        raise ValueError(f"{LEAST_M:g} … {MOST_M:g} m needed: Kalibr's lengths are metres, not mm")
+    """Refuses what no hardware has."""
+    least, most = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
+    if not least <= value <= most:
+        raise ValueError(f"{least:g} … {most:g} m needed: Kalibr's lengths are metres, not mm")
     return value
 
 
-LEAST_M, MOST_M = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
-"""Tags, squares and spacings that hardware has, m; another value is in a wrong unit, for Kalibr's are metres."""
 LEAST_GAP = 0.1
 """Smallest gap between tags over their side that grids have: with less white about them tags are not found."""
 SAME_WITHIN = 1e-6
@@ -155,11 +148,7 @@ class _CircleGrid(Strict):
 def kalibr_board_of(
     content: dict[str, Any], where: str
 ) -> AprilGridDesign | ChessboardDesign | AsymmetricCirclesDesign:
-    """Return the board of a file of Kalibr; the message of an InputError begins with ``where``.
-
-    Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
-    grids do not state the radius of circles, which is determined from images.
-    """
+    """Return the board of a file of Kalibr; its circle grids do not state the radius, which images determine."""
     kind = content["target_type"]
     if kind == "aprilgrid":
         data = validated(content, _KalibrAprilGrid, where)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import AsymmetricCirclesDesign, BoardSet, CharucoDesign, ChessboardDesign, FlatBoard
+from stcal.boards.design import BoardSet, CharucoDesign, ChessboardDesign, FlatBoard
 from stcal.boards.file import SET, board_content, design_of, flat_board, load_flat_board
 from stcal.boards.target import tags_on
 from stcal.design import BoardDesign
@@ -33,11 +33,9 @@ class _Place(PoseEntry):
         """Return common_from_board."""
         given_keys = self.model_fields_set
         if self.common_from_board is not None:
-            if len(given_keys) > 1:
-                conflicting = min(given_keys - {"common_from_board"})
-                raise InputError(
-                    "E-BOARD-KEY-CONFLICT", f"{where}: common_from_board and {conflicting}; give one of them"
-                )
+            if further := given_keys - {"common_from_board"}:
+                conflict = f"{where}: common_from_board and {min(further)}; give one of them"
+                raise InputError("E-BOARD-KEY-CONFLICT", conflict)
             if [len(row) for row in self.common_from_board] != [4] * 4:
                 raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: 4 rows of 4 numbers needed")
             try:
@@ -53,11 +51,7 @@ class _Place(PoseEntry):
 
 
 def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
-    """Read a board file of any kind, of one board or several (form: ``data_layout.md``).
-
-    Raises InputError: as :func:`~stcal.boards.file.load_flat_board`; or boards of a set look alike in images, or have a
-    rotational symmetry.
-    """
+    """Read a board file of any kind, of one board or several (form: ``data_layout.md``)."""
     content = board_content(path)
     if content is None or content.get("type") != SET:
         return design_of(path, content)
@@ -69,9 +63,7 @@ def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
         entry_board = {key: value for key, value in entry.items() if key not in place}
         places.append(validated(place, _Place, entry_place).common(entry_place))
         boards.append(_board(Path(path), entry_board, entry_place))
-        names.append(
-            f"board {number} ({Path(entry_board['file']).name})" if "file" in entry_board else f"board {number}"
-        )
+        names.append(f"board {number}" + (f" ({Path(entry_board['file']).name})" if "file" in entry_board else ""))
     board_set = BoardSet(tuple(names), tuple(boards), tuple(places))
     _require_told_apart(board_set, where)
     return board_set
@@ -83,9 +75,8 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
     if not isinstance(entry["file"], str):
         raise InputError("E-BOARD-FILE-KEY", f"{where}: file: a string needed")
     if extra := sorted(set(entry) - {"file"}):
-        raise InputError(
-            "E-BOARD-KEY-CONFLICT", f"{where}: {', '.join(extra)} beside file; the board's file says what the board is"
-        )
+        beside = f"{where}: {', '.join(extra)} beside file; the board's file says what the board is"
+        raise InputError("E-BOARD-KEY-CONFLICT", beside)
     try:
         return load_flat_board(path.parent / entry["file"])
     except InputError as error:
@@ -108,7 +99,7 @@ def _require_told_apart(found: BoardSet, where: str) -> None:
 
 def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:
     """Return why two boards look alike in images, and what to do; empty if they differ."""
-    if (colour := _circles(first)) and colour == _circles(second):
+    if (colour := getattr(first, "polarity", "")) and colour == getattr(second, "polarity", ""):
         return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
     for whole, part in ((first, second), (second, first)):
         if not isinstance(part, ChessboardDesign) or not (inner := _inner(whole)):
@@ -121,10 +112,6 @@ def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> s
     if common := sorted(set(tags_on(first)) & set(tags_on(second))):
         return f"both have tag {common[0][1]} of {common[0][0]}; other ids (first_id) or another dictionary needed"
     return ""
-
-
-def _circles(board: BoardDesign | FlatBoard) -> str:
-    return board.polarity if isinstance(board, BoardDesign | AsymmetricCirclesDesign) else ""
 
 
 def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import cv2
 import numpy as np
@@ -38,23 +39,15 @@ the original scale grows the white too far into tags of 50 px and less."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tags:
-    """The tags seen in one image.
+    """The n tags seen in one image."""
 
-    ``tags`` : (n,) dictionary and id; ``corners_px`` : (n, 4, 2) top left, top right, bottom right, bottom left as
-    printed; ``covariance_px2`` : (n, 4, 2, 2); ``repeated`` : tags that were omitted because they occur more than once;
-    ``saturated`` : (n,) share of the white around a tag that is saturated, see :meth:`edge_sigma_px`; ``joint_px2`` :
-    (n, 8, 8) covariance of the four corners of a tag together, of which ``covariance_px2`` holds the blocks of single
-    corners; if None, corners are independent; ``smear_px`` : way by which motion during the exposure blurs edges; 0
-    where it is short.
-    """
-
-    tags: tuple[tuple[str, int], ...]
-    corners_px: np.ndarray
-    covariance_px2: np.ndarray
-    repeated: tuple[tuple[str, int], ...] = ()
-    saturated: np.ndarray | None = None
-    joint_px2: np.ndarray | None = None
-    smear_px: float = 0.0
+    tags: tuple[tuple[str, int], ...]  # dictionary and id
+    corners_px: np.ndarray  # (n, 4, 2) top left, top right, bottom right, bottom left as printed
+    covariance_px2: np.ndarray  # (n, 4, 2, 2)
+    repeated: tuple[tuple[str, int], ...] = ()  # tags that were omitted because they occur more than once
+    saturated: np.ndarray | None = None  # (n,) share of the white around a tag, see :meth:`edge_sigma_px`
+    joint_px2: np.ndarray | None = None  # (n, 8, 8) of the four corners of a tag together; None: independent
+    smear_px: float = 0.0  # way by which motion during the exposure blurs edges; 0 where it is short
 
     def __post_init__(self):
         freeze(self, "corners_px", (len(self.tags), 4, 2), "tags' corners")
@@ -92,19 +85,26 @@ def find_tags(
             for tag, place in find_family(grey, name):
                 places_of.setdefault((name, tag), []).append(place.astype(np.float32))
             continue
-        detectors = [
-            cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits, windows))
-            for windows in windows_px
-        ]
-        for look in _looks(grey, joined):
+        settings = [detector_settings(name, border_bits, windows) for windows in windows_px]
+        detectors = [cv2.aruco.ArucoDetector(dictionary_of(name), each) for each in settings]
+        for large, larger, grown_px in _looks(grey, joined):
             for detector in detectors:
-                corners, ids, _ = detector.detectMarkers(look.grey)
-                places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
+                corners, ids, _ = detector.detectMarkers(large)
+                places = np.array(corners, np.float32).reshape(-1, 4, 2)
+                if grown_px and len(places):
+                    places = (places + grown_px * corners_by_edges(places)).astype(np.float32)
+                if larger != 1:
+                    places = ((places + 0.5) / larger - 0.5).astype(np.float32)
                 earlier = {tag: list(known_places) for tag, known_places in places_of.items()}
                 for place, tag in zip(places, [] if ids is None else ids.ravel(), strict=True):
                     if not any(_inside(place, earlier_place) for earlier_place in earlier.get((name, int(tag)), [])):
                         places_of.setdefault((name, int(tag)), []).append(place)
-    places_of = _outermost(places_of)
+    # Tags are also read inside of larger ones, from their cells or a second time from their border.
+    every = [(place, cv2.contourArea(place)) for places in places_of.values() for place in places]
+    for tag, places in places_of.items():
+        larger_than = [[o for o, area in every if area > cv2.contourArea(place)] for place in places]
+        outermost = [not any(_inside(p, o) for o in others) for p, others in zip(places, larger_than, strict=True)]
+        places_of[tag] = list(compress(places, outermost))
     once = {tag: places[0] for tag, places in sorted(places_of.items()) if len(places) == 1}
     cells = np.array([cells_of(name, border_bits) for name, _ in once])
     white = np.array([name in FAMILIES for name, _ in once], bool)
@@ -125,30 +125,14 @@ def corner_blocks(joint: np.ndarray) -> np.ndarray:
     return np.moveaxis(joint.reshape(-1, 4, 2, 4, 2)[:, corner, :, corner], 0, 1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Look:
-    """An image enlarged by the factor ``larger``, in which white areas are dilated by ``grown_px`` of its pixels."""
-
-    grey: np.ndarray
-    larger: int = 1
-    grown_px: float = 0.0
-
-    def in_image(self, corners: np.ndarray) -> np.ndarray:
-        """Return the corners of tags (n, 4, 2) in the original image, px."""
-        if self.grown_px and len(corners):
-            corners = (corners + self.grown_px * corners_by_edges(corners)).astype(np.float32)
-        return corners if self.larger == 1 else ((corners + 0.5) / self.larger - 0.5).astype(np.float32)
-
-
-def _looks(grey: np.ndarray, joined: bool) -> Iterator[_Look]:
-    """Yield the image; if tags are joined at their corners, dilated images come first."""
+def _looks(grey: np.ndarray, joined: bool) -> Iterator[tuple[np.ndarray, int, float]]:
+    """Yield the image; first, of ``joined`` tags, enlarged ones with dilated white: image, factor, and dilation, px."""
     for larger, most in GROWN_LOOKS if joined else ():
         if grey.size * larger**2 <= most:
             interpolation = cv2.INTER_CUBIC
             large = grey if larger == 1 else cv2.resize(grey, None, fx=larger, fy=larger, interpolation=interpolation)
-            grown = cv2.dilate(large, np.ones((WHITE_PX, WHITE_PX), np.uint8))
-            yield _Look(grown, larger, (WHITE_PX - 1) / 2)
-    yield _Look(grey)
+            yield cv2.dilate(large, np.ones((WHITE_PX, WHITE_PX), np.uint8)), larger, (WHITE_PX - 1) / 2
+    yield grey, 1, 0.0
 
 
 def _inside(place: np.ndarray, other: np.ndarray) -> bool:
@@ -160,9 +144,8 @@ def _inside(place: np.ndarray, other: np.ndarray) -> bool:
 def seen_otherwise(image: np.ndarray, own: Collection[tuple[str, int]], place: str) -> str:
     """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing.
 
-    Tags of ``own`` (dictionary, id) may be in view twice, mirrored, or white on black; or others, of which the
-    dictionary with most is named; of dictionaries that contain one another, the smaller one. ``place`` : of what must
-    be corrected.
+    Tags of ``own`` (dictionary, id) may be in view twice, mirrored, or white on black; or tags of another dictionary,
+    which is to be corrected in ``place``.
     """
     grey, known = grey_8bit(image), sorted({name for name, _ in own})
     if twice := [tag for tag in find_tags(grey, known).repeated if tag in own]:
@@ -176,10 +159,10 @@ def seen_otherwise(image: np.ndarray, own: Collection[tuple[str, int]], place: s
     # Some dictionaries have two names; and one of the second names finds tags everywhere.
     names = [name for name in names if name.upper() == name or name.upper() not in names]
     others = []
-    for name in names:
+    for name in (name for name in names if name.upper() not in map(str.upper, known)):
         dictionary = dictionary_of(name)
         _, ids, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings(name)).detectMarkers(grey)
-        if ids is not None and name.upper() not in map(str.upper, known):
+        if ids is not None:  # of dictionaries that contain one another, the smaller one is named
             others.append((-len(ids), len(dictionary.bytesList), name))
     most, _, name = min(others, default=(0, 0, ""))
     best = max(counts, key=counts.__getitem__)
@@ -203,11 +186,9 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
 def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ...] = TOGETHER_PX):
     """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows.
 
-    The default settings lose small tags: only the middle of a cell keeps its colour, blur mixes the rest with the
-    neighbours, and four pixels per cell are too few to separate them. Of 272 real tags of 19 to 60 px a side the
-    default settings read 86 %, these 97 %. Two sizes of the threshold window find as much as three, and more if each
-    has a search of its own: of the outlines that both find of one tag, the detector keeps a single one, which need not
-    be that which can be read.
+    The default settings lose small tags, in which only the middle of a cell keeps its colour: of 272 real tags of 19 to
+    60 px a side they read 86 %, these 97 %. Two sizes of the window find more if each has a search of its own: of the
+    outlines that both find of one tag, the detector keeps a single one, which need not be that which can be read.
     """
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = border_bits
@@ -219,16 +200,6 @@ def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ..
     if "APRILTAG" in name.upper():
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return settings
-
-
-def _outermost(found: dict[tuple[str, int], list[np.ndarray]]) -> dict[tuple[str, int], list[np.ndarray]]:
-    """Return the tags without those read inside a larger tag, from its cells or a second time from its border."""
-    flat = [(tag, place, cv2.contourArea(place)) for tag, places in found.items() for place in places]
-    outermost: dict[tuple[str, int], list[np.ndarray]] = {}
-    for tag, place, area in flat:
-        if not any(larger > area and _inside(place, other_place) for _, other_place, larger in flat):
-            outermost.setdefault(tag, []).append(place)
-    return outermost
 
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -257,9 +228,8 @@ def _refined(
         return refined, covariance, max(smears)
     measured = corners_from_edges(grey, corners, cells)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
-    away = np.linalg.norm(np.where(measured.seen[:, None, None], measured.corners_px - corners, 0), axis=2).max(
-        1, initial=0
-    )
+    away = np.linalg.norm(np.where(measured.seen[:, None, None], measured.corners_px - corners, 0), axis=2)
+    away = away.max(1, initial=0)
     good = (measured.seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
     covariance = np.where(good, measured.covariance_px2, UNREFINED_PX**2 * np.eye(8))
     return np.where(good, measured.corners_px, corners), covariance, measured.smear_px
@@ -283,17 +253,19 @@ def find_aprilgrid(
     image: np.ndarray, name: str, board: AprilGridDesign, camera: Camera
 ) -> tuple[BoardView | None, str]:
     """Return the view with all four corners of each tag seen, or None and the reason. A part of the board is enough."""
-    layout = board.layout()
+    layout, ids = board.layout(), board.tag_ids()
     tags, bits = _tags(image, board)
     view = view_of_tags(name, tags, layout)
+    if view is None and tags.tags:
+        return None, f"tag {tags.tags[0][1]} of {board.dictionary}, none of {ids[0]} … {ids[-1]} of the AprilGrid"
+    if view is None and tags.repeated:
+        return None, f"tag {tags.repeated[0][1]} of the AprilGrid is in view more than once, and no other"
     if view is None:
-        return None, _without_tags(tags, bits, board)
+        return None, f"no tag of the AprilGrid: {board.dictionary}, border of {bits} cells"
     fitting, unused = view, list(view.unused)
-    strangers = [tag for _, tag in tags.tags if tag not in board.tag_ids()]
-    unused += [f"tag {tag} is none of its {len(board.tag_ids())}" for tag in strangers]
-    while (off := _off(fitting, camera)).max() > MAX_OFF_SHARE and len(fitting) - 4 >= (1 - MOST_STRAY_SHARE) * len(
-        view
-    ):
+    unused += [f"tag {tag} is none of its {len(ids)}" for _, tag in tags.tags if tag not in ids]
+    least = (1 - MOST_STRAY_SHARE) * len(view)
+    while (off := _off(fitting, camera)).max() > MAX_OFF_SHARE and len(fitting) - 4 >= least:
         worst = fitting.ids[4 * int(off.argmax())] // 4
         unused.append(f"tag {layout.tags[worst][1]} lies off the board's plane")
         fitting = fitting.rows(fitting.ids // 4 != worst)
@@ -308,24 +280,12 @@ def _tags(image: np.ndarray, board: AprilGridDesign) -> tuple[Tags, str]:
     if board.border_bits is not None:
         return find_tags(image, names, board.border_bits, joined=True), f"{board.border_bits}"
     of_two_bits = find_tags(image, names, KALIBR_BITS, joined=True)
-    if _own(of_two_bits, board) >= ENOUGH_SHARE * len(board.tag_ids()):
+    two = sum(tag in board.tag_ids() for _, tag in of_two_bits.tags)
+    if two >= ENOUGH_SHARE * len(board.tag_ids()):
         return of_two_bits, f"{KALIBR_BITS}"
     of_one_bit = find_tags(image, names, USUAL_BITS, joined=True)
-    two_bits_hold = _own(of_two_bits, board) > 0 and _own(of_two_bits, board) >= TELLING_SHARE * _own(of_one_bit, board)
-    return (of_two_bits if two_bits_hold else of_one_bit), f"{USUAL_BITS} or {KALIBR_BITS}"
-
-
-def _own(tags: Tags, board: AprilGridDesign) -> int:
-    return sum(tag in board.tag_ids() for _, tag in tags.tags)
-
-
-def _without_tags(tags: Tags, bits: str, board: AprilGridDesign) -> str:
-    ids = board.tag_ids()
-    if tags.tags:
-        return f"tag {tags.tags[0][1]} of {board.dictionary}, none of {ids[0]} … {ids[-1]} of the AprilGrid"
-    if tags.repeated:
-        return f"tag {tags.repeated[0][1]} of the AprilGrid is in view more than once, and no other"
-    return f"no tag of the AprilGrid: {board.dictionary}, border of {bits} cells"
+    one = sum(tag in board.tag_ids() for _, tag in of_one_bit.tags)
+    return (of_two_bits if 0 < two >= TELLING_SHARE * one else of_one_bit), f"{USUAL_BITS} or {KALIBR_BITS}"
 
 
 def _off(view: BoardView, camera: Camera) -> np.ndarray:

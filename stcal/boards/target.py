@@ -1,5 +1,6 @@
 """Target files whose faces may be boards or tags: reader and writer over those of ``stcal.io.design``."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -91,31 +92,19 @@ def printed_face(
     face_id: str, board: FlatBoard, sigma_mm: float | None = None, size_sigma_mm: float = 0.0, **more: Any
 ) -> FaceDesign:
     """Return the face of a board or tags; ``sigma_mm`` : σ of a corner, else the board's; ``more`` : pose, outline."""
-    ids = corner_ids(board)
-    xy = board.xy_mm()
-    middle = xy.mean(0)
-    first = int(np.linalg.norm(xy - middle, axis=1).argmax())
+    ids, xy = corner_ids(board), board.xy_mm()
+    first = int(np.linalg.norm(xy - xy.mean(0), axis=1).argmax())
     second = int(np.linalg.norm(xy - xy[first], axis=1).argmax())
     along = (xy[second] - xy[first]) / np.linalg.norm(xy[second] - xy[first])
     across = (xy - xy[first]) @ np.array([-along[1], along[0]])
     third = int(across.argmax()) if across.max() >= -across.min() else int(across.argmin())
     if across[third] < 0:  # as seen along Z, X to Y must turn like the axes
         first, second = second, first
+    frame = ids[first], ids[second], ids[third]
     own = board.sigma_mm or TAG_SIGMA_MM
-    return FaceDesign(
-        face_id,
-        ids,
-        xy,
-        np.full(len(ids), POINT_RADIUS_MM),
-        ids[first],
-        ids[second],
-        ids[third],
-        printed=board,
-        sigma_mm=own if sigma_mm is None else sigma_mm,
-        size_sigma=size_sigma_mm / _size_mm(board),
-        of_tags=not isinstance(board, CharucoDesign),
-        **more,
-    )
+    more |= {"printed": board, "sigma_mm": own if sigma_mm is None else sigma_mm}
+    more |= {"size_sigma": size_sigma_mm / _size_mm(board), "of_tags": not isinstance(board, CharucoDesign)}
+    return FaceDesign(face_id, ids, xy, np.full(len(ids), POINT_RADIUS_MM), *frame, **more)
 
 
 def corner_ids(board: FlatBoard) -> tuple[str, ...]:
@@ -124,12 +113,9 @@ def corner_ids(board: FlatBoard) -> tuple[str, ...]:
         row, column = np.divmod(np.arange((board.rows - 1) * (board.columns - 1)), board.columns - 1)
         return tuple(f"{i}.{j}" for i, j in zip(row.tolist(), column.tolist(), strict=True))
     tags = tags_on(board)
-    numbers = [tag for _, tag in tags]
-    families = [dictionary.removeprefix("DICT_") for dictionary, _ in tags]
-    names = [
-        f"{tag}" if numbers.count(tag) == 1 else f"{family}.{tag}"
-        for family, tag in zip(families, numbers, strict=True)
-    ]
+    count = Counter(tag for _, tag in tags)
+    families = [f"{name.removeprefix('DICT_')}." if count[tag] > 1 else "" for name, tag in tags]
+    names = [f"{family}{tag}" for family, (_, tag) in zip(families, tags, strict=True)]
     return tuple(f"{name}.{corner}" for name in names for corner in range(4))
 
 

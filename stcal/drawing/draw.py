@@ -14,7 +14,7 @@ from stcal.boards.several import load_boards
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.net import net_part
-from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, board_parts, corners_of, said_mm, target_parts
+from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, corners_of, parts_of, said_mm
 from stcal.drawing.sheets import FURNITURE, MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
@@ -228,9 +228,14 @@ def draw(
                 f"{fitting or OWN}, or draw the plates one by one without --net",
             )
     else:
-        parts = target_parts(loaded, margin_mm) if isinstance(loaded, TargetDesign) else board_parts(loaded, margin_mm)
+        parts = parts_of(loaded, margin_mm)
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
-    sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
+    if paper != OWN:
+        sheets = paper_sheets(parts, paper, title)
+    elif path.suffix.lower() == ".pdf":
+        sheets = [one_sheet([part], f"{title}, {part.name}" if len(parts) > 1 else title) for part in parts]
+    else:
+        sheets = [one_sheet(parts, title)]
     save(path, content_of(sheets, path))
     return Drawn(path, parts, sheets, paper)
 
@@ -260,15 +265,6 @@ def load_design(path: str | Path) -> Design:
         )
     content = board_content(path)
     return load_body(path) if content is not None and "face" in content else load_boards(path)
-
-
-def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sheet]:
-    """Return the sheets of a paper, or of the parts' own size: then one for all parts, or one for each if ``apart``."""
-    if paper != OWN:
-        return paper_sheets(parts, paper, title)
-    if not apart:
-        return [one_sheet(parts, title)]
-    return [one_sheet([part], f"{title}, {part.name}" if len(parts) > 1 else title) for part in parts]
 
 
 def paper_for(parts: Sequence[Part]) -> str | None:
@@ -314,10 +310,7 @@ def _paper(path: Path, paper: str) -> str:
 
 def drawn_text(drawn: Drawn) -> str:
     """Return the parts and sheets of a drawing, and how to use them, as text."""
-    lines = []
-    for part in drawn.parts:
-        width, height = np.ptp(part.outline, axis=0).tolist()
-        lines.append(f"{part.name}: {said_mm(width)} × {said_mm(height)} mm")
+    lines = [f"{part.name}: {_size(part)}" for part in drawn.parts]
     sheets = len(drawn.sheets)
     kind = "of its own size" if drawn.paper == OWN else drawn.paper
     lines.append(f"{drawn.path}: {sheets} sheet{'s' if sheets > 1 else ''} {kind}")

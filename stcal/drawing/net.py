@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.drawing.parts import Area, Disc, Line, Part, Shape, Text, as_seen, face_part, words_with_room
+from stcal.drawing.parts import Area, Disc, Line, Part, Shape, Text, as_seen, corners_of, face_part, words_with_room
 from stcal.errors import InputError
 from stcal.io.design import ROUGH_KEYS
 
@@ -69,7 +69,7 @@ def net_part(target: TargetDesign) -> Part:
             if partner is None or partner[0] not in free:
                 continue
             unfolded = _unfolded(plate, edge, target.face(partner[0]), partner[1])
-            if _is_clear(unfolded.corners(), plates):
+            if _is_clear(unfolded.corners(), [each.corners() for each in plates]):
                 plates.append(unfolded)
                 free.remove(partner[0])
                 folds |= {((plate.face.id, edge), partner), (partner, (plate.face.id, edge))}
@@ -117,20 +117,19 @@ def _unfolded(plate: _Plate, edge: int, face: FaceDesign, own: int) -> _Plate:
     return _Plate(replace(face, outline_mm=outline), turn, middle)
 
 
-def _is_clear(corners: np.ndarray, plates: Iterable[_Plate]) -> bool:
-    """Return True if a polygon overlaps none of the plates; concave polygons may count with their hulls."""
-    return not any(_overlap(corners, plate.corners()) for plate in plates)
+def _is_clear(one: np.ndarray, others: Iterable[np.ndarray]) -> bool:
+    """Return True if a polygon overlaps no other, by separating axes; concave polygons may count with their hulls."""
 
+    def overlaps(other: np.ndarray) -> bool:
+        for polygon in (one, other):
+            side = np.roll(polygon, -1, axis=0) - polygon
+            normals = np.column_stack([side[:, 1], -side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
+            a, b = one @ normals.T, other @ normals.T
+            if ((a.max(0) <= b.min(0) + TOUCH) | (b.max(0) <= a.min(0) + TOUCH)).any():
+                return False
+        return True
 
-def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
-    """Return True if two polygons overlap, by separating axes along the normals of the sides."""
-    for polygon in (one, other):
-        side = np.roll(polygon, -1, axis=0) - polygon
-        normals = np.column_stack([side[:, 1], -side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
-        a, b = one @ normals.T, other @ normals.T
-        if ((a.max(0) <= b.min(0) + TOUCH) | (b.max(0) <= a.min(0) + TOUCH)).any():
-            return False
-    return True
+    return not any(map(overlaps, others))
 
 
 def _part(plates: list[_Plate], target: TargetDesign, shared, folds) -> Part:
@@ -154,13 +153,11 @@ def _part(plates: list[_Plate], target: TargetDesign, shared, folds) -> Part:
         for edge in range(len(corners)):
             edge_id, partner = (plate.face.id, edge), shared.get((plate.face.id, edge))
             ends = np.array([corners[edge], corners[(edge + 1) % len(corners)]])
-            folded = (edge_id, partner) in folds
-            if folded:
-                if edge_id < partner:
-                    lines.append(Line(ends, "FOLD", "grey", dashed=True))
+            if (edge_id, partner) in folds:
+                lines += [Line(ends, "FOLD", "grey", dashed=True)] if edge_id < partner else []
                 continue
             tab = _tab(ends) if partner and edge_id < partner else None
-            if tab is None or not _is_clear(tab, plates) or any(_overlap(tab, drawn_tab) for drawn_tab in tabs):
+            if tab is None or not _is_clear(tab, [*(each.corners() for each in plates), *tabs]):
                 lines.append(Line(ends, "CUT", width=0.1))
                 continue
             tabs.append(tab)
@@ -171,9 +168,9 @@ def _part(plates: list[_Plate], target: TargetDesign, shared, folds) -> Part:
             at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
             shapes.append(Text(*at, words, LETTERS, "middle", turned=not level))
     every = np.concatenate([*(plate.corners() for plate in plates), *tabs])
-    (left, below), (right, above) = every.min(0), every.max(0)
-    outline = np.array([[left, below], [right, below], [right, above], [left, above]])
-    return Part("net", outline, (*grounds, *shapes, *_sketch(plates, right + APART, above)), lines=tuple(lines))
+    box = np.array([every.min(0), every.max(0)])
+    sketch = _sketch(plates, box[1, 0] + APART, box[1, 1])
+    return Part("net", corners_of(box), (*grounds, *shapes, *sketch), lines=tuple(lines))
 
 
 def _tab(ends: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ from stcal.boards.design import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
     BoardSet,
-    CharucoDesign,
     ChessboardDesign,
     FlatBoard,
     TagLayout,
@@ -57,7 +56,8 @@ class Area:
 
     def box(self) -> np.ndarray:
         """Return the bounding box, (2, 2): smallest and largest coordinates."""
-        return _box(np.concatenate(self.lines))
+        points = np.concatenate(self.lines)
+        return np.array([points.min(0), points.max(0)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +73,7 @@ class Line:
 
     def box(self) -> np.ndarray:
         """Return the bounding box, (2, 2): smallest and largest coordinates."""
-        return _box(self.points)
+        return np.array([self.points.min(0), self.points.max(0)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +123,6 @@ def corners_of(box: np.ndarray) -> np.ndarray:
     return np.array([[left, below], [right, below], [right, above], [left, above]])
 
 
-def _box(points: np.ndarray) -> np.ndarray:
-    return np.array([points.min(0), points.max(0)])
-
-
 def words_with_room(places: np.ndarray, words: Iterable[str], height: float, taken: Iterable[Text] = ()) -> list[Text]:
     """Return words about their places (n, 2), without those that would overlap others before, or the ``taken`` ones."""
     found, boxes = [], [text.box() for text in taken]
@@ -145,34 +141,26 @@ def said_mm(value: float) -> str:
     return "0" if text == "-0" else text
 
 
+Spans: TypeAlias = tuple[tuple[int, float, float, str], ...]
+"""Lengths with their axis, both ends, and words."""
 NAMED_TAGS = 6
 """Largest number of tags that the name of a part lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A flat piece, seen from the side that is photographed, Y upwards.
-
-    ``outline`` : (k, 2) cutting line; ``shapes`` : content; ``spans`` : lengths that are dimensioned, as (axis, from,
-    to, words); ``table`` : rows of words, the first a note, the second the heads; ``lines`` : lines to cut and fold, if
-    they replace the outline, which then only encloses the part.
-    """
+    """A flat piece, seen from the side that is photographed, Y upwards."""
 
     name: str
-    outline: np.ndarray
+    outline: np.ndarray  # (k, 2) cutting line
     shapes: tuple[Shape, ...]
-    spans: tuple[tuple[int, float, float, str], ...] = ()
-    table: tuple[tuple[str, ...], ...] = ()
-    lines: tuple[Line, ...] = ()
+    spans: Spans = ()  # lengths that are dimensioned
+    table: tuple[tuple[str, ...], ...] = ()  # rows of words, the first a note, the second the heads
+    lines: tuple[Line, ...] = ()  # to cut and fold, if they replace the outline, which then only encloses the part
 
     def pattern(self) -> list[Shape]:
         """Return the shapes of the pattern, without the ground."""
         return [shape for shape in self.shapes if shape.layer == "PATTERN"]
-
-
-def target_parts(target: TargetDesign, margin_mm: float) -> list[Part]:
-    """Return a plate for each face, with the face's outline, or ``margin_mm`` beyond the rims of its circles."""
-    return [face_part(face, target.polarity, margin_mm) for face in target.faces]
 
 
 def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
@@ -182,13 +170,12 @@ def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
         outline = as_seen(face).outline_mm
         return part if outline is None else replace(part, outline=outline)
     shapes = _discs(face.xy_mm, face.radius_mm, face.labels(), polarity)
-    head = ("circle", "x", "y", "diameter")
     rows = [
         (circle, said_mm(x), said_mm(y), said_mm(2 * r))
         for circle, (x, y), r in zip(face.ids, face.xy_mm.tolist(), face.radius_mm.tolist(), strict=True)
     ]
     frame = (f"mm from circle {face.origin},", f"X through {face.x}", "", "")
-    table = (frame, head, *rows)
+    table = (frame, ("circle", "x", "y", "diameter"), *rows)
     return _part(f"face {face.id}", shapes, polarity, margin_mm, table=table, outline=face.outline_mm)
 
 
@@ -201,13 +188,12 @@ def as_seen(face: FaceDesign) -> FaceDesign:
     return replace(face, outline_mm=outline, rough_target_from_face=None if pose is None else pose @ turn)
 
 
-def board_parts(board: BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
-    """Return the sheet of a board, or of each board of a set, with a margin of at least ``margin_mm``."""
-    if isinstance(board, BoardSet):
-        return [
-            board_part(one_board, name, margin_mm) for name, one_board in zip(board.names, board.boards, strict=True)
-        ]
-    return [board_part(board, "board", margin_mm)]
+def parts_of(design: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
+    """Return a plate for each face of a target, or a sheet for each board, with a margin of at least ``margin_mm``."""
+    if isinstance(design, TargetDesign):
+        return [face_part(face, design.polarity, margin_mm) for face in design.faces]
+    boards = zip(design.names, design.boards, strict=True) if isinstance(design, BoardSet) else [("board", design)]
+    return [board_part(board, name, margin_mm) for name, board in boards]
 
 
 def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> Part:
@@ -245,34 +231,28 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
     return _part(description, dots, board.polarity, margin_mm, tuple(spans))
 
 
-def _squares_said(board: SquaresOrTags) -> tuple[str, tuple[tuple[int, float, float, str], ...]]:
+def _squares_said(board: SquaresOrTags) -> tuple[str, Spans]:
     """Return the description of a board, and the lengths to check as :attr:`Part.spans`."""
+    if isinstance(board, TagLayout):
+        return _tags_said(board)
+    if isinstance(board, AprilGridDesign):
+        tag = said_mm(board.tag_mm)
+        words = f"{tag}, step {said_mm(board.tag_mm * (1 + board.spacing))}"
+        description = f"AprilGrid, {board.rows} × {board.columns} tags of {tag} mm, {board.dictionary}"
+        return description, ((0, 0.0, board.tag_mm, words), (1, 0.0, board.tag_mm, words))
     if isinstance(board, ChessboardDesign):
         columns, rows, first = board.columns - 1, board.rows - 1, 0.0
         description = f"chessboard, {board.rows} × {board.columns} inner corners"
-    elif isinstance(board, CharucoDesign):
-        columns, rows, first = board.columns - 2, board.rows - 2, board.square_mm
-        description = (
-            f"ChArUco, {board.rows} × {board.columns} squares, tags {said_mm(board.marker_mm)} mm, {board.dictionary}"
-        )
-    elif isinstance(board, AprilGridDesign):
-        step = board.tag_mm * (1 + board.spacing)
-        words = f"{said_mm(board.tag_mm)}, step {said_mm(step)}"
-        description = (
-            f"AprilGrid, {board.rows} × {board.columns} tags of {said_mm(board.tag_mm)} mm, {board.dictionary}"
-        )
-        return description, ((0, 0.0, board.tag_mm, words), (1, 0.0, board.tag_mm, words))
     else:
-        return _tags_said(board)
-    side = board.square_mm
-    across = (0, first, first + side * columns, f"{columns} × {said_mm(side)} = {said_mm(side * columns)}")
-    return description, (
-        across,
-        (1, -first - side * rows, -first, f"{rows} × {said_mm(side)} = {said_mm(side * rows)}"),
-    )
+        columns, rows, first = board.columns - 2, board.rows - 2, board.square_mm
+        tags = f"tags {said_mm(board.marker_mm)} mm, {board.dictionary}"
+        description = f"ChArUco, {board.rows} × {board.columns} squares, {tags}"
+    across, down = ((count * board.square_mm, count) for count in (columns, rows))
+    words = [f"{count} × {said_mm(board.square_mm)} = {said_mm(mm)}" for mm, count in (across, down)]
+    return description, ((0, first, first + across[0], words[0]), (1, -first - down[0], -first, words[1]))
 
 
-def _tags_said(layout: TagLayout) -> tuple[str, tuple[tuple[int, float, float, str], ...]]:
+def _tags_said(layout: TagLayout) -> tuple[str, Spans]:
     """Return as :func:`_squares_said`; the side of a tag that lies along the axes is what to measure."""
     names = ", ".join(f"{tag}" for _, tag in layout.tags) if len(layout.tags) <= NAMED_TAGS else f"{len(layout.tags)}"
     families = ", ".join(dict.fromkeys(family for family, _ in layout.tags))
@@ -280,8 +260,8 @@ def _tags_said(layout: TagLayout) -> tuple[str, tuple[tuple[int, float, float, s
     for corners in layout.corners_mm * [1, -1]:
         low, high = corners.min(0), corners.max(0)
         if np.abs(np.abs(corners - (low + high) / 2) - (high - low) / 2).max() < 1e-6:
-            (left, below), (right, above) = low.tolist(), high.tolist()
-            return description, ((0, left, right, said_mm(right - left)), (1, below, above, said_mm(above - below)))
+            ends = zip(low.tolist(), high.tolist(), strict=True)
+            return description, tuple((axis, a, b, said_mm(b - a)) for axis, (a, b) in enumerate(ends))
     return description, ()
 
 

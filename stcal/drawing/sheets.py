@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 
@@ -45,11 +45,8 @@ def table(part: Part, below: bool) -> list[Shape]:
         return []
     box = extent(framed(part))
     top = float(part.outline[:, 1].max())
-    x, y = (
-        (float(part.outline[:, 0].min()), float(box[0, 1]) - ROW)
-        if below
-        else (float(box[1, 0]) + APART, top - LETTERS)
-    )
+    beside = float(box[1, 0]) + APART, top - LETTERS
+    x, y = (float(part.outline[:, 0].min()), float(box[0, 1]) - ROW) if below else beside
     heading, *rows = part.table
     shapes: list[Shape] = [Text(x, y, " ".join(filter(None, heading)), LETTERS)]
     widths = [max(len(row[k]) for row in rows) * WIDTH_PER_HEIGHT * LETTERS + COLUMN_GAP for k in range(len(rows[0]))]
@@ -98,11 +95,10 @@ def scale_bars(width: float, height: float) -> list[Shape]:
 
 def _cut_marks(box: np.ndarray) -> list[Shape]:
     marks: list[Shape] = []
-    for x, outwards in ((box[0, 0], -1), (box[1, 0], 1)):
-        for y, upwards in ((box[0, 1], -1), (box[1, 1], 1)):
-            for direction in (np.array([outwards, 0.0]), np.array([0.0, upwards])):
-                ends = np.array([x, y]) + np.array([[CUT_FROM], [CUT_TO]]) * direction
-                marks.append(Line(ends, "CUT", width=0.1))
+    for right, above, axis in product((0, 1), (0, 1), (0, 1)):
+        outwards = np.where(np.arange(2) == axis, [2 * right - 1, 2 * above - 1], 0)
+        ends = np.array([box[right, 0], box[above, 1]]) + np.array([[CUT_FROM], [CUT_TO]]) * outwards
+        marks.append(Line(ends, "CUT", width=0.1))
     return marks
 
 
@@ -164,15 +160,14 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A page with its origin at the bottom left; ``cuts`` : whether a seam runs through the pattern of its part;
-    ``bare`` : whether the part is without dimensions and table, with which it would take more sheets."""
+    """A page with its origin at the bottom left."""
 
     title: str
     width: float
     height: float
     placed: tuple[Placed, ...]
-    cuts: bool = False
-    bare: bool = False
+    cuts: bool = False  # whether a seam runs through the pattern of its part
+    bare: bool = False  # whether the part is without dimensions and table, with which it would take more sheets
 
 
 def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
@@ -225,11 +220,8 @@ class _Way:
 
     def cuts(self) -> bool:
         """Return True if a seam runs through a circle, square or tag; ``pattern`` : their boxes, (n, 2, 2)."""
-        return any(
-            ((self.pattern[:, 0, k] < seam) & (self.pattern[:, 1, k] > seam)).any()
-            for k in (0, 1)
-            for seam in self.seams[k]
-        )
+        low, high = np.moveaxis(self.pattern, 1, 0)
+        return any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in self.seams[k])
 
     def count(self) -> int:
         """Return the number of sheets."""
@@ -264,8 +256,7 @@ def seams_between(
 ) -> list[float]:
     """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
 
-    Seams avoid the intervals ``taken`` (n, 2) if a piece has a free place, and those of ``words`` (m, 2) too if its
-    second half has one.
+    Seams avoid the intervals ``taken`` (n, 2) and, in a piece's second half, those of ``words`` (m, 2) if they can.
     """
     both = taken if words is None else np.concatenate([taken, words])
     seams, start = [], low
@@ -294,7 +285,10 @@ def _tiles(way: _Way, title: str) -> list[Sheet]:
         shift = [EDGE + SIDE - float(way.box[0, 0]), way.size[1] - EDGE - float(way.box[1, 1])]
         sheet = _sheet(title, *way.size, tuple(moved(shape, *shift) for shape in way.shapes))
         return [replace(sheet, bare=way.bare)]
-    pieces = [_pieces(float(way.box[0, k]), float(way.box[1, k]), way.seams[k]) for k in (0, 1)]
+    pieces = []  # start and end of each piece along X, and along Y
+    for seams, low, high in zip(way.seams, *way.box.tolist(), strict=True):
+        begins, ends = [seam - OVERLAP / 2 for seam in seams], [seam + OVERLAP / 2 for seam in seams]
+        pieces.append(list(zip([low, *begins], [*ends, high], strict=True)))
     shapes = [*way.shapes, *_registration(way)]
     boxes = [shape.box() for shape in shapes]
     sheets = []
@@ -302,19 +296,11 @@ def _tiles(way: _Way, title: str) -> list[Sheet]:
         for column, (left, right) in enumerate(pieces[0], 1):
             shift = [EDGE + SIDE - left, EDGE + FOOT - below]
             clip = np.array([[left, below], [right, above]])
-            inside = [
-                s for s, b in zip(shapes, boxes, strict=True) if (b[0] <= clip[1]).all() and (b[1] >= clip[0]).all()
-            ]
-            shapes_of_sheet = tuple(moved(shape, *shift) for shape in inside)
+            inside = [(box[0] <= clip[1]).all() and (box[1] >= clip[0]).all() for box in boxes]
+            shapes_of_sheet = tuple(moved(shape, *shift) for shape in compress(shapes, inside))
             place = f"sheet {len(sheets) + 1} of {way.count()}: row {row}, column {column}"
             sheets.append(_sheet(f"{title}; {place}", *way.size, shapes_of_sheet, clip + shift, way.cuts()))
     return sheets
-
-
-def _pieces(low: float, high: float, seams: list[float]) -> list[tuple[float, float]]:
-    """Return start and end of each piece."""
-    begins = [low, *(seam - OVERLAP / 2 for seam in seams)]
-    return list(zip(begins, [*(seam + OVERLAP / 2 for seam in seams), high], strict=True))
 
 
 def _registration(way: _Way) -> list[Shape]:

@@ -138,10 +138,8 @@ class BodyScene:
             if _lacking(tilts):
                 best = f", at best {min(tilts):.0f}° from its normal" if tilts else ""
                 named.append(f"{face.id} ({len(tilts)} of {len(shown)} images{best})")
-        enough = (
-            f"better {ENOUGH_VIEWS} of each, {ENOUGH_SQUARE} of them within {SQUARE_DEG:.0f}°: more --images needed"
-        )
-        return f"hardly seen: face {', '.join(named)}; {enough}" if named else ""
+        enough = f"{ENOUGH_VIEWS} of each, {ENOUGH_SQUARE} of them within {SQUARE_DEG:.0f}°: more --images needed"
+        return f"hardly seen: face {', '.join(named)}; better {enough}" if named else ""
 
 
 @require_arguments
@@ -211,7 +209,8 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
     tilts_deg: dict[str, tuple[float, ...]] = dict.fromkeys(design, ())
     for left in range(options.images, 0, -1):
         choices = CHOICES if left <= 2 * sum(map(_lacking, tilts_deg.values())) else 1
-        pose, tilts_deg = min(_poses(scene, choices, tilts_deg, rng), key=lambda each: _lack(each[1]))
+        tried = _poses(scene, choices, tilts_deg, rng)  # squares: the face that lacks most counts most
+        pose, tilts_deg = min(tried, key=lambda each: sum(_lacking(tilts) ** 2 for tilts in each[1].values()))
         poses.append(pose)
     off_mm = _print_errors(target, camera, options)
     return replace(scene, target_from_face=_in_first_face(moved), camera_from_target=tuple(poses), off_mm=off_mm)
@@ -291,9 +290,11 @@ def _shown_deg(scene: BodyScene, pose: Rigid) -> dict[str, tuple[float, ...]]:
     for face in scene.target.faces:
         camera_from_face = pose @ scene.target_from_face[face.id]
         middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
-        cosine = float(_inward(face, camera_from_face) @ middle / np.linalg.norm(middle))
-        tilts[face.id] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    return {face_id: (tilt_deg,) for face_id, tilt_deg in tilts.items() if tilt_deg < SHOWN_DEG}
+        inward = -face.outward * camera_from_face.rotation[:, 2]
+        tilt_deg = float(np.degrees(np.arccos(np.clip(inward @ middle / np.linalg.norm(middle), -1, 1))))
+        if tilt_deg < SHOWN_DEG:
+            tilts[face.id] = (tilt_deg,)
+    return tilts
 
 
 def _lacking(tilts_deg: Sequence[float]) -> int:
@@ -302,34 +303,19 @@ def _lacking(tilts_deg: Sequence[float]) -> int:
     return max(ENOUGH_VIEWS - len(tilts_deg), 0) + max(ENOUGH_SQUARE - squarely, 0)
 
 
-def _lack(tilts_deg: Mapping[str, Sequence[float]]) -> int:
-    """Returns a measure of what all faces lack, in which the face that lacks most counts most."""
-    return sum(_lacking(tilts) ** 2 for tilts in tilts_deg.values())
-
-
-def _inward(face: FaceDesign, camera_from_face: Rigid) -> np.ndarray:
-    """Returns the normal of a face that points into the body, camera frame."""
-    return -face.outward * camera_from_face.rotation[:, 2]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
-    """A face as a picture: ``grey`` (h, w) its brightness, ``solid`` (h, w) where its plate is; ``px_mm`` pixels in a
-    mm; ``origin`` (2,) its first pixel; ``bend`` (h, w) mm along Z, None of a plane."""
+    """A face as a picture."""
 
-    grey: np.ndarray
-    solid: np.ndarray
-    px_mm: float
-    origin: np.ndarray
-    bend: np.ndarray | None = None
+    grey: np.ndarray  # (h, w) brightness
+    solid: np.ndarray  # (h, w) where the plate is
+    px_mm: float  # pixels in a mm
+    origin: np.ndarray  # (2,) of the first pixel, mm
+    bend: np.ndarray | None = None  # (h, w) mm along Z, None of a plane
 
 
 def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarray | None = None) -> Drawing:
-    """Returns the drawing of a face with the plate about it.
-
-    ``polarity`` : of circles; ``off_mm`` : (n, 3) how far the points of a printed face are off; between them, and
-    along the edges that they end, it changes linearly.
-    """
+    """Returns the drawing of a face with the plate about it; ``off_mm`` : (n, 3) how far printed points are off."""
     if face.printed is None:
         around = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
         unit = np.column_stack([np.cos(around), np.sin(around)])
@@ -370,9 +356,8 @@ def _off_at(places: np.ndarray, xy_mm: np.ndarray, off_mm: np.ndarray) -> np.nda
 def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:
     """Returns the share of each pixel (height, width) of a picture that areas cover, exactly.
 
-    ``areas`` : lists of closed lines (k, 2), pixels from the picture's corner, of which the first one is the outline
-    and the others, in the other direction, are holes. Each piece of a line within one pixel adds what is between it and
-    the picture's right side.
+    ``areas`` : lists of closed lines (k, 2), px: the outline, then holes in the other direction. Each piece of a line
+    within one pixel adds what is between it and the picture's right side.
     """
     height, width = size
     added = np.zeros((height, width + 1))
@@ -401,9 +386,7 @@ def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.nd
 
 
 def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
-    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face.
-
-    Within a pixel, the lens is linear."""
+    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face."""
     camera, pose, options = scene.camera, scene.camera_from_target[image], scene.options
     lattice = np.column_stack([np.arange(SAMPLES), LATTICE * np.arange(SAMPLES)]) / SAMPLES
     moved = np.random.default_rng([options.seed, 2, image]).random((camera.height, camera.width, 2), np.float32)
@@ -415,7 +398,7 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
         corners = drawing.origin + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * extent
         xyz = camera_from_face @ np.pad(corners, ((0, 0), (0, 1)))
         middle = xyz.mean(0)
-        inward = _inward(face, camera_from_face)
+        inward = -face.outward * camera_from_face.rotation[:, 2]
         if inward @ middle <= 0 or (xyz[:, 2] <= 0).any():
             continue
         box = camera.project(xyz)
@@ -430,15 +413,16 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
         start = -camera_from_face.rotation.T @ camera_from_face.translation
         light = 0.75 + 0.25 * float(inward @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
         for part, point in zip(total, lattice, strict=True):
-            offset = (point + moved[rows, columns]) % 1 - 0.5
+            offset = (point + moved[rows, columns]) % 1 - 0.5  # within a pixel, the lens is linear
             ray = ideal + offset[..., :1] * along[0] + offset[..., 1:] * along[1]
             rays = np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2) @ camera_from_face.rotation
-            depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
+            towards = np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
+            depth = -start[2] / towards
             at = start[:2] + depth[..., None] * rays[..., :2]
             place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
             if drawing.bend is not None:
                 bend = cv2.remap(drawing.bend, place[..., 0], place[..., 1], cv2.INTER_LINEAR)
-                at += (bend / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9))[..., None] * rays[..., :2]
+                at += (bend / towards)[..., None] * rays[..., :2]
                 place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
             inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
             value, solid = (

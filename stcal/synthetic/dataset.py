@@ -86,11 +86,8 @@ class TruthFile(ResultFile):
     def of(cls, scene: Scene, image_format: str = "jpg", options: RenderOptions | None = None) -> "TruthFile":
         """Returns the truth of a scene, with images named by :func:`image_name`."""
         options = options or RenderOptions()
-        optics: dict[str, Any] = {}
-        if options.lens is not None:
-            optics["lens"] = TrueLens(**asdict(options.lens))
-        if options.rim_mm:
-            optics["rim_mm"] = options.rim_mm
+        lens = {} if options.lens is None else {"lens": TrueLens(**asdict(options.lens))}
+        optics: dict[str, Any] = lens | ({"rim_mm": options.rim_mm} if options.rim_mm else {})
         truth = cls(
             unit="mm",
             reference_face=scene.reference_face,
@@ -161,10 +158,7 @@ def render_all(
     check_lens(scene, options.lens)
     views = [(name, i) for name, group in scene.groups.items() for i in range(len(group.camera_from_target))]
     rendered = dict(run_parallel(render, [(scene, *view, options) for view in views], workers))
-    images: dict[str, list[np.ndarray]] = {name: [] for name in scene.groups}
-    for k, (name, _) in enumerate(views):
-        images[name].append(rendered[k])
-    return images
+    return {name: [rendered[k] for k, (group, _) in enumerate(views) if group == name] for name in scene.groups}
 
 
 IMAGE_FORMATS = ("jpg", "png")

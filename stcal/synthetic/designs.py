@@ -144,9 +144,6 @@ def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int, face
     """Return a body of tags by its width between opposite faces, mm, which may be a text.
 
     ``faces`` : ids of the faces that it is to have, such as ``1,2,3,4,5``; all of them if empty.
-
-    Raises InputError: the width is not a number above 0, the dictionary or an id in it does not exist, or a face does
-    not, or fewer than two remain.
     """
     width, count = width_of(size), 6 if kind == "cube" else 12
     family = known_tags([(dictionary, first_id + face) for face in range(count)], "--tags, --dictionary")[0][0]
@@ -184,27 +181,18 @@ def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
     tag_px = tag_mm / distance_mm * float(np.sqrt(camera.focal.prod()))
     tags = [tag for each in target.with_faces(printed=True).faces for tag in tags_on(each.printed)]
     cells = dictionary_of(tags[0][0]).markerSize + 2
-    lines = [
+    text = (
         f"{len(target.faces)} faces, tags {tags[0][1]} to {tags[-1][1]} of {tags[0][0]}, {tag_mm:g} mm; "
         f"{tag_px:.0f} px at {distance_mm:g} mm, {tag_px / cells:.1f} px a cell"
-    ]
-    if tag_px < 2 * MIN_CELL_PX * cells:
-        nearest = distance_mm * tag_px / (2 * MIN_CELL_PX * cells)
-        lines.append(
-            f"warning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm or nearer"
-        )
-    return "\n".join(lines)
+    )
+    nearest = distance_mm * tag_px / (2 * MIN_CELL_PX * cells)
+    tilted = (
+        f"\nwarning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm or nearer"
+    )
+    return text + tilted * (nearest < distance_mm)
 
 
-def _body(
-    name: str,
-    normals: np.ndarray,
-    distance_mm: float,
-    tag_mm: float,
-    dictionary: str,
-    first_id: int,
-    size_sigma_mm: float,
-) -> TargetDesign:
+def _body(name, normals: np.ndarray, distance_mm, tag_mm, dictionary, first_id: int, size_sigma_mm) -> TargetDesign:
     """Return a body of faces with these outward normals (n, 3), all at one distance from its middle."""
     tag_mm = float(np.round(tag_mm, 3))
     corners = tag_mm / 2 * np.array([[[-1, -1], [1, -1], [1, 1], [-1, 1]]], float)
@@ -216,15 +204,8 @@ def _body(
         x /= np.linalg.norm(x)
         pose = Rigid(np.column_stack([x, np.cross(z, x), z]), distance_mm * normal)
         layout = TagLayout(((dictionary, first_id + k),), corners, TAG_SIGMA_MM)
-        face = printed_face(
-            str(k + 1),
-            layout,
-            TAG_SIGMA_MM,
-            size_sigma_mm,
-            rough_target_from_face=pose,
-            outline_mm=_outline(k, normals, distance_mm, pose),
-        )
-        faces.append(face)
+        more = {"rough_target_from_face": pose, "outline_mm": _outline(k, normals, distance_mm, pose)}
+        faces.append(printed_face(str(k + 1), layout, TAG_SIGMA_MM, size_sigma_mm, **more))
     return TargetDesign(name, "bright", tuple(faces))
 
 

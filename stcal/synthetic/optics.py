@@ -99,31 +99,21 @@ def blur_evenly(picture: np.ndarray, radius_px: float) -> np.ndarray:
 
 
 def defocused(
-    shares: list[np.ndarray],
-    planes: list[np.ndarray],
-    normal: np.ndarray,
-    corner_px: tuple[int, int],
+    shares: list[np.ndarray],  # (h, w), sharp image of each outline, by squares of which ``cells`` make a pixel's side
+    planes: list[np.ndarray],  # (3,), a point of each plane near the disc, camera frame, mm
+    normal: np.ndarray,  # (3,) of the planes, camera frame
+    corner_px: tuple[int, int],  # pixel (x, y) in the corner of the images
     cells: int,
     camera: Camera,
     lens: ThinLens,
-    blur_px: float,
-    light: np.ndarray | None = None,
+    blur_px: float,  # σ of the Gaussian blur that follows, which decides how many points of the lens are taken
+    light: np.ndarray | None = None,  # (h, w) of the disc on the last plane; even if None
 ) -> np.ndarray:
     """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens.
 
     Parallel planes hold one outline each, and a ray is seen that lies in all of them. Through a point p of the lens
     each plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z). On a plane 1/Z is linear in the image, with a
     gradient g, so that the movement is an affine map: what is seen at y was at y − p (1/z_f − 1/Z(y)) / (1 − g p).
-
-    Parameters
-    ----------
-    shares : list of (h, w) arrays; sharp image of each outline, by squares of which ``cells`` make a pixel's side
-    planes : list of (3,) arrays; a point of each plane, near the disc, camera frame, mm
-    normal : (3,) normal of the planes, camera frame
-    corner_px : pixel (x, y) in the corner of the images
-    blur_px : σ of the Gaussian blur that follows, which decides how many points of the lens are taken
-    light : (h, w) light of the disc on the last plane; even if None
-
     The lens distortion is taken as linear across the disc: off by less than 1e-3 of the circle of confusion.
     """
     widest = max(float(lens.confusion_px(camera, point[2])) for point in planes)
@@ -162,25 +152,8 @@ DARKEST = 1e-3
 """Least grey value, as a share of white. The photograph holds no information below."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sensor:
-    """Sensor of a camera.
-
-    ``gamma`` : the response is light to the power of 1/gamma; ``full_well`` : electrons at full scale, whose shot noise
-    is the root of their number; ``read_noise`` : read noise in electrons; ``bits`` : 8 or 16.
-    """
-
-    gamma: float = 1.0
-    full_well: float = 10_000.0
-    read_noise: float = 8.0
-    bits: int = 8
-
-    def __post_init__(self):
-        if self.gamma <= 0 or self.full_well <= 0 or self.read_noise < 0 or self.bits not in (8, 16):
-            raise InputError(
-                "E-SIMULATE-OPTIONS",
-                "sensor: gamma and full well positive, read noise not negative, 8 or 16 bits needed",
-            )
+FULL_WELL, READ_NOISE = 10_000.0, 8.0
+"""Electrons of a sensor at full scale, whose shot noise is the root of their number, and read noise in electrons."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,11 +174,7 @@ class Light:
 
 
 def expose(
-    photograph: np.ndarray,
-    times: Sequence[float],
-    sensor: Sensor | None = None,
-    light: Light | None = None,
-    seed: int = 0,
+    photograph: np.ndarray, times: Sequence[float], light: Light | None = None, seed: int = 0
 ) -> list[np.ndarray]:
     """Exposes the scene of an 8-bit photograph (height, width) at other times; time 1 keeps its brightness.
 
@@ -217,19 +186,14 @@ def expose(
         )
     if not all(time > 0 for time in times):
         raise InputError("E-EXPOSURES-VALUE", "exposure times: positive numbers needed")
-    sensor, light = sensor or Sensor(), light or Light()
-    rng = np.random.default_rng(seed)
+    rng, exposures = np.random.default_rng(seed), []
     # The light within one grey level is unknown. It is spread evenly, or a darker exposure would show the levels.
     grey = (photograph + rng.random(photograph.shape, np.float32)) / np.float32(256)
-    scene = lit(np.maximum(grey, DARKEST) ** np.float32(sensor.gamma), light)
-    top = 2**sensor.bits - 1
-    exposures = []
+    scene = lit(np.maximum(grey, np.float32(DARKEST)), light or Light())
     for time in times:
-        electrons = scene * np.float32(time * sensor.full_well)
-        noise = np.sqrt(electrons + np.float32(sensor.read_noise**2)) * rng.standard_normal(scene.shape, np.float32)
-        share = np.clip((electrons + noise) / np.float32(sensor.full_well), 0, 1)
-        value = np.rint(top * share ** np.float32(1 / sensor.gamma))
-        exposures.append(value.astype(np.uint8 if sensor.bits == 8 else np.uint16))
+        electrons = scene * np.float32(time * FULL_WELL)
+        noise = np.sqrt(electrons + np.float32(READ_NOISE**2)) * rng.standard_normal(scene.shape, np.float32)
+        exposures.append(np.rint(255 * np.clip((electrons + noise) / np.float32(FULL_WELL), 0, 1)).astype(np.uint8))
     return exposures
 
 

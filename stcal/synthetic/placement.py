@@ -195,15 +195,10 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     direction = np.array([np.cos(angle), np.sin(angle)])
     found = np.zeros(len(a), bool)
     for at in range(0, len(a), AT_ONCE):
-        (low_a, high_a), (low_b, high_b) = (_extent(points[at : at + AT_ONCE], direction) for points in (a, b))
+        along = [np.swapaxes(points[at : at + AT_ONCE], 0, 1) @ direction for points in (a, b)]
+        (low_a, low_b), (high_a, high_b) = ([axis(each, 0) for each in along] for axis in (np.min, np.max))
         found[at : at + AT_ONCE] = (np.maximum(low_b - high_a, low_a - high_b) > BODY_GAP).any(1)
     return found
-
-
-def _extent(points: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the smallest and largest coordinates (n, d) of point sets (n, k, 2) along directions (2, d)."""
-    along = np.swapaxes(points, 0, 1) @ direction  # reductions along the first axis are far faster
-    return along.min(0), along.max(0)
 
 
 def _farthest(directions: np.ndarray, count: int) -> np.ndarray:

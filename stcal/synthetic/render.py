@@ -1,7 +1,7 @@
 """Synthesis of photographs of a scene: circles by exact area coverage, rims, lens blur, vignetting, background."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.synthetic.optics import SHARP_PX, WIDEST_PX, ThinLens, blur_evenly, defocused
-from stcal.synthetic.scene import Group, ImageCircles, Scene, image_circles, rim_points, together
+from stcal.synthetic.scene import Group, ImageCircles, Scene, image_circles, rim_points
 
 WALL_BEHIND_MM = 350.0
 WALL_CELL_MM = 35.0
@@ -59,17 +59,14 @@ def draw_background(
     lens: ThinLens | None = None,
     reflectance: float | None = None,
 ) -> np.ndarray:
-    """Draws the image without the circles, (height, width) uint8.
+    """Draws the image without the circles, (height, width) uint8; all images of a group show the same scenery.
 
-    The scenery belongs to the group: all images of the group show the same scenery from different places. A thin lens
-    blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs. A table of the
-    given ``reflectance`` shows target and board as a mirror below them does.
+    A thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs.
     """
     g, look = scene.groups[group], look_of(scene.target.polarity)
     painter = _Painter(scene.camera, g.camera_from_target[image], look.wall)
     if clutter:
-        names = list(scene.groups)
-        rng = np.random.default_rng([scene.seed, scenery_seed, names.index(group)])
+        rng = np.random.default_rng([scene.seed, scenery_seed, list(scene.groups).index(group)])
         wall = _wall(scene, g, rng)
         _draw_checker(painter, wall, look)
         _draw_lamps(painter, wall, look, rng)
@@ -78,24 +75,19 @@ def draw_background(
     outlines = [*(scene.face_outline(face) for face in g.faces), scene.board_outline(group)]
     near_px = 0.0
     if lens is not None:
-        near_px = float(
-            lens.confusion_px(scene.camera, (painter.camera_from_target @ np.vstack(outlines))[:, 2].mean())
-        )
-    if lens is not None and clutter:
-        far_px = float(lens.confusion_px(scene.camera, (painter.camera_from_target @ wall.translation)[2]))
-        # Once more blurred with the target, the wall has the variance of its own circle of confusion.
-        painter.canvas[:] = blur_evenly(painter.canvas, float(np.sqrt(max(far_px**2 - near_px**2, 0))))
+        middle_mm = (painter.camera_from_target @ np.vstack(outlines))[:, 2].mean()
+        near_px = float(lens.confusion_px(scene.camera, middle_mm))
+        if clutter:
+            far_px = float(lens.confusion_px(scene.camera, (painter.camera_from_target @ wall.translation)[2]))
+            # Once more blurred with the target, the wall has the variance of its own circle of confusion.
+            painter.canvas[:] = blur_evenly(painter.canvas, float(np.sqrt(max(far_px**2 - near_px**2, 0))))
     _draw_body(painter, scene, look)
     painter.polygons(_edges(scene.board_outline(group)), look_of(scene.board.polarity).plate)
     return blur_evenly(painter.canvas, near_px)
 
 
 class _Painter:
-    """Canvas in the image of a camera, for polygons in the target frame, perhaps as a mirror shows them.
-
-    ``centre`` : where the eye stands, target frame: the camera's centre, or its mirror image. ``mirror`` : unit normal
-    and distance of the mirror from the origin. ``tone`` : the canvas's grey level of a thing's.
-    """
+    """Canvas in the image of a camera, for polygons in the target frame, perhaps as a mirror shows them."""
 
     def __init__(
         self,
@@ -103,12 +95,13 @@ class _Painter:
         camera_from_target: Rigid,
         level: float,
         canvas: np.ndarray | None = None,
-        mirror: tuple[np.ndarray, float] | None = None,
-        tone: Callable[[float], float] = lambda level: level,
+        mirror: tuple[np.ndarray, float] | None = None,  # unit normal, and distance from the origin
+        tone: Callable[[float], float] = lambda level: level,  # the canvas's grey level of a thing's
     ):
         self.camera, self.camera_from_target = camera, camera_from_target
         self.canvas = np.full((camera.height, camera.width), round(level), np.uint8) if canvas is None else canvas
         self.mirror, self.tone = mirror, tone
+        # where the eye stands, target frame
         self.centre = self._mirrored(camera_from_target.inverse().translation)
 
     def _mirrored(self, xyz: np.ndarray) -> np.ndarray:
@@ -201,25 +194,19 @@ def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: fl
     at = (outlines @ up).min() - TABLE_BELOW_MM
     if painter.centre @ up <= at:
         return
-    own = look_of(scene.target.polarity).checker[1]
-    mirror = _Painter(
-        painter.camera,
-        painter.camera_from_target,
-        own,
-        canvas=painter.canvas,
-        mirror=(up, at),
-        tone=lambda level: own + share * (level - own),
-    )
-    board = scene.board
+    look, board, plate = look_of(scene.target.polarity), scene.board, look_of(scene.board.polarity)
+    own = look.checker[1]
+    view = painter.camera, painter.camera_from_target
+    mirror = _Painter(*view, own, painter.canvas, (up, at), lambda level: own + share * (level - own))
     if whole:
-        _draw_body(mirror, scene, look_of(scene.target.polarity))
+        _draw_body(mirror, scene, look)
     for face in scene.target.faces:
-        normal, level = scene.target_from_face[face.id].rotation[:, 2], look_of(scene.target.polarity).circle
-        mirror.circles(scene.face_circles(face.id), normal, face.radius_mm, level)
+        normal = scene.target_from_face[face.id].rotation[:, 2]
+        mirror.circles(scene.face_circles(face.id), normal, face.radius_mm, look.circle)
     if whole:
-        mirror.polygons(_edges(scene.board_outline(g.name)), look_of(board.polarity).plate)
+        mirror.polygons(_edges(scene.board_outline(g.name)), plate.plate)
     normal = -g.target_from_board.rotation[:, 2]
-    mirror.circles(g.board_circles_target, normal, board.radii_mm(), look_of(board.polarity).circle)
+    mirror.circles(g.board_circles_target, normal, board.radii_mm(), plate.circle)
 
 
 def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
@@ -360,7 +347,9 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     if holes.any():
         # The light of a hole is that of the plate in place of its dot's; circles are added to the plate's.
         plate = look_of(scene.board.polarity).plate
-        circles = together(circles, circles.select(holes).smaller(HOLE_SHARE))
+        every = circles.rows(np.append(np.arange(len(base)), np.flatnonzero(holes)))
+        radius_mm = np.append(circles.radius_mm, HOLE_SHARE * circles.radius_mm[holes])
+        circles = replace(every, radius_mm=radius_mm)
         levels = np.append(levels, 2 * plate - levels[holes])
         rim_mm = np.append(rim_mm, np.minimum(rim_mm[holes], 0))
     turn = scene.groups[group].camera_from_target[image].rotation

@@ -1,8 +1,8 @@
 """Scenes of a target and a board before a camera, perspective or wide, and observations without rendered pixels."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from itertools import combinations, compress
+from itertools import combinations
 
 import numpy as np
 
@@ -85,18 +85,8 @@ class SceneOptions:
     body_seed: int | None = None
 
     def __post_init__(self):
-        require_fields(
-            self,
-            "scene",
-            seed=0,
-            body_seed=0,
-            focal_px=1,
-            centre_sigma=0,
-            circle_sigma_mm=0,
-            face_shift_mm=0,
-            face_turn_deg=0,
-            margin_mm=0,
-        )
+        zero = dict.fromkeys(("seed", "body_seed", "centre_sigma", "circle_sigma_mm", "face_shift_mm"), 0)
+        require_fields(self, "scene", **zero, focal_px=1, face_turn_deg=0, margin_mm=0)
         for name in ("width", "height", "images_per_group", "distance_mm", "spread_deg"):
             if getattr(self, name) <= 0:
                 raise InputError("E-SIMULATE-OPTIONS", f"scene: {name} {getattr(self, name)}, a positive number needed")
@@ -112,19 +102,14 @@ class SceneOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Group of photographs between which only the camera moves.
-
-    ``faces`` : faces that the group shows, two in a scene of :func:`make_scene`; ``axes`` : (3, 3) rows right, up,
-    towards the camera of the middle view, target frame; ``board_circles_target`` : (n, 3) mm, row-major;
-    ``camera_from_target`` : one pose per image.
-    """
+    """Group of photographs between which only the camera moves."""
 
     name: str
-    faces: tuple[str, ...]
-    axes: np.ndarray
+    faces: tuple[str, ...]  # that the group shows, two in a scene of :func:`make_scene`
+    axes: np.ndarray  # (3, 3) rows right, up, towards the camera of the middle view, target frame
     target_from_board: Rigid
-    board_circles_target: np.ndarray
-    camera_from_target: tuple[Rigid, ...]
+    board_circles_target: np.ndarray  # (n, 3) mm, row-major
+    camera_from_target: tuple[Rigid, ...]  # by image
 
     def __post_init__(self):
         freeze(self, "axes", (3, 3), "axes")
@@ -231,8 +216,8 @@ def make_scene(
         scene = make_scene(seen_by(options, model), target, board, nominal)
         return replace(scene, camera=model.calibrated(0, 0))
     if options.fisheye_deg is not None:
-        perspective = replace(wide_options(options), fisheye_deg=None)
-        return seen_wide(make_scene(perspective, target, board, nominal), options.fisheye_deg, options.seed)
+        perspective = replace(options, focal_px=PLACED_FOCAL * options.width, fisheye_deg=None)
+        return _seen_wide(make_scene(perspective, target, board, nominal), options.fisheye_deg, options.seed)
     target, board = target or reference_target(), board or reference_board()
     nominal = nominal or target.rough_poses()
     missing = [face.id for face in target.faces if face.id not in nominal]
@@ -254,10 +239,7 @@ def make_scene(
 
 
 def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
-    """Returns options that place views for the camera of a file, which must state its image size.
-
-    Size and focal length come from the file, and the distortion too unless the lens is equidistant.
-    """
+    """Returns options that place views for the camera of a file, which must state its image size."""
     focal_px = float(np.sqrt(file.focal.prod()))
     distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
     return replace(options, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
@@ -308,9 +290,8 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
     visible_pairs = [
         (a, b) for a, b in pairs if np.cos(np.radians(120)) <= normal[a] @ normal[b] <= np.cos(np.radians(20))
     ]
-    if set(target_from_face) == {face for pair in REFERENCE_GROUPS for face in pair} and set(REFERENCE_GROUPS) <= {
-        *visible_pairs
-    }:
+    is_reference = set(target_from_face) == {face for pair in REFERENCE_GROUPS for face in pair}
+    if is_reference and set(REFERENCE_GROUPS) <= set(visible_pairs):
         return list(REFERENCE_GROUPS)
     if not visible_pairs:
         raise DegenerateError(
@@ -395,18 +376,10 @@ PAST = (0.42, 0.24)
 """Largest turn of the axis away from the target, to either side and up or down, as a share of half the field."""
 
 
-def wide_options(options: SceneOptions) -> SceneOptions:
-    """Returns the options by which the views are placed."""
-    return replace(options, focal_px=PLACED_FOCAL * options.width)
+def _seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
+    """Returns the scene with cameras of COLMAP's OPENCV_FISHEYE at the same places, turned at random.
 
-
-def seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
-    """Returns the scene with turned cameras whose lens covers ``field_deg`` over the image's diagonal.
-
-    Target, boards and camera centres stay the same. The camera model is COLMAP's OPENCV_FISHEYE.
-
-    ``scene`` : scene made with :func:`wide_options`; ``field_deg`` : field of view over the diagonal, without
-    distortion; ``seed`` : seed of the random turns.
+    ``field_deg`` : field of view over the image's diagonal, without distortion.
     """
     original, rng = scene.camera, np.random.default_rng([seed, 9])
     half = np.radians(field_deg) / 2
@@ -433,51 +406,20 @@ NEAR_BORDER = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCircles:
-    """True values of the circles that one image shows; camera frame, mm.
-
-    ``labels`` : n labels; ``xyz_camera``, ``normal_camera`` : (n, 3), normals towards the camera; ``radius_mm`` :
-    (n,); ``tilt_rad`` : (n,) angle between normal and line of sight; ``centre_px`` : (n, 2) image of the circle's
-    centre; ``must_find`` : (n,) bool, True for circles of the group's faces or the board with a tilt up to 70° that lie
-    completely in the image.
-    """
+    """True values of the n circles that one image shows; camera frame, mm."""
 
     labels: tuple[Label, ...]
-    xyz_camera: np.ndarray
-    normal_camera: np.ndarray
+    xyz_camera: np.ndarray  # (n, 3)
+    normal_camera: np.ndarray  # (n, 3) towards the camera
     radius_mm: np.ndarray
-    tilt_rad: np.ndarray
-    centre_px: np.ndarray
-    must_find: np.ndarray
+    tilt_rad: np.ndarray  # between normal and line of sight
+    centre_px: np.ndarray  # (n, 2) image of the circle's centre
+    must_find: np.ndarray  # True for circles of the group's faces or the board, tilted up to 70°, whole in the image
 
-    def __post_init__(self):
-        n = len(self.labels)
-        for name, shape in {
-            "xyz_camera": (n, 3),
-            "normal_camera": (n, 3),
-            "radius_mm": (n,),
-            "tilt_rad": (n,),
-            "centre_px": (n, 2),
-        }.items():
-            freeze(self, name, shape, name)
-        freeze(self, "must_find", (n,), "must_find", bool)
-
-    def select(self, rows: np.ndarray) -> "ImageCircles":
-        """Returns the circles of a mask (n,)."""
-        labels = tuple(label for label, own in zip(self.labels, rows, strict=True) if own)
-        return ImageCircles(labels, *(getattr(self, name)[rows] for name in _ARRAYS))
-
-    def smaller(self, share: float) -> "ImageCircles":
-        """Returns circles of this share of the radius at the same places."""
-        return replace(self, radius_mm=share * self.radius_mm)
-
-
-_ARRAYS = ("xyz_camera", "normal_camera", "radius_mm", "tilt_rad", "centre_px", "must_find")
-
-
-def together(first: ImageCircles, second: ImageCircles) -> ImageCircles:
-    """Returns the circles of both."""
-    arrays = (np.concatenate([getattr(first, name), getattr(second, name)]) for name in _ARRAYS)
-    return ImageCircles((*first.labels, *second.labels), *arrays)
+    def rows(self, index: np.ndarray) -> "ImageCircles":
+        """Returns the circles of a mask, or of indices."""
+        labels = [self.labels[i] for i in np.arange(len(self.labels))[index]]
+        return ImageCircles(tuple(labels), *(getattr(self, part.name)[index] for part in fields(self)[1:]))
 
 
 def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
@@ -507,15 +449,7 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     shown = (tilt <= MAX_SHOWN_TILT_RAD) & ((centre > -0.5) & (centre < size - 0.5)).all(1)
     whole = _whole(scene.camera, xyz, normal, radius, centre)
     findable = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
-    return ImageCircles(
-        tuple(compress(labels, shown.tolist())),
-        xyz[shown],
-        normal[shown],
-        radius[shown],
-        tilt[shown],
-        centre[shown],
-        findable[shown],
-    )
+    return ImageCircles(tuple(labels), xyz, normal, radius, tilt, centre, findable).rows(shown)
 
 
 def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import POINT_MM, draw
-from stcal.drawing.parts import Disc, Line, Text, board_parts
+from stcal.drawing.parts import Disc, Line, Text, parts_of
 from stcal.drawing.sheets import (
     EDGE,
     FOOT,
@@ -82,7 +82,7 @@ def test_pages_of_a_pdf_have_the_size_of_the_paper(files):
 
 def test_sheets_cover_the_board_and_seams_run_between_dots():
     """Each dot is whole on a sheet, at its place against the others: a sheet's shift is that of all on it."""
-    (part,) = board_parts(reference_board(), 10.0)
+    (part,) = parts_of(reference_board(), 10.0)
     sheets = paper_sheets([part], "A5", "board")
     assert len(sheets) == 6
     place = {s.name: np.array([s.x, s.y]) for s in part.shapes if isinstance(s, Disc)}
@@ -125,12 +125,12 @@ def test_seams_leave_no_gap(taken):
 def test_the_lengths_to_check_are_said():
     """Between the outermost inner corners: of 9 × 6 squares of 12 mm 7 × 4. 8 × 5 inner corners of 12 mm make 9 × 6
     squares: 108 mm × 72 mm, and a square around."""
-    (part,) = board_parts(AprilGridDesign(3, 4, 20.0, 0.3, 2), 10.0)
+    (part,) = parts_of(AprilGridDesign(3, 4, 20.0, 0.3, 2), 10.0)
     assert {words for *_, words in part.spans} == {"20, step 26"}
-    (part,) = board_parts(CharucoDesign(6, 9, 12.0, 9.0, "DICT_4X4_50"), 10.0)
+    (part,) = parts_of(CharucoDesign(6, 9, 12.0, 9.0, "DICT_4X4_50"), 10.0)
     lengths = {words: high - low for _, low, high, words in part.spans}
     assert lengths == {"7 × 12 = 84": 84.0, "4 × 12 = 48": 48.0}
-    (part,) = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)
+    (part,) = parts_of(ChessboardDesign(5, 8, 12.0), 10.0)
     assert {"132", "96"} <= {shape.words for shape in framed(part) if isinstance(shape, Text)}
 
 

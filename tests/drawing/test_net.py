@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from stcal.design import TargetDesign, reference_target
-from stcal.drawing.draw import OWN, draw, net_text, sheets_of
-from stcal.drawing.net import _overlap, net_part
+from stcal.drawing.draw import draw, net_text
+from stcal.drawing.net import _is_clear, net_part
 from stcal.drawing.parts import Disc, Text
+from stcal.drawing.sheets import one_sheet
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -48,7 +49,7 @@ def test_a_box_is_one_net(target):
     part = net_part(target)
     assert set(circles_of(part)) == set(target.radius_of())
     plates = places_of(target, part)
-    assert not any(_overlap(a, b) for a, b in combinations(plates.values(), 2))
+    assert all(_is_clear(a, [b]) for a, b in combinations(plates.values(), 2))
     folds = [line for line in part.lines if line.layer == "FOLD"]
     tabs = [s.words for s in part.shapes if isinstance(s, Text) and s.words.startswith("under ")]
     assert len(tabs) == 4  # of eight edges that two plates share four hold the net together
@@ -70,7 +71,7 @@ def test_a_net_is_on_one_sheet(target, tmp_path):
         draw(target, tmp_path / "a3.pdf", paper="A3", net=True)
     large = tag_body("cube", 500.0, "DICT_APRILTAG_36h11", 0)
     drawn = draw(large, tmp_path / "large.pdf", net=True)
-    assert (drawn.paper, len(drawn.sheets)) == (OWN, 1)
+    assert (drawn.paper, len(drawn.sheets)) == ("own", 1)
     assert "larger than A0" in net_text(large)
 
 
@@ -95,7 +96,7 @@ def test_plates_meet_in_the_net_as_they_do_in_space(target):
 
 
 def test_all_faces_are_read_from_the_net(target):
-    (sheet,) = sheets_of([net_part(target)], OWN, "net", apart=True)
+    sheet = one_sheet([net_part(target)], "net")
     image = page_image(sheet)
     found = detect_image(image, camera_of(image), target, None, EllipseOptions())
     assert sorted(each.face for each in found.faces) == sorted(face.id for face in target.faces)
@@ -117,10 +118,10 @@ def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
 
 def test_plates_that_touch_do_not_overlap():
     square = np.array([[0.0, 0], [10, 0], [10, 10], [0, 10]])
-    assert not _overlap(square, square + np.array([10, 0]))
-    assert not _overlap(square, square + np.array([10, 10]))
-    assert _overlap(square, square + np.array([9.9, 3]))
-    assert _overlap(square, 0.1 * square + 4)
+    assert _is_clear(square, [square + np.array([10, 0])])
+    assert _is_clear(square, [square + np.array([10, 10])])
+    assert not _is_clear(square, [square + np.array([9.9, 3])])
+    assert not _is_clear(square, [0.1 * square + 4])
 
 
 def test_what_lacks_an_outline_or_a_place_is_refused(target, tmp_path):

@@ -7,8 +7,9 @@ from stcal.boards.chessboard import find_charuco, find_chessboard
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.tags import find_aprilgrid, find_tags
 from stcal.design import BoardDesign, TargetDesign, reference_target
-from stcal.drawing.draw import OWN, draw, sheets_of
-from stcal.drawing.parts import Area, Disc, board_parts, target_parts
+from stcal.drawing.draw import draw
+from stcal.drawing.parts import Area, Disc, parts_of
+from stcal.drawing.sheets import one_sheet
 from stcal.geometry.plane import apply_homography
 from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -59,7 +60,7 @@ def test_faces_are_read_back(target: TargetDesign, tmp_path):
 
 def test_dots_are_read_back():
     board = BoardDesign(5, 7, 12.0, 3.0, "bright", 0.005, (0, 6), 4.5)
-    (sheet,) = sheets_of(board_parts(board, 10.0), OWN, "board", apart=True)
+    sheet = one_sheet(parts_of(board, 10.0), "board")
     page = page_image(sheet)
     for image, rims, camera in seen_ways(page, rims_px(sheet, page)):
         detection = detect_image(image, camera, reference_target(), board, EllipseOptions())
@@ -95,8 +96,8 @@ BOARDS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("board", BOARDS.values(), ids=BOARDS)
 def test_squares_and_tags_are_read_back(board):
-    (part,) = board_parts(board, 10.0)
-    (sheet,) = sheets_of([part], OWN, "board", apart=True)
+    (part,) = parts_of(board, 10.0)
+    sheet = one_sheet([part], "board")
     page = page_image(sheet)
     for image, places, camera in seen_ways(page, {"": points_px(sheet, part, board, page)}):
         xy = places[""]
@@ -118,21 +119,21 @@ def test_squares_and_tags_are_read_back(board):
 
 def test_asymmetric_circles_lie_where_the_design_has_them():
     board = AsymmetricCirclesDesign(5, 4, 10.0, 3.0, "dark")
-    (part,) = board_parts(board, 10.0)
+    (part,) = parts_of(board, 10.0)
     places = np.array([[s.x, -s.y] for s in part.pattern() if isinstance(s, Disc)])
     np.testing.assert_allclose(places, board.xy_mm())
 
 
 def test_rings_have_their_holes():
     board = AsymmetricCirclesDesign(5, 4, 10.0, 3.0, "dark", rings=((0, 1), (3, 2)))
-    (part,) = board_parts(board, 10.0)
+    (part,) = parts_of(board, 10.0)
     holes = [s for s in part.pattern() if isinstance(s, Disc) and s.ink == "white"]
     np.testing.assert_allclose([[s.x, -s.y] for s in holes], board.xy_mm()[[1, 14]])
     assert [s.radius for s in holes] == [1.5, 1.5]
 
 
 def test_plates_have_their_margin():
-    for part, face in zip(target_parts(reference_target(), 7.0), reference_target().faces, strict=True):
+    for part, face in zip(parts_of(reference_target(), 7.0), reference_target().faces, strict=True):
         rims = face.xy_mm + np.array([[-1.0], [1.0]])[:, :, None] * face.radius_mm[:, None]
         np.testing.assert_allclose(part.outline.min(0), rims.min((0, 1)) - 7.0)
         np.testing.assert_allclose(part.outline.max(0), rims.max((0, 1)) + 7.0)

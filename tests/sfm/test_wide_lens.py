@@ -10,7 +10,7 @@ from stcal.sfm.camera.calibrate import calibrate_camera
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene, seen_wide, wide_options
+from stcal.synthetic.scene import SceneOptions, make_scene
 
 pytestmark = pytest.mark.slow
 FIELD_DEG = 150.0
@@ -19,8 +19,8 @@ FIELD_DEG = 150.0
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     folder = tmp_path_factory.mktemp("wide")
-    options = wide_options(SceneOptions(seed=3, width=1944, height=1296, images_per_group=6, distance_mm=450.0))
-    scene = seen_wide(make_scene(options), FIELD_DEG, 3)
+    options = SceneOptions(3, 1944, 1296, images_per_group=6, distance_mm=450.0, fisheye_deg=FIELD_DEG)
+    scene = make_scene(options)
     write_dataset(folder, scene, RenderOptions(seed=1), image_format="png")
     return scene, folder
 

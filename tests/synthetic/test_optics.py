@@ -12,7 +12,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.optics import ThinLens, blur_evenly
 from stcal.synthetic.render import RenderOptions, _add_circles, check_lens, render
-from stcal.synthetic.scene import ImageCircles, SceneOptions, image_circles, make_scene, seen_wide, wide_options
+from stcal.synthetic.scene import ImageCircles, SceneOptions, image_circles, make_scene
 from tests.outcome import fails_with, refuses
 
 OPTIONS = SceneOptions(seed=1, width=972, height=648, images_per_group=2, groups=(("1", "2"), ("1", "5")))
@@ -209,6 +209,6 @@ def test_refusals(scene):
     refuses("E-SIMULATE-OPTIONS … 20 mm … 24 mm", ThinLens, 4.0, 24.0, 20.0)
     refuses("E-FIELD-TYPE … rim_mm", RenderOptions, rim_mm=float("nan"))
     refuses("E-SIMULATE-OPTIONS … 100 mm … at most 20", check_lens, scene, ThinLens(2.0, 24.0, 100.0))
-    wide = wide_options(replace(OPTIONS, distance_mm=500, groups=(("1", "2"),)))
+    wide = make_scene(replace(OPTIONS, distance_mm=500, groups=(("1", "2"),), fisheye_deg=120.0))
     with fails_with("E-SIMULATE-OPTIONS … equidistant"):
-        check_lens(seen_wide(make_scene(wide), 120, 1), ThinLens(4.0, 24.0, 500.0))
+        check_lens(wide, ThinLens(4.0, 24.0, 500.0))

@@ -99,14 +99,11 @@ def correct_defocus(
     focal_px = float(np.sqrt(camera.focal.prod()))
     views = [_views_of(image, patterns, focal_px) for image in images]
     laws = _laws(views)
-    corrected, focus = [], []
-    for image, own, law in zip(images, views, laws, strict=True):
-        if law is None:
-            corrected.append(image)
-            continue
-        moved, shift_px = _moved(image, own, law, camera, focal_px) if law.significant else (image, 0.0)
-        corrected.append(moved)
-        focus.append(_focus(image.name, own, law, shift_px))
+    corrected, focus = list(images), []
+    for i, (image, own, law) in enumerate(zip(images, views, laws, strict=True)):
+        if law is not None:
+            corrected[i], shift_px = _moved(image, own, law, camera, focal_px) if law.significant else (image, 0.0)
+            focus.append(_focus(image.name, own, law, shift_px))
     return corrected, tuple(focus)
 
 
@@ -179,10 +176,8 @@ def _law(own: _Views, unit: float, curvature: tuple[float, float] | None = None)
     rows = np.stack([np.ones_like(u), u, u * u], axis=1)
     coefficients, inverse, scatter = _fitted(rows, own.blur2, curvature)
     plain = float(robust_sigma(np.abs(own.blur2 - np.median(own.blur2))))
-    residual, deviation = (
-        np.minimum(np.abs(r), 3 * max(s, 1e-12))
-        for r, s in ((own.blur2 - rows @ coefficients, scatter), (own.blur2 - np.median(own.blur2), plain))
-    )
+    residual = np.minimum(np.abs(own.blur2 - rows @ coefficients), 3 * max(scatter, 1e-12))
+    deviation = np.minimum(np.abs(own.blur2 - np.median(own.blur2)), 3 * max(plain, 1e-12))
     freedom = len(u) - 3
     gain = float((deviation**2).sum() - (residual**2).sum())
     significant = gain / 2 > ratio_limit(BY_CHANCE, 2, freedom) * float((residual**2).sum()) / freedom
@@ -243,9 +238,7 @@ def _focus(image: str, own: _Views, law: _Law, shift_px: float) -> Focus:
     odd = law.significant and law.coefficients[2] < -3 * np.sqrt(law.covariance[2, 2])
     note = ""
     if spread > TOLD_PX and (odd or law.scatter > MAX_UNEXPLAINED * law.plain):
-        note = (
-            f"blur varies by {spread:.1f} px among its circles, and depth does not explain it: motion, a curved "
-            "plane of focus or dirt on the lens; centres may be off by more than their σ"
-        )
+        why = "motion, a curved plane of focus or dirt on the lens; centres may be off by more than their σ"
+        note = f"blur varies by {spread:.1f} px among its circles, and depth does not explain it: {why}"
     focused = law.focused_mm() if law.significant else None
     return Focus(image, focused, (1 / float(near), 1 / float(far)), (float(ends[0]), float(ends[1])), shift_px, note)

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import combinations
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -42,7 +43,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 10
+CACHE_VERSION = 11
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 PHOTOGRAPHS = "the photographs"
@@ -55,6 +56,7 @@ SAME_SHARE = 0.6
 """Share of an image's circles that lie within the same squares of that side in another form of it; at a square's edge
 some change over."""
 
+P = TypeVar("P", Centres, FaceSighting, BoardSighting)
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
 """Type of functions that detect circles in one grey image."""
 
@@ -97,7 +99,7 @@ def detect_files(
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options, pictures)
-    jobs = [(file, camera, size_from, target, board, options, settings, detector, pictures) for file in files]
+    jobs = [(file, camera, size_from, (target, board, options), settings, detector, pictures) for file in files]
     outcomes: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
@@ -108,7 +110,14 @@ def detect_files(
             progress(file.name)
     for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers, kept=True):
         i = pending[k]
-        outcomes[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
+        if isinstance(outcome, Skipped):
+            outcomes[i] = outcome
+        else:  # saved in the cache and loaded from there
+            path = cache / f"{outcome[0]}.npz"
+            keep_packed(path, outcome[1])
+            outcomes[i] = _load(files[i], path, reused=False)
+            if outcomes[i] is None:
+                raise InputError("E-OUTPUT-READ-BACK", f"{path}: written, and cannot be read again; check the disk")
         if progress:
             progress(files[i].name)
     grouped = forms and board is not None and board.rows > 0  # a board moves between groups
@@ -144,32 +153,15 @@ def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera,
     return camera_model.sized(*size), MAJORITY
 
 
-def _fingerprint(
-    detector: Detector | None,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: EllipseOptions,
-    pictures: bool,
-) -> str:
+def _fingerprint(detector: Detector | None, camera: Camera, target, board, options, pictures: bool) -> str:
     """Returns a hash of everything that detection depends on except the image."""
-
-    def plain(value):
-        return value.tolist() if isinstance(value, np.ndarray) else str(value)
-
     dots = {key: value for key, value in asdict(board).items() if key != "stated"} if board else None
-    parts = [
-        CACHE_VERSION,
-        made_by(),
-        cv2.__version__,
-        {key: value for key, value in asdict(camera).items() if key not in ("colmap_model", "covariance")},
-        asdict(target.patterns_alone()),
-        dots,
-        asdict(options),
-    ]
+    lens = {key: value for key, value in asdict(camera).items() if key not in ("colmap_model", "covariance")}
+    parts = [CACHE_VERSION, made_by(), cv2.__version__, lens, asdict(target.patterns_alone()), dots, asdict(options)]
     parts += [detector.__name__] if detector else []
     parts += [] if pictures else ["no picture"]
-    return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
+    plain = json.dumps(parts, default=lambda each: getattr(each, "tolist", each.__str__)(), sort_keys=True)
+    return hashlib.sha256(plain.encode()).hexdigest()
 
 
 def _key(data: bytes, settings: str) -> tuple[str, str]:
@@ -187,15 +179,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
 
 
 def _detect_file(
-    file: ImageFile,
-    camera: Camera,
-    size_from: str,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: EllipseOptions,
-    settings: str,
-    detector: Detector | None,
-    pictures: bool,
+    file: ImageFile, camera: Camera, size_from: str, seen, settings: str, detector: Detector | None, pictures: bool
 ) -> tuple[str, bytes] | Skipped:
     """Detects circles in one file; returns the key of the result and its content for the cache."""
     loaded = load_image(file, camera, size_from)
@@ -203,22 +187,12 @@ def _detect_file(
         return loaded
     data, image = loaded
     try:
-        detection = (detector or detect_image)(image, camera, target, board, options)
+        detection = (detector or detect_image)(image, camera, *seen)
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
     picture, scale = thumbnail(grey_8bit(image)) if pictures else (np.zeros(0, np.uint8), 1.0)
     return key, _packed(detection, key, digest, picture, scale)
-
-
-def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedImage:
-    """Saves a result in the cache and loads it from there."""
-    path = cache / f"{key}.npz"
-    keep_packed(path, content)
-    found = _load(file, path, reused=False)
-    if found is None:
-        raise InputError("E-OUTPUT-READ-BACK", f"{path}: written, and cannot be read again; check the disk")
-    return found
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
@@ -237,74 +211,43 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     return data, image
 
 
+def _arrays(kind: str, *parts: Centres | FaceSighting | BoardSighting) -> dict[str, np.ndarray]:
+    """Returns the arrays of dataclasses of one type by name, for :func:`_part`."""
+    named = {f"{kind}_{i}_{f.name}": getattr(part, f.name) for i, part in enumerate(parts) for f in fields(part)}
+    return {name: value for name, value in named.items() if isinstance(value, np.ndarray)}
+
+
+def _part(stored, kind: str, i: int, make: type[P], *first: str) -> P:
+    """Returns part ``i`` of :func:`_arrays`, of the class ``make``; ``first`` : its fields that are no arrays."""
+    return make(*first, *(stored[f"{kind}_{i}_{f.name}"] for f in fields(make)[len(first) :]))  # type: ignore[arg-type]
+
+
 def _packed(detection: ImageDetection, key: str, digest: str, picture: np.ndarray, scale: float) -> bytes:
-    meta = {
-        "digest": digest,
-        "scale": scale,
-        "faces": [sighting.face for sighting in detection.faces],
-        "printed": [sighting.face for sighting in detection.printed],
-        "boards": len(detection.boards),
-        "open_faces": [[sighting.face for sighting in faces] for faces in detection.open_faces],
-        "mirrored": detection.mirrored,
-        "notes": detection.notes,
-        "candidates": detection.candidates,
-    }
-    arrays = _centre_arrays(detection.centres)
-    for i, face in enumerate(detection.faces):
-        arrays |= {f"face_rows_{i}": face.rows, f"face_circles_{i}": face.circles}
-    for i, face in enumerate(detection.printed):
-        arrays |= {f"printed_rows_{i}": face.rows, f"printed_corners_{i}": face.circles}
-    for i, faces in enumerate(detection.open_faces):
-        for k, face in enumerate(faces):
-            arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
-    for i, sighting in enumerate(detection.boards):
-        arrays |= {f"board_{f.name}_{i}": getattr(sighting, f.name) for f in fields(BoardSighting)}
-    return packed(key, {"thumbnail": picture, **arrays}, meta)
+    arrays = {"thumbnail": picture} | _arrays("centres", detection.centres) | _arrays("board", *detection.boards)
+    faces = (detection.faces, detection.printed, *detection.open_faces)
+    for k, sightings in enumerate(faces):
+        arrays |= _arrays(f"faces_{k}", *sightings)
+    meta = {name: getattr(detection, name) for name in ("mirrored", "notes", "candidates")}
+    meta |= {"digest": digest, "scale": scale, "boards": len(detection.boards)}
+    meta["faces"] = [[sighting.face for sighting in sightings] for sightings in faces]
+    return packed(key, arrays, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
     """Loads a cached result; None if there is none, or the file is not as it was saved."""
 
     def make(stored, meta) -> DetectedImage:
-        faces = [
-            FaceSighting(face, stored[f"face_rows_{i}"], stored[f"face_circles_{i}"])
-            for i, face in enumerate(meta["faces"])
-        ]
-        boards = [
-            BoardSighting(*(stored[f"board_{f.name}_{i}"] for f in fields(BoardSighting)))
-            for i in range(meta["boards"])
-        ]
-        open_faces = [
-            tuple(
-                FaceSighting(face, stored[f"open_rows_{i}_{k}"], stored[f"open_circles_{i}_{k}"])
-                for k, face in enumerate(names)
-            )
-            for i, names in enumerate(meta["open_faces"])
-        ]
-        detection = ImageDetection(
-            _stored_centres(stored),
-            tuple(faces),
-            tuple(boards),
-            tuple(meta["mirrored"]),
-            tuple(meta["notes"]),
-            meta["candidates"],
-            tuple(open_faces),
-            tuple(
-                FaceSighting(face, stored[f"printed_rows_{i}"], stored[f"printed_corners_{i}"])
-                for i, face in enumerate(meta["printed"])
-            ),
+        faces, printed, *open_faces = (
+            tuple(_part(stored, f"faces_{k}", i, FaceSighting, face) for i, face in enumerate(names))
+            for k, names in enumerate(meta["faces"])
         )
-        return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
+        boards = tuple(_part(stored, "board", i, BoardSighting) for i in range(meta["boards"]))
+        centres, mirrored, notes = _part(stored, "centres", 0, Centres), tuple(meta["mirrored"]), tuple(meta["notes"])
+        seen = faces, boards, mirrored, notes, meta["candidates"], tuple(open_faces), printed
+        picture = stored["thumbnail"].tobytes()
+        return DetectedImage(file, ImageDetection(centres, *seen), meta["digest"], picture, meta["scale"], reused)
 
     return kept(path, make)
-
-
-def _centre_arrays(centres: Centres) -> dict[str, np.ndarray]:
-    return {f.name: getattr(centres, f.name) for f in fields(Centres)}
-
-
-def _stored_centres(stored) -> Centres:
-    return Centres(*(stored[f.name] for f in fields(Centres)))
 
 
 def look_again(
@@ -328,7 +271,7 @@ def look_again(
             looks[image.file.name] = known
     for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
-            keep(paths[k], _centre_arrays(look.centres), {"labels": look.labels, "missed": look.missed})
+            keep(paths[k], _arrays("centres", look.centres), {"labels": look.labels, "missed": look.missed})
             looks[pending[k][0].name] = look
     return looks
 
@@ -344,20 +287,13 @@ def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, opt
 def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
-    try:
-        data = file.read()
-    except OSError:
-        return None
-    try:
-        image = decode(data, file.name, (camera.width, camera.height))
-    except InputError:
-        return None
-    return measure_predicted(image, camera, predicted, options)
+    loaded = load_image(file, camera, "")
+    return None if isinstance(loaded, Skipped) else measure_predicted(loaded[1], camera, predicted, options)
 
 
 def _stored_look(stored, meta) -> SecondLook:
     missed = {parse_label(label): reason for label, reason in meta["missed"].items()}
-    return SecondLook(parse_labels(meta["labels"]), _stored_centres(stored), missed)
+    return SecondLook(parse_labels(meta["labels"]), _part(stored, "centres", 0, Centres), missed)
 
 
 def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
@@ -368,9 +304,8 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
 def _without_copies(
     outcomes: list[DetectedImage | Skipped], forms: bool, grouped: bool
 ) -> tuple[list[DetectedImage], list[Skipped]]:
-    """Returns the images without copies of photographs, which add no information, and the files that are skipped. Of
-    equal content the plainest name stays, of several ``forms`` the lossless one; with ``grouped``, nothing tells which
-    of two groups a photograph is of."""
+    """Returns the images without copies of photographs, and the files that are skipped. Of equal content the plainest
+    name stays, of several ``forms`` the lossless one; if ``grouped``, none of a photograph that is in two groups."""
     if grouped:
         misplaced = _in_two_groups([outcome for outcome in outcomes if isinstance(outcome, DetectedImage)])
         outcomes = [misplaced.get(o.file.name, o) if isinstance(o, DetectedImage) else o for o in outcomes]
@@ -457,11 +392,7 @@ def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None
 def files_of_arrays(images: Mapping[str, Sequence[np.ndarray]], exclude: Sequence[str] = ()) -> ImageFiles:
     """Return images in memory as files that carry their content, named ``12/0.png``, ``12/1.png`` … by group.
 
-    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of images that are not
-    used.
-
-    Raises InputError: no image, an array that is none, or a name that leads out of a folder; and as for
-    :func:`stcal.io.images.chosen_images`.
+    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of those not used.
     """
     named = [(group, f"{group}/{k}.png", image) for group, arrays in images.items() for k, image in enumerate(arrays)]
     if not named:

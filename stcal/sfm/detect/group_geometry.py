@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
@@ -122,18 +123,14 @@ def across_groups(groups: Sequence[Arrangement], reach_mm: float) -> list[Arrang
 def _as_faces(group: Arrangement) -> list[Readings]:
     """Returns the faces of a group in the form of an image's readings, with a row for each observed circle."""
     views_of_plane: dict[str, list[PlaneView]] = {}
-    for views in group.views.values():
-        for view in views:
-            if view.plane != BOARD:
-                views_of_plane.setdefault(view.plane, []).append(view)
+    for view in chain.from_iterable(group.views.values()):
+        if view.plane != BOARD and view.plane in group.group_from_plane:
+            views_of_plane.setdefault(view.plane, []).append(view)
     faces = []
     for plane, views in views_of_plane.items():
-        if plane in group.group_from_plane:
-            rows = np.concatenate([view.rows for view in views])
-            first = max(views, key=lambda view: len(view.rows))
-            area = sum(view.area for view in views)
-            pose = group.group_from_plane[plane]
-            faces.append([replace(first, rows=rows, area=area, camera_from_plane=pose, named=True)])
+        first, area = max(views, key=lambda view: len(view.rows)), sum(view.area for view in views)
+        rows, pose = np.concatenate([view.rows for view in views]), group.group_from_plane[plane]
+        faces.append([replace(first, rows=rows, area=area, camera_from_plane=pose, named=True)])
     return faces
 
 
@@ -154,31 +151,20 @@ def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
 def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_mm: float) -> Arrangement:
     """Grows the arrangement from one image to all images that share planes with placed ones."""
     known = {view.plane: Rigid()}
+    others = [views for views in images[seed] if not any(each is view for each in views)]
+    alternatives = sum(map(len, images[seed])) - sum(map(len, others))
     # If the numbering of the first image is a convention, the board alone cannot place another image.
-    by_convention = view.plane == BOARD and len(_same_circles(images[seed], view)) > 1
+    by_convention = view.plane == BOARD and alternatives > 1
     while True:
         placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
-        placed[seed] = _with_seed(images[seed], view, known, reach_mm)
+        pose = view.camera_from_plane @ known[view.plane].inverse()
+        placed[seed] = pose, [view, *_agreeing(others, pose, known, reach_mm, {view.plane})[0]]
         new = _new_planes(images, placed, known, reach_mm) or _agreed_plane(images, placed, known, reach_mm)
         if not new:
             break
         known |= new
     poses = {i: pose for i, (pose, _) in placed.items()}
     return Arrangement(known, poses, {i: tuple(views) for i, (_, views) in placed.items()})
-
-
-def _same_circles(readings: list[Readings], view: PlaneView) -> Readings:
-    return next(views for views in readings if any(each is view for each in views))
-
-
-def _with_seed(readings: list[Readings], view: PlaneView, known: dict[str, Rigid], reach_mm: float):
-    """Returns pose and readings of the first image, with the reading that the arrangement was started from."""
-    pose = view.camera_from_plane @ known[view.plane].inverse()
-    alternatives = _same_circles(readings, view)
-    others, _ = _agreeing(
-        [views for views in readings if views is not alternatives], pose, known, reach_mm, {view.plane}
-    )
-    return pose, [view, *others]
 
 
 def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
@@ -214,12 +200,10 @@ def _alike(pose: Rigid, other: Rigid, view: PlaneView, reach_mm: float) -> bool:
 
 def _agreeing(readings: list[Readings], camera_from_group: Rigid, known, reach_mm: float, taken: set[str]):
     """Returns the readings that agree with the arrangement, each plane once, and circles with several such readings."""
-    agreed, ambiguous = [], []
-    ranked = []
+    agreed, ambiguous, ranked = [], [], []
     for views in readings:
-        shifts = sorted(
-            ((_shift_mm(view, camera_from_group, known), k) for k, view in enumerate(views) if view.plane in known)
-        )
+        inside = [(k, view) for k, view in enumerate(views) if view.plane in known]
+        shifts = sorted((_shift_mm(view, camera_from_group, known), k) for k, view in inside)
         if not shifts or shifts[0][0] > reach_mm:
             continue
         if len(shifts) > 1 and shifts[1][0] < 2 * reach_mm:
@@ -257,9 +241,8 @@ def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rig
     """Plane that no image alone names, and its pose, if two images agree, and more than on any other; or {}."""
     ranked = []
     for plane, found in _unknown_planes(images, placed, known, named=False).items():
-        together = _together(found, reach_mm)
         by_image = np.array([i for i, _, _ in found])
-        support = [len(np.unique(by_image[row])) for row in together]
+        support = [len(np.unique(by_image[row])) for row in _together(found, reach_mm)]
         k = int(np.argmax(support))
         ranked.append((support[k], plane, found[k][2]))
     ranked.sort(key=lambda each: -each[0])
@@ -308,20 +291,20 @@ def _adjusted(arrangement: Arrangement, focal_px: float) -> Arrangement:
 def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: float) -> Arrangement:
     """Returns the arrangement with all readings compared with it, after its adjustment."""
     views, contradicted, unsettled = {}, {}, {}
+
+    def off_mm(view: PlaneView) -> float:
+        """Median distance of circles from their places in the arrangement, at the depth of these places."""
+        xyz = pose @ (found.group_from_plane[view.plane] @ view.xyz_mm())
+        return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
+
     for i, pose in found.camera_from_group.items():
         agreed, ambiguous = _agreeing(images[i], pose, found.group_from_plane, MAX_SHIFT_PITCHES * step_mm, set())
-        views[i] = tuple(v for v in agreed if _off_mm(v, pose, found.group_from_plane) < MAX_OFF_PITCHES * step_mm)
+        views[i] = tuple(v for v in agreed if off_mm(v) < MAX_OFF_PITCHES * step_mm)
         accepted_ids = [id(v) for v in views[i]]
         others = [r for r in images[i] if not any(id(v) in accepted_ids for v in r)]
         contradicted[i] = tuple(r for r in others if not any(r is each for each in ambiguous))
         unsettled[i] = tuple(ambiguous)
     return replace(found, views=views, contradicted=contradicted, open=unsettled)
-
-
-def _off_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) -> float:
-    """Returns the median distance of circles from their places in the arrangement, at the depth of these places."""
-    xyz = camera_from_group @ (known[view.plane] @ view.xyz_mm())
-    return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
 
 
 HUBER_PX = 1.5
@@ -428,8 +411,7 @@ def outlying_circles(
     if not reasons:
         return arrangement, {}
     found: dict[int, dict[Label, str]] = {}
-    for k, reason in reasons.items():
-        image, label = circles.rows[k]
+    for (image, label), reason in ((circles.rows[k], reason) for k, reason in reasons.items()):
         found.setdefault(image, {})[label] = reason
     return arrangement.moved(circles.camera_from_group, circles.group_from_plane), found
 
@@ -445,21 +427,12 @@ class _Circles:
     group_from_plane: PoseStack
 
     @classmethod
-    def of(
-        cls,
-        arrangement: Arrangement,
-        images: Sequence[ImageObservations],
-        patterns: dict[str, Pattern],
-        focal_px: float,
-    ) -> "_Circles":
+    def of(cls, arrangement: Arrangement, images, patterns: dict[str, Pattern], focal_px: float) -> "_Circles":
+        """Returns the circles that the images show of planes of the arrangement."""
         names, planes = list(arrangement.camera_from_group), list(arrangement.group_from_plane)
-        design = {
-            label: (*xyz, radius)
-            for plane in planes
-            for label, xyz, radius in zip(
-                patterns[plane].labels, patterns[plane].xyz_mm(), patterns[plane].radius_mm, strict=True
-            )
-        }
+        design = {}
+        for pattern in (patterns[plane] for plane in planes):
+            design |= dict(zip(pattern.labels, np.column_stack([pattern.xyz_mm(), pattern.radius_mm]), strict=True))
         rows, columns = [], []
         for a, i in enumerate(names):
             sigma = images[i].sigma_px()
@@ -473,8 +446,10 @@ class _Circles:
         circles = cls(rows, bundle, table[:, 4], *arrangement.stacks())
         if not rows:
             return circles
-        seen = bundle.seen - circles._eccentricity_px(table[:, 8])
-        return replace(circles, bundle=replace(bundle, seen=seen))
+        rotation, xyz = circles._placed()
+        centre = circle_image_offset(xyz, rotation[:, :, 2], table[:, 8])
+        eccentricity_px = focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
+        return replace(circles, bundle=replace(bundle, seen=bundle.seen - eccentricity_px))
 
     def adjusted(self, keep: np.ndarray) -> "_Circles":
         """Returns the circles with poses adjusted to those to ``keep`` on planes with enough circles for a pose."""
@@ -491,10 +466,8 @@ class _Circles:
     def in_one_image(self) -> np.ndarray:
         """Returns the mask of the circles of faces that only one image shows."""
         image, plane = self.bundle.image, self.bundle.plane
-        images = [len(np.unique(image[plane == p])) for p in range(len(self.group_from_plane))]
-        return np.array(
-            [images[p] == 1 and label.plane != BOARD for p, (_, label) in zip(plane, self.rows, strict=True)]
-        )
+        images = np.array([len(np.unique(image[plane == p])) for p in range(len(self.group_from_plane))])
+        return (images[plane] == 1) & [label.plane != BOARD for _, label in self.rows]
 
     def off_px(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns centres minus their places, (n, 2) px, and derivatives (n, 2, 2) by the place in the plane, px/mm."""
@@ -507,11 +480,6 @@ class _Circles:
         camera, plane = self.camera_from_group[self.bundle.image], self.group_from_plane[self.bundle.plane]
         xyz = self.bundle.placed(self.group_from_plane, self.camera_from_group)[2]
         return camera.rotation @ plane.rotation, xyz
-
-    def _eccentricity_px(self, radius_mm: np.ndarray) -> np.ndarray:
-        rotation, xyz = self._placed()
-        centre = circle_image_offset(xyz, rotation[:, :, 2], radius_mm)
-        return self.bundle.focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
 
 
 def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
@@ -533,9 +501,7 @@ def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
         outlying[k] = not (apart_px < ALIKE * off_px[k]).any()
     for i, p in {(image[k], plane[k]) for k in np.flatnonzero(outlying)}:
         circles_of_face = np.flatnonzero(keep & (image == i) & (plane == p))
-        worst = circles_of_face[
-            np.argmax(np.where(outlying[circles_of_face], off_px[circles_of_face] / limit[circles_of_face], 0))
-        ]
+        worst = circles_of_face[np.argmax(np.where(outlying, off_px / limit, 0)[circles_of_face])]
         error = f"{off_px[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
         if alone[worst] and enough[worst]:
             why = f"{circles.rows[worst][1]} is {error}, and no other image of the group tells which circles are right"

@@ -7,7 +7,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from stcal.boards.design import BoardView, CornerBoard
+from stcal.boards.design import CornerBoard
 from stcal.boards.faces import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
@@ -59,12 +59,8 @@ def read_image(
     short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
     if short and not reading.untried:
         faint = replace(options, min_contrast=FAINT * options.min_contrast)
-        second_reading = _read_once(grey, camera, target, board, faint, aside)
-        better = (len(second_reading.boards) > 0, len(second_reading.face_ids())) > (
-            len(reading.boards) > 0,
-            len(reading.face_ids()),
-        )
-        return second_reading if better else reading
+        second = _read_once(grey, camera, target, board, faint, aside)
+        return max(reading, second, key=lambda each: (len(each.boards) > 0, len(each.face_ids())))
     return reading
 
 
@@ -77,7 +73,10 @@ def _read_once(
     aside: np.ndarray | None,
 ) -> ImageReading:
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
-    outlines: dict[Polarity, Ellipses] = {p: _outside(find_ellipses(grey, p, options), aside) for p in polarities}
+    outlines: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
+    for polarity, found in outlines.items() if aside is not None else ():
+        inside = [cv2.pointPolygonTest(aside.astype(np.float32), at, False) > 0 for at in found.centre_px.tolist()]
+        outlines[polarity] = found.select(~np.array(inside, bool))
     boards: list[BoardReading] = []
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
@@ -92,15 +91,6 @@ def _read_once(
     faces = finder.find(candidates)
     mirrored = finder.find_mirrored(candidates, faces.faces)
     return ImageReading(outlines, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses))
-
-
-def _outside(ellipses: Ellipses, polygon: np.ndarray | None) -> Ellipses:
-    """Returns the ellipses whose centres lie outside of a polygon (k, 2), px."""
-    if polygon is None:
-        return ellipses
-    outline = polygon.astype(np.float32)
-    inside = [cv2.pointPolygonTest(outline, centre, False) > 0 for centre in ellipses.centre_px.tolist()]
-    return ellipses.select(~np.array(inside, bool))
 
 
 def detect_target(
@@ -130,7 +120,12 @@ def detect_image(
     views, notes = find_on_faces(image, "", boards, camera)  # type: ignore[arg-type]
     detection = ImageDetection(_corners(np.zeros((0, 2)), np.zeros((0, 2, 2)), camera), ())
     if circles.faces or (board is not None and corners is None):
-        aside = None if corners is None or BOARD not in views else _outline_px(views[BOARD], corners)
+        aside = None
+        if corners is not None and BOARD in views:  # circles are searched outside of the board and a step about it
+            xy, view = corners.xy_mm(), views[BOARD]
+            (x0, y0), (x1, y1) = xy.min(0) - corners.pitch_mm, xy.max(0) + corners.pitch_mm
+            image_from_board = fit_homography(view.xyz_board[:, :2], view.xy_px)
+            aside = apply_homography(image_from_board, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
         detection = _detect_circles(image, camera, circles, None if corners else board, options, aside, dots)
     parts, sightings, board_sightings, first = [detection.centres], [], [*detection.boards], len(detection.centres)
     for face, view in views.items():
@@ -150,14 +145,6 @@ def detect_image(
         notes=(*detection.notes, *notes),
         candidates=detection.candidates + sum(len(sighting.rows) for sighting in board_sightings),
     )
-
-
-def _outline_px(view: BoardView, board: CornerBoard) -> np.ndarray:
-    """Returns the outline (4, 2), px, of a board of corners and a step about it, as one image shows it."""
-    xy = board.xy_mm()
-    (x0, y0), (x1, y1) = xy.min(0) - board.pitch_mm, xy.max(0) + board.pitch_mm
-    image_from_board = fit_homography(view.xyz_board[:, :2], view.xy_px)
-    return apply_homography(image_from_board, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
 
 
 def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> Centres:
@@ -188,7 +175,11 @@ def _detect_circles(
     for grid in boards:
         patterns.append(_Pattern(of_board, found.select(grid.candidates), [DOT] * len(grid.candidates)))
     measured = _measured(grey, camera, patterns, reading.found)
-    notes = [_untried_note(reading)] if reading.untried else []
+    notes: list[str] = []
+    if reading.untried:
+        every, tried = len(free) + reading.untried, f"the {len(free)} largest were tried for faces"
+        remedy = "keep fine patterns out of view, or raise --min-diameter"
+        notes.append(f"{every} outlines like circles beside the board, {tried}; {remedy}")
     for pattern, centres in zip(patterns, measured, strict=True):
         notes += [_rim_note(pattern.names[i], centres.rim[i]) for i in np.flatnonzero(~centres.ok).tolist()]
     ends = np.cumsum([0, *(int(centres.ok.sum()) for centres in measured)])
@@ -198,15 +189,17 @@ def _detect_circles(
     for face, (ok, rows) in zip(named, measured_rows[:first], strict=True):
         faces.append(FaceSighting(face.face.id, rows, np.flatnonzero(face.index >= 0)[ok]))
     for nameless, candidates, (ok, rows) in zip(refused, used, measured_rows[first:second], strict=True):
-        row = np.full(len(reading.free), -1)
+        row = np.full(len(reading.free), -1)  # of each candidate among the centres, −1 if it is not measured
         row[candidates[ok]] = rows
-        open_faces.append(tuple(_sighting(face, row) for face in nameless))
+        found_rows = [np.where(face.index >= 0, row[face.index], -1) for face in nameless]
+        circles = [np.flatnonzero(each >= 0) for each in found_rows]
+        sightings = zip(nameless, found_rows, circles, strict=True)
+        open_faces.append(tuple(FaceSighting(face.face.id, each[own], own) for face, each, own in sightings))
     for grid, (ok, rows) in zip(boards, measured_rows[second:], strict=True):
         board_sightings.append(BoardSighting(rows, grid.numberings[:, ok], grid.unlikely[:, ok]))
+    none = measure_centres(grey, camera, free.select(np.zeros(0, int)), free)
     return ImageDetection(
-        Centres.concatenate(
-            [centres.select(np.flatnonzero(centres.ok)) for centres in measured] or [_nothing(grey, camera, free)]
-        ),
+        Centres.concatenate([none, *(centres.select(np.flatnonzero(centres.ok)) for centres in measured)]),
         tuple(faces),
         tuple(board_sightings),
         tuple(face.face.id for face in reading.mirrored),
@@ -241,31 +234,12 @@ def _measured(
     return [measured[i] for i in range(len(patterns))]
 
 
-def _sighting(reading: FaceReading, row: np.ndarray) -> FaceSighting:
-    """Returns the sighting of a reading. ``row`` : index of each candidate among the centres, −1 if not measured."""
-    rows = np.where(reading.index >= 0, row[reading.index], -1)
-    circles = np.flatnonzero(rows >= 0)
-    return FaceSighting(reading.face.id, rows[circles], circles)
-
-
-def _nothing(image: np.ndarray, camera: Camera, ellipses: Ellipses) -> Centres:
-    return measure_centres(image, camera, ellipses.select(np.zeros(0, int)), ellipses)
-
-
 def _rim_note(label: Label | str, rim: float) -> str:
     if rim >= MIN_RIM:
         return f"{label}: σ of its centre is not determined, left out; check the distortion in the camera file"
     return (
         f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed; partly hidden or "
         "disturbed, left out"
-    )
-
-
-def _untried_note(reading: ImageReading) -> str:
-    tried = len(reading.free)
-    return (
-        f"{tried + reading.untried} outlines like circles beside the board, the {tried} largest "
-        "were tried for faces; keep fine patterns out of view, or raise --min-diameter"
     )
 
 

@@ -89,6 +89,11 @@ def labelled_image(
     return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))
 
 
+def unlabelled(name: str, group: str, detection: ImageDetection, *notes: str) -> LabelledImage:
+    """Returns the image without circles, with the notes of its detection and further ones."""
+    return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), [*detection.notes, *notes])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection(ByValue):
     """The labelled circles of one image.
@@ -169,12 +174,10 @@ def detect_circles(
     camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), body_of(target)
     board = None if board is None else run_board_of(board)
     found = detect_image(grey, camera, target, board, options or EllipseOptions())
-    circles = target.with_faces(printed=False)
-    focal_px = float(np.sqrt(camera.focal.prod()))
+    circles, labelled = target.with_faces(printed=False), unlabelled("image", "", found)
     if circles.faces or board is not None:
+        focal_px = float(np.sqrt(camera.focal.prod()))
         labelled = label_groups([[("image", "", found)]], circles, board, focal_px)[0][0][0]
-    else:
-        labelled = labelled_image("image", "", (), found.centres.select(np.zeros(0, int)), found.notes)
     sharp = without_defocus([_with_corners(labelled, found, target)], camera, patterns_of(target, board))[0]
     seen = sharp.observations
     return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
@@ -186,13 +189,10 @@ def without_defocus(
     """Returns the images with centres corrected for blur that varies across a circle, and what their blur shows."""
     corrected, focus = correct_defocus([image.observations for image in images], camera, patterns)
     by_name = {own.image: own for own in focus}
+    blurs = [by_name.get(observations.name) for observations in corrected]
     return [
-        LabelledImage(
-            observations,
-            (*image.notes, *([own.note] if (own := by_name.get(observations.name)) and own.note else [])),
-            own,
-        )
-        for image, observations in zip(images, corrected, strict=True)
+        LabelledImage(observations, (*image.notes, *([blur.note] if blur and blur.note else [])), blur)
+        for image, observations, blur in zip(images, corrected, blurs, strict=True)
     ]
 
 
@@ -218,11 +218,7 @@ def label_images(
     if circles.faces or board is not None:
         labelled = _label_circles(detection, circles, board, options, cache, workers)
     else:
-        labelled = [
-            labelled_image(name, group, (), found.centres.select(np.zeros(0, int)), found.notes)
-            for _, images in _groups(detection)
-            for name, group, found in images
-        ]
+        labelled = [unlabelled(*image) for _, images in _groups(detection) for image in images]
     by_name = {image.file.name: image.detection for image in detection.images}
     return [_with_corners(image, by_name[image.observations.name], target) for image in labelled]
 
@@ -243,19 +239,17 @@ def _label_circles(
     workers: int | None = None,
 ) -> list[LabelledImage]:
     """Returns the labelled circles of all images, in the order of their groups."""
-    camera = detection.camera
-    groups = _groups(detection)
-    board = in_scale([named for _, named in groups], target, board)
+    camera, groups = detection.camera, _groups(detection)
+    named, focal_px = [images for _, images in groups], float(np.sqrt(camera.focal.prod()))
+    board = in_scale(named, target, board)
     dots = None if isinstance(board, CornerBoard) else board  # corners are not searched at predicted places
     patterns = patterns_of(target, board)
     first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
-    focal_px = float(np.sqrt(camera.focal.prod()))
-    labelled_groups = label_groups([named for _, named in groups], target, board, focal_px)
-    for (members, _), (images_of_group, arrangement) in zip(groups, labelled_groups, strict=True):
-        images_of_group, arrangement = _without_outlying(images_of_group, arrangement, patterns, focal_px)
-        for i, (image, image_labels) in enumerate(zip(members, images_of_group, strict=True)):
-            seen = image_labels.observations
+    for (members, _), labelled in zip(groups, label_groups(named, target, board, focal_px), strict=True):
+        group, arrangement = _without_outlying(*labelled, patterns, focal_px)
+        for i, (image, labels) in enumerate(zip(members, group, strict=True)):
+            seen = labels.observations
             predicted, steep = (
                 predict_circles(arrangement, i, seen.labels, target, dots, camera, tilt)
                 for tilt in (MAX_TILT_RAD, STEEP_RAD)
@@ -263,17 +257,13 @@ def _label_circles(
             if predicted is None or steep is None:
                 continue
             wrong = contradictions(steep, seen, camera)
-            images_of_group[i] = image_labels.without(wrong, contradicted_notes(wrong))
+            group[i] = labels.without(wrong, contradicted_notes(wrong))
             if predicted.wanted.any():
                 jobs.append((image, predicted))
-        first_looks.append((images_of_group, arrangement))
+        first_looks.append((group, arrangement))
     looks = look_again(jobs, camera, options, cache, workers)
-    labelled_images = [
-        image_labels
-        for images_of_group, arrangement in first_looks
-        for image_labels in _without_outlying(_second(images_of_group, looks), arrangement, patterns, focal_px)[0]
-    ]
-    return without_defocus(labelled_images, camera, patterns)
+    second = [_without_outlying(_second(group, looks), known, patterns, focal_px)[0] for group, known in first_looks]
+    return without_defocus([image for group in second for image in group], camera, patterns)
 
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
@@ -308,10 +298,8 @@ def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[La
         look = looks.get(image.observations.name)
         images.append(image if look is None else image.plus(look.labels, look.centres, missed_notes(look.missed)))
     for face, found, expected in _unconfirmed(group, looks):
-        note = (
-            f"face {face}: read in one image of the group alone, {found} of {expected} of its circles found that other "
-            "images must show; left out, it is a reflection or another object, or hidden there"
-        )
+        read = f"face {face}: read in one image of the group alone, {found} of {expected} of its circles found"
+        note = f"{read} that other images must show; left out, it is a reflection or another object, or hidden there"
         for i, image in enumerate(images):
             labels_of_face = [label for label in image.observations.labels if label.plane == face]
             images[i] = image.without(labels_of_face, [note])
@@ -376,30 +364,20 @@ def label_groups(
     focal_px: float,
 ) -> list[tuple[list[LabelledImage], Arrangement]]:
     """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels."""
-    step = step_mm(target, board)
+    step, alone = step_mm(target, board), []
     readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
-    alone = [as_drawn(_arranged(own, step, focal_px), target.rough_poses()) for own in readings]
-    return [
-        (
-            [
-                _labelled(*image, likely_views(own), arrangement, i)
-                for i, (image, own) in enumerate(zip(images, readings_of_group, strict=True))
-            ],
-            arrangement,
-        )
-        for images, readings_of_group, arrangement in zip(
-            groups, readings, across_groups(alone, MAX_SHIFT_PITCHES * step), strict=True
-        )
-    ]
-
-
-def _arranged(readings: list[list[Readings]], step: float, focal_px: float) -> Arrangement:
-    """Returns the arrangement of one group. Readings with covered dots are used only if they explain more circles."""
-    likely = arrange([likely_views(each) for each in readings], step, focal_px)
-    if not any(likely.contradicted.values()):
-        return likely
-    every = arrange(readings, step, focal_px)
-    return every if every.explained() > likely.explained() else likely
+    likely = [[likely_views(own) for own in group] for group in readings]
+    for group, likely_ones in zip(readings, likely, strict=True):
+        found = arrange(likely_ones, step, focal_px)
+        if any(found.contradicted.values()):  # readings with covered dots must explain more circles
+            found = max(found, arrange(group, step, focal_px), key=Arrangement.explained)
+        alone.append(as_drawn(found, target.rough_poses()))
+    arrangements = across_groups(alone, MAX_SHIFT_PITCHES * step)
+    labelled = []
+    for images, views, arrangement in zip(groups, likely, arrangements, strict=True):
+        numbered = enumerate(zip(images, views, strict=True))
+        labelled.append(([_labelled(*image, own, arrangement, i) for i, (image, own) in numbered], arrangement))
+    return labelled
 
 
 def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
@@ -417,11 +395,9 @@ def _labelled(
     name: str, group: str, detection: ImageDetection, readings: list[Readings], arrangement: Arrangement, image: int
 ) -> LabelledImage:
     if detection.mirrored:
-        note = (
-            f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does; left out, turn it "
-            "back, or use the file that the camera wrote"
-        )
-        return labelled_image(name, group, (), detection.centres.select(np.zeros(0, int)), [*detection.notes, note])
+        shown = f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does"
+        remedy = "left out, turn it back, or use the file that the camera wrote"
+        return unlabelled(name, group, detection, f"{shown}; {remedy}")
     notes = [*detection.notes, *_repeated(detection)]
     if image in arrangement.views:
         views = list(arrangement.views[image])
@@ -429,7 +405,8 @@ def _labelled(
         notes += [_open(each) for each in arrangement.open.get(image, ())]
         notes += [_foreign(each) for each in arrangement.foreign.get(image, ())]
     else:
-        views = [each[0] for each in readings if len(each) == 1 and each[0].named and _once(each[0], readings)]
+        times = Counter(each[0].plane for each in readings if each[0].named)
+        views = [each[0] for each in readings if len(each) == 1 and each[0].named and times[each[0].plane] == 1]
         notes += [_open(each) for each in readings if len(each) > 1 or not each[0].named]
     labels = [label for view in views for label in view.labels]
     rows = np.concatenate([view.rows for view in views]) if views else np.zeros(0, int)
@@ -439,10 +416,6 @@ def _labelled(
 
 def _repeated(detection: ImageDetection) -> list[str]:
     return [f"{what} found more than once; left out, one may be a reflection" for what in detection.repeated]
-
-
-def _once(view: PlaneView, readings: list[Readings]) -> bool:
-    return sum(each[0].plane == view.plane for each in readings if each[0].named) == 1
 
 
 OF_A_BOARD = ("a board of ", "board of ")
@@ -491,34 +464,23 @@ UNNUMBERED = "left out, show the whole board, or a face with it"
 
 def is_board_alone(detection: DetectionResult) -> bool:
     """Returns whether no image has a face, and half of them too few outlines outside of boards for one."""
-    detections = [detection_of_image.detection for detection_of_image in detection.images]
-    if not any(detection_of_image.boards for detection_of_image in detections) or any(
-        detection_of_image.faces or detection_of_image.open_faces for detection_of_image in detections
-    ):
+    images = [image.detection for image in detection.images]
+    if not any(image.boards for image in images) or any(image.faces or image.open_faces for image in images):
         return False
-    outside_boards = [
-        detection_of_image.candidates - sum(len(board.rows) for board in detection_of_image.boards)
-        for detection_of_image in detections
-    ]
+    outside_boards = [image.candidates - sum(len(board.rows) for board in image.boards) for image in images]
     return float(np.median(outside_boards)) < MIN_EXPECTED
 
 
 def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
     """Returns the labelled dots of all images, in the order of their groups."""
-    found = [each for images, _ in _groups(detection) for each in _label_group(images, target, board)]
-    return without_defocus(found, detection.camera, patterns_of(target, board))
-
-
-def _label_group(images: list[DetectedImage], target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
-    views = [_views(image, target, board) for image in images]
-    chosen, reasons = _numbered(views)
-    found = []
-    for i, image in enumerate(images):
-        notes = [*image.detection.notes, *([reasons[i]] if i in reasons else [])]
-        labels, rows = (chosen[i].labels, chosen[i].rows) if i in chosen else ((), np.zeros(0, int))
-        centres = image.detection.centres.select(rows)
-        found.append(labelled_image(image.file.name, image.file.group, labels, centres, notes))
-    return found
+    labelled = []
+    for images, named in _groups(detection):
+        chosen, reasons = _numbered([_views(image, target, board) for image in images])
+        for i, (name, group, found) in enumerate(named):
+            notes = [*found.notes, *([reasons[i]] if i in reasons else [])]
+            labels, rows = (chosen[i].labels, chosen[i].rows) if i in chosen else ((), np.zeros(0, int))
+            labelled.append(labelled_image(name, group, labels, found.centres.select(rows), notes))
+    return without_defocus(labelled, detection.camera, patterns_of(target, board))
 
 
 def _views(image: DetectedImage, target: TargetDesign, board: BoardDesign) -> list[PlaneView] | str:
@@ -528,9 +490,8 @@ def _views(image: DetectedImage, target: TargetDesign, board: BoardDesign) -> li
     if image.detection.board is None:
         return "board found more than once; left out"
     readings = likely_views(readings_of(image.detection, target, board))
-    views = max(
-        (each for each in readings if each and each[0].plane == BOARD), key=lambda v: len(v[0].rows), default=[]
-    )
+    boards = [each for each in readings if each and each[0].plane == BOARD]
+    views = max(boards, key=lambda v: len(v[0].rows), default=[])
     if not views:
         return f"a board without a pose; {UNNUMBERED}"
     if not all(_is_symmetry(views[0].camera_from_plane.inverse() @ v.camera_from_plane, board) for v in views):
@@ -555,8 +516,9 @@ def _numbered(views: list[list[PlaneView] | str]) -> tuple[dict[int, PlaneView],
     first = max(open_images, key=lambda i: len(open_images[i][0].rows))
     numbered = {first: open_images.pop(first)[0]}
     while open_images:
+        known = [view.camera_from_plane.inverse() for view in numbered.values()]
         turns = {
-            (i, k): min(_turn_rad(view, other) for other in numbered.values())
+            (i, k): min((view.camera_from_plane @ other).angle_rad() for other in known)
             for i, numberings in open_images.items()
             for k, view in enumerate(numberings)
         }
@@ -564,14 +526,9 @@ def _numbered(views: list[list[PlaneView] | str]) -> tuple[dict[int, PlaneView],
         numberings = open_images.pop(i)
         rivals = [turns[i, m] for m in range(len(numberings)) if m != k]
         if rivals and min(rivals) - turns[i, k] < CLEAR_RAD:
-            reasons[i] = (
-                f"board numbered from either end: the camera is turned by {np.degrees(turns[i, k]):.0f}° or "
-                f"{np.degrees(min(rivals)):.0f}° from the nearest image; left out, add views in between, or show a face"
-            )
+            turned = f"by {np.degrees(turns[i, k]):.0f}° or {np.degrees(min(rivals)):.0f}° from the nearest image"
+            remedy = "left out, add views in between, or show a face"
+            reasons[i] = f"board numbered from either end: the camera is turned {turned}; {remedy}"
         else:
             numbered[i] = numberings[k]
     return numbered, reasons
-
-
-def _turn_rad(view: PlaneView, other: PlaneView) -> float:
-    return (view.camera_from_plane @ other.camera_from_plane.inverse()).angle_rad()

@@ -24,8 +24,6 @@ LEAST_CROSS_PX = 15
 """Size of the cross on a circle that was left out, at least."""
 MIN_LABEL_GAP = 70.0
 """Smallest distance between numbered dots, px at text size 1."""
-
-
 NAME_ROOM = 100.0
 """Distance of a face's name from the nearest centre, in units of its letters, from which on it has room there."""
 
@@ -67,10 +65,8 @@ def draw_overlay(
     """Returns a JPEG with every measured ellipse and its label, and the name of each face."""
     picture = cv2.imdecode(np.frombuffer(thumbnail, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
-        raise InputError(
-            "E-RUN-DAMAGED",
-            f"{observations.name}: its small picture in cache/ is damaged; remove that folder, run again",
-        )
+        damaged = f"{observations.name}: its small picture in cache/ is damaged; remove that folder, run again"
+        raise InputError("E-RUN-DAMAGED", damaged)
     if picture.shape[1] < MIN_WIDTH_PX:  # room for the labels of small circles
         picture, scale = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 2 * scale
     size = max(0.4, picture.shape[1] / 2800)
@@ -92,13 +88,8 @@ def draw_overlay(
     extended = observations.shape.any(axis=(1, 2))
     kind = "circles" if extended.all() else "circles and corners" if extended.any() else "corners"
     counts = f"{observations.name}: {len(observations)} {kind} labelled"
-    _text(
-        picture,
-        counts + (f", {notes} note{'s' * (notes > 1)}" if notes else ""),
-        (8, picture.shape[0] - 10),
-        1.2 * size,
-        (255,) * 3,
-    )
+    counts += f", {notes} note{'s' * (notes > 1)}" if notes else ""
+    _text(picture, counts, (8, picture.shape[0] - 10), 1.2 * size, (255,) * 3)
     if crossed := sum(label in left_out for label in observations.labels):
         at = np.array([8 + LEAST_CROSS_PX // 2, picture.shape[0] - 10 - int(60 * size)])
         _cross(picture, at, LEAST_CROSS_PX)
@@ -111,10 +102,8 @@ def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[DotLab
     """Returns the numbered dots of the first row and column: the first and last, and all if there is room."""
     place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if isinstance(x, DotLabel)}
     chosen = set()
-    for line in (
-        sorted((x for x in place if x.column == 0), key=lambda x: x.row),
-        sorted((x for x in place if x.row == 0), key=lambda x: x.column),
-    ):
+    for column in (True, False):
+        line = sorted((x for x in place if (x.column if column else x.row) == 0), key=lambda x: (x.row, x.column))
         if line:
             steps = np.linalg.norm(np.diff([place[x] for x in line], axis=0), axis=1)
             roomy = len(line) > 1 and np.median(steps) > gap_px
