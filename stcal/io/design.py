@@ -397,7 +397,7 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
 
 
 def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
-    """Return the text of a ``target.toml``, with comments; ``printed`` : returns the lines of a face's board or tags."""
+    """Return the text of a ``target.toml`` with comments; ``printed`` : returns the lines of a board or tags."""
     of_circles = any(face.printed is None for face in target.faces)
     lines = ["# A body with tags or boards on its faces. Lengths in mm."]
     if of_circles:
