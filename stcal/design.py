@@ -311,11 +311,6 @@ class BoardDesign(ByValue):
         Height of the rims in front of the dots, negative for dots that stand out; mm.
     rings : tuple of (int, int)
         Row and column of each dot with a hole, which tell the board from its turns.
-
-    Raises
-    ------
-    InputError
-        Numbers that no board has, dots that overlap, a larger dot that is not at a corner.
     """
 
     rows: int

@@ -94,9 +94,7 @@ CameraName = Annotated[str, "Take this camera, by name or number, of a --camera 
 TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
 BoardFile = Annotated[Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference."]
 PlateMargin = Annotated[
-    float,
-    "Assume that plates end this far beyond their circles without outline_mm.",
-    Opt("--margin-mm", min=0, max=1e4),
+    float, "Assume that plates without outline_mm end this far beyond circles.", Opt("--margin-mm", min=0, max=1e4)
 ]
 Distance = Annotated[float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)]
 """Distance of the camera in `design`, `plan` and `simulate`: photographs that are forecast can be simulated."""
@@ -106,18 +104,12 @@ LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
 JsonFile = Annotated[
     Path | None, "Also write all results to this file (JSON; `-`: standard output).", Opt("--json", writes=True)
 ]
-ReportFile = Annotated[
-    Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
-]
+ReportFile = Annotated[Path | None, "Also write a page to this file (HTML).", Opt("--report", writes=True)]
 Device = Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."]
 Gain = Annotated[float | None, "Set this gain, in the driver's unit; unchanged if not given.", Opt(min=0, max=1e6)]
-Exclude = Annotated[
-    list[str] | None, "Ignore this image, such as 12/IMG_1003.jpg; repeat it for more.", Opt(metavar="IMAGE")
-]
+Exclude = Annotated[list[str] | None, "Ignore this image, such as 12/a.jpg; repeat it for more.", Opt(metavar="IMAGE")]
 Strict = Annotated[bool, "End with exit code 4 if a check has failed; results are written in any case."]
-StrictByDefault = Annotated[
-    bool, "End with exit code 4 if the answer is no; results are written.", Opt("--strict/--no-strict")
-]
+StrictByDefault = Annotated[bool, "End with exit code 4 if the answer is no, else with 0.", Opt("--strict/--no-strict")]
 """Option of the commands that say whether a run may be used."""
 Overwrite = Annotated[bool, "Replace existing output files.", Opt("--overwrite")]
 """Option of every command that writes a file."""
@@ -146,9 +138,7 @@ Rotation = Annotated[
     "rotvec, xyz (fixed axes), ZYX (moving axes).",
 ]
 PayloadKg = Annotated[
-    float | None,
-    "Take this mass at the flange for rows without payload_kg; the robot file's if not given.",
-    Opt(min=0, max=1e4),
+    float | None, "Take this mass at the flange for rows without payload_kg, or the robot file's.", Opt(min=0, max=1e4)
 ]
 MinDiameter = Annotated[
     float | None, "Ignore circles smaller than this, px; 4.5, 9 over 8 megapixels, if not given.", Opt(min=4, max=1e6)

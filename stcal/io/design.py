@@ -335,7 +335,6 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
             face.origin,
             face.x,
             face.y,
-            rim_mm=None if rims == [None] * len(rims) else np.array([rim or 0.0 for rim in rims]),
         )
     origin, x = xy[drawn.ids.index(face.origin)], xy[drawn.ids.index(face.x)]
     along = (x - origin) / np.linalg.norm(x - origin)
@@ -349,7 +348,8 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
         outline = np.array(face.outline_mm)
         _require_inside(drawn, outline, where)
         outline = (outline - origin) @ face_from_drawing.T
-    return replace(drawn, xy_mm=(xy - origin) @ face_from_drawing.T, rough_target_from_face=rough, outline_mm=outline)
+    placed = replace(drawn, xy_mm=(xy - origin) @ face_from_drawing.T, rough_target_from_face=rough, outline_mm=outline)
+    return placed if rims == [None] * len(rims) else replace(placed, rim_mm=np.array([rim or 0.0 for rim in rims]))
 
 
 def _require_inside(face: FaceDesign, outline: np.ndarray, where: str) -> None:
@@ -397,7 +397,7 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
 
 
 def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
-    """Return the text of a ``target.toml``, with comments; ``printed`` : returns the lines of a face's board or tags."""
+    """Return the text of a ``target.toml`` with comments; ``printed`` : returns the lines of a board or tags."""
     of_circles = any(face.printed is None for face in target.faces)
     lines = ["# A body with tags or boards on its faces. Lengths in mm."]
     if of_circles:

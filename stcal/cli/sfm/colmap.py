@@ -10,6 +10,7 @@ from stcal.cli.terminal import StageProgress, say
 from stcal.errors import InputError, MappingError
 
 app = typer.Typer()
+LIMIT = Opt(min=0, max=1e6)
 
 
 @app.command(name="export-database")
@@ -61,20 +62,14 @@ def export_run(
 def crosscheck(
     run: Run,
     colmap: Annotated[Path | None, "Run this native program; `colmap` on the PATH if not given."] = None,
-    tolerance_sigma: Annotated[
-        float, "Accept differences of faces and circles up to this, in σ.", Opt(min=0, max=1e6)
-    ] = 0.5,
-    tolerance_um: Annotated[
-        float | None, "Accept differences of faces and circles up to this, µm.", Opt(min=0, max=1e6)
-    ] = None,
-    tolerance_mdeg: Annotated[
-        float | None, "Accept differences of faces up to this, millidegrees.", Opt(min=0, max=1e6)
-    ] = None,
+    tolerance_sigma: Annotated[float, "Accept differences of faces and circles up to this, in σ.", LIMIT] = 0.5,
+    tolerance_um: Annotated[float | None, "Accept differences of faces and circles up to this, µm.", LIMIT] = None,
+    tolerance_mdeg: Annotated[float | None, "Accept differences of faces up to this, millidegrees.", LIMIT] = None,
     camera_tolerance_um: Annotated[
-        float | None, "Accept differences of camera positions up to this, µm.", Opt(min=0, max=1e6)
+        float | None, "Accept differences of camera positions up to this, µm.", LIMIT
     ] = None,
     camera_tolerance_mdeg: Annotated[
-        float | None, "Accept differences of camera attitudes up to this, mdeg.", Opt(min=0, max=1e6)
+        float | None, "Accept differences of camera attitudes up to this, mdeg.", LIMIT
     ] = None,
     timeout: Annotated[float, "Stop the native mapper after this time for a group, s.", Opt(min=1, max=1e6)] = 600.0,
 ) -> None:

@@ -47,25 +47,19 @@ def simulate(
     images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
     distance: shared.Distance = 1000.0,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
-    fisheye: Annotated[
-        float | None, "Use an equidistant lens of this diagonal field, degrees.", Opt(min=60, max=170)
-    ] = None,
+    fisheye: Annotated[float | None, "Use an equidistant lens of this diagonal field, °.", Opt(min=60, max=170)] = None,
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[
         float | None, "Use a thin lens of this f-number; if not given, all is in focus.", Opt(min=0.5, max=100)
     ] = None,
-    focus: Annotated[
-        float | None, "Focus at this depth; at --distance if not given.", Opt("--focus-mm", min=10, max=1e7)
-    ] = None,
+    focus: Annotated[float | None, "Focus at this depth, or at --distance.", Opt("--focus-mm", min=10, max=1e7)] = None,
     focal: Annotated[
         float | None,
-        "Set the focal length; if not given, that of a sensor 22.3 mm wide.",
+        "Set the focal length; that of a sensor 22.3 mm wide if not given.",
         Opt("--focal-mm", min=0.5, max=5000),
     ] = None,
-    rim: Annotated[
-        float, "Set the height of rims before circles of faces; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)
-    ] = 0.0,
+    rim: Annotated[float, "Set the height of rims; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)] = 0.0,
     slope: Annotated[float, "Let the light of circles rise by this fraction across.", Opt(min=0, max=1)] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
