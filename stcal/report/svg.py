@@ -408,26 +408,23 @@ class Space:
         self._scale = float((room / extent).min())
         self._middle = (corners.min(0) + corners.max(0)) / 2
         self._centre = np.array([drawing.width, drawing.height]) / 2
-        self._draw_box(drawing)
+        front = (self._towards > 0).astype(int)  # index of the limit that is nearer to the viewer, by axis
+        for axis in range(3):  # the walls behind the points
+            others = [i for i in range(3) if i != axis]
+            wall = np.empty((4, 3))
+            wall[:, axis] = self._limits[1 - front[axis], axis]
+            for other, sides in zip(others, ([0, 1, 1, 0], [0, 0, 1, 1]), strict=True):
+                wall[:, other] = self._limits[sides, other]
+            drawing.lines([self.at(wall)], PANE_EDGE, 0.8, PANE)
+        for axis, name in enumerate("XYZ"):
+            self._draw_axis(drawing, axis, name, front)
 
     def at(self, xyz: np.ndarray) -> np.ndarray:
         """Returns the places (n, 2) in the drawing of points (n, 3)."""
         return self._centre + self._scale * (np.asarray(xyz, float) @ self._axes.T - self._middle)
 
-    def _draw_box(self, drawing: Drawing) -> None:
-        """Draws the three walls behind the points, and ticks and names along edges that nothing hides."""
-        front = (self._towards > 0).astype(int)  # index of the limit that is nearer to the viewer, by axis
-        for axis in range(3):
-            others = [i for i in range(3) if i != axis]
-            wall = np.empty((4, 3))
-            wall[:, axis] = self._limits[1 - front[axis], axis]
-            wall[:, others] = [[self._limits[i, others[0]], self._limits[k, others[1]]] for i, k in
-                               ((0, 0), (1, 0), (1, 1), (0, 1))]  # fmt: skip
-            drawing.lines([self.at(wall)], PANE_EDGE, 0.8, PANE)
-        for axis, name in enumerate("XYZ"):
-            self._draw_axis(drawing, axis, name, front)
-
     def _draw_axis(self, drawing: Drawing, axis: int, name: str, front: np.ndarray) -> None:
+        """Draws ticks and the name of an axis along an edge that nothing hides."""
         a, b = (i for i in range(3) if i != axis)
         low, high = self._limits[:, axis]
 

@@ -209,7 +209,9 @@ def measure(
     design = body_of(target)
     circles = read_target(faces, design)
     if serve or live:
-        source = None if serve else camera_index if images is None else _source(images)
+        # A path has one slash where the URL of a stream has two.
+        url = re.sub(r"^([a-z]+):/(?!/)", r"\1://", str(images))
+        source = None if serve else camera_index if images is None else url
         model = read_camera(camera)
         model = replace(model, source=Path(model.source).name)  # answers name no folder of this machine
         others = load_board(board) if board else None, PoseOptions(sigma_factor=sigma_factor), ellipses
@@ -278,8 +280,3 @@ def _serve(setting: tuple, source: int | str | None, host: str, port: int, limit
                 say(line_of(picture))
                 sys.stdout.flush()
         say(f"ended after {picture['picture']} pictures")
-
-
-def _source(path: Path) -> str:
-    """Returns the stream's URL or the file that was given; a path has one slash where a URL has two."""
-    return re.sub(r"^([a-z]+):/(?!/)", r"\1://", str(path))

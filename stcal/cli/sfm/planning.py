@@ -42,9 +42,10 @@ def plan(
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
-    from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run, stated_noise
+    from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run
     from stcal.sfm.planning.bodies import plan as planned
     from stcal.sfm.planning.file import PlanFile, plan_text
+    from stcal.sfm.planning.forecast import CentreNoise
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.saved import load_run
@@ -55,7 +56,8 @@ def plan(
             "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
         )
     if noise is not None:
-        centre_noise, source = stated_noise(noise)
+        centre_noise = CentreNoise(0.0, floor_px=noise, corner_px=noise)
+        source = "--noise, whatever the size of a circle"
     elif run is not None:
         saved = load_run(run)
         centre_noise, source = noise_of_run(saved), f"by size and tilt as in {run}"

@@ -103,21 +103,16 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     found = contributions_of(adjusted.state)
     own = derivatives(found.joint, adjusted.start, run.target_design, run.faces.frame)
     stated = statement or statement_of(board.stated)
-    reference, rims = run.faces.reference_face, _rims(run, found, own)
-    camera_given = run.report["summary"].get("camera_given", True)
+    heights, sigma_mm = run.rims_mm()
+    rims: tuple[Source, ...] = ()
+    if heights:
+        row = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
+        covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm)
+        rims = (Source("rims", "rims before the circles", "A", *row, 1e3 * sigma_mm or None, "µm", covariance),)
+    reference, camera_given = run.faces.reference_face, run.report["summary"].get("camera_given", True)
     return budget(
         found, own, run.camera, board, options.flatness_mm, options.refine_camera, stated, reference, rims, camera_given
     )
-
-
-def _rims(run: SavedRun, found: Contributions, own: Derivatives) -> tuple[Source, ...]:
-    """Returns the row of the rims in front of the circles, none if the faces are as seen."""
-    heights, sigma_mm = run.rims_mm()
-    if not heights:
-        return ()
-    covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm)
-    origin, words = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
-    return (Source("rims", "rims before the circles", "A", origin, words, 1e3 * sigma_mm or None, "µm", covariance),)
 
 
 def budget(
@@ -135,7 +130,10 @@ def budget(
     """Returns the budget of an adjustment, as :func:`stcal.sfm.budget.sources.sources_of`; ``more``: further rows."""
     sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
     if own.circles_designed.shape[2]:
-        sources += (_placed(own),)
+        words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
+        size, sigma_um = own.circles.shape[-1], 1e3 * own.designed_sigma_mm
+        none = np.zeros((size, size))  # it moves faces, not circles
+        sources += (Source(PLACED, "frame circles placed", "A", "estimated", words, sigma_um, "µm", none),)
     rng, joint = np.random.default_rng(0), found.joint
     # Where photographs differ more than their pixels explain, it is they that are counted.
     freedom = joint.redundancy if joint.differ <= 1 else sum(len(model.images) for model in joint.models)
@@ -147,13 +145,6 @@ def budget(
     circles = own.circle_covariance(np.sum([source.covariance_mm2 for source in sources], axis=0))
     conditions = conditions_of(statement, board)
     return Budget(found.joint, reference_face, sources, tuple(rows), circles, views, statement, conditions)
-
-
-def _placed(own: Derivatives) -> Source:
-    words = "not mapped; their places are those of the design, with errors as large as those of the mapped ones"
-    sigma, size = 1e3 * own.designed_sigma_mm, own.circles.shape[-1]
-    covariance = np.zeros((size, size))  # it moves faces, not circles
-    return Source(PLACED, "frame circles placed", "A", "estimated", words, sigma, "µm", covariance)
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
@@ -199,22 +190,17 @@ def _row(
     variance = float(np.trace(covariance))
     estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")
     standard = float(np.sqrt(variance))
+    values, vectors = np.linalg.eigh(covariance)
+    errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     return Row(
         measurand,
         {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()},
         covariance,
         standard,
         COVERAGE_FACTOR * standard,
-        _coverage(covariance, COVERAGE_FACTOR * standard, rng),
+        float((np.linalg.norm(errors, axis=1) <= COVERAGE_FACTOR * standard).mean()),
         max(freedom, 1) * (variance / estimated) ** 2 if estimated else np.inf,
     )
-
-
-def _coverage(covariance: np.ndarray, expanded: float, rng: np.random.Generator) -> float:
-    """Returns the share of simulated errors that are not longer than the expanded uncertainty."""
-    values, vectors = np.linalg.eigh(covariance)
-    errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
-    return float((np.linalg.norm(errors, axis=1) <= expanded).mean())
 
 
 def _view(model: MetricModel) -> View:

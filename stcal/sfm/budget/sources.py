@@ -1,7 +1,7 @@
 """Sources of uncertainty of a budget, and the conditions stated for them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
 from typing import Annotated, Literal
@@ -70,15 +70,12 @@ class Statement:
 def statement_of(own: StatedSize, path: str | Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
     """Statement of a run: ``own`` of its ``board.toml``, overridden by the file, whose fields ``given`` overrides."""
     file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
-    sizes, origin = {}, {}
+    sizes: dict[str, StatedSize] = {}
+    origin: dict[tuple[str, str], str] = {}
     for body, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
-        values = {}
-        for key in (field.name for field in fields(StatedSize)):
-            values[key] = getattr(second, key)
-            origin[body, key] = str(path)
-            if values[key] is None:
-                values[key], origin[body, key] = getattr(first, key), "board.toml"
-        sizes[body] = StatedSize(**values)
+        values, default = asdict(second), asdict(first)
+        sizes[body] = StatedSize(**{key: default[key] if own is None else own for key, own in values.items()})
+        origin |= {(body, key): "board.toml" if own is None else str(path) for key, own in values.items()}
     for name, value in (given or {}).items():
         if not name or len(name) > 60 or len(value) > LONGEST:
             raise InputError(

@@ -34,8 +34,7 @@ MIN_REACH = 0.75
 class ProjectionSigma:
     """σ of projections over the image."""
 
-    xy_px: np.ndarray  # (n, 2)
-    sigma_px: np.ndarray  # (n,) per axis, up to a rotation of the camera, which poses absorb
+    sigma_px: np.ndarray  # (n,) per axis at :func:`image_grid`, up to a rotation of the camera, which poses absorb
     reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
     corner_sigma_px: np.ndarray  # (4,)
 
@@ -78,7 +77,7 @@ def projection_sigma(result: Intrinsics) -> ProjectionSigma:
     # The smaller of the two coordinates counts: a dot at the side of the image is not in its corner.
     reach = np.minimum.reduce(dots[:, None] * corners / middle, axis=2).max(0)
     corner_index = [int(np.argmin(((xy - middle - corner * middle) ** 2).sum(1))) for corner in corners]
-    return ProjectionSigma(xy, sigma, np.maximum(reach, 0), sigma[corner_index])
+    return ProjectionSigma(sigma, np.maximum(reach, 0), sigma[corner_index])
 
 
 CELLS = (12, 8)
@@ -212,25 +211,25 @@ def choose_model(
 ) -> tuple[str, tuple[Candidate, ...]]:
     """Returns the simplest lens model that predicts held-out views as well as the best one, and all candidates.
     ``known``: intrinsics of any model that fits, at which models of the same projection start."""
-    starts = [(views, board, known.camera, model) for model in CANDIDATES]
-    fitted = dict(zip(CANDIDATES, run_in_order(_fitted, starts, workers), strict=True))
-    factors = {m: entry.factors.centres for m, entry in fitted.items() if isinstance(entry, Intrinsics)}
-    why = {m: str(entry) for m, entry in fitted.items() if isinstance(entry, StcalError)}
-    least = min(factors, key=factors.__getitem__, default="")
-    for model, factor in factors.items():
-        if factor > HOPELESS * factors[least]:
-            why[model] = f"residuals {factor / factors[least]:.3g} times those of {least}"
-    jobs = {m: (views, board, entry) for m, entry in fitted.items() if isinstance(entry, Intrinsics) and m not in why}
+    fits = run_in_order(_fitted, [(views, board, known.camera, model) for model in CANDIDATES], workers)
+    fitted = {model: fit for model, fit in zip(CANDIDATES, fits, strict=True) if isinstance(fit, Intrinsics)}
+    why = {model: str(fit) for model, fit in zip(CANDIDATES, fits, strict=True) if isinstance(fit, StcalError)}
+    least = min(fitted, key=lambda model: fitted[model].factors.centres, default="")
+    for model, fit in fitted.items():
+        if (ratio := fit.factors.centres / fitted[least].factors.centres) > HOPELESS:
+            why[model] = f"residuals {ratio:.3g} times those of {least}"
+    tried = [model for model in fitted if model not in why]
+    outcomes = run_in_order(_tried, [(views, board, fitted[model]) for model in tried], workers)
     fared: dict[str, HeldOut] = {}
-    for model, outcome in zip(jobs, run_in_order(_tried, list(jobs.values()), workers), strict=True):
+    for model, outcome in zip(tried, outcomes, strict=True):
         if isinstance(outcome, HeldOut):
             fared[model] = outcome
         else:
             why[model] = str(outcome or "too few views")
     if not fared:
-        for entry in fitted.values():
-            if isinstance(entry, StcalError) and not jobs:
-                raise entry
+        for fit in fits:
+            if isinstance(fit, StcalError) and not tried:
+                raise fit
         raise DegenerateError(
             "E-CALIBRATE-FEW-VIEWS",
             f"--model auto: {len(views)} views, {MIN_TRAINING + 1} needed; add views, or choose a --model",
@@ -238,19 +237,17 @@ def choose_model(
     factor = min(entry.factor for entry in fared.values())  # one σ for all models: that of the model that fits best
     squares = {model: entry.squares(factor) for model, entry in fared.items()}
     best = min(squares, key=lambda model: squares[model].mean())
-    rows = [_row(model, fared.get(model), squares, best, why.get(model, "")) for model in CANDIDATES]
-    as_good = [row for row in rows if row.worse is not None and row.worse <= LIKELY * (row.worse_sigma or 0.0)]
+    rows = {}
+    for model in CANDIDATES:
+        row = Candidate(model, len(parameter_names(model)), None, None, None, why.get(model, ""))
+        if model in fared:
+            apart = squares[model] - squares[best]
+            sigma = float(apart.std(ddof=1) / np.sqrt(len(apart)))
+            row = replace(row, rms_px=fared[model].rms_px(), worse=float(apart.mean()), worse_sigma=sigma)
+        rows[model] = row
+    as_good = [row for row in rows.values() if row.worse is not None and row.worse <= LIKELY * (row.worse_sigma or 0.0)]
     chosen = min(as_good, key=lambda row: (row.parameters, row.worse or 0.0))
-    return chosen.model, tuple(rows)
-
-
-def _row(model: str, outcome: HeldOut | None, squares: dict[str, np.ndarray], best: str, why: str) -> Candidate:
-    count = len(parameter_names(model))
-    if outcome is None:
-        return Candidate(model, count, None, None, None, why)
-    apart = squares[model] - squares[best]
-    sigma = float(apart.std(ddof=1) / np.sqrt(len(apart)))
-    return Candidate(model, count, outcome.rms_px(), float(apart.mean()), sigma)
+    return chosen.model, tuple(rows.values())
 
 
 def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics | StcalError:

@@ -161,7 +161,12 @@ def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = No
     now = forecast(known.models, setup)
     shares = variance_shares(now, known.models, setup)
     with kept_processes():
-        views = [view for views_of_group in _candidates(known) for view in views_of_group]
+        if setup.board.rows:
+            jobs = [(known.scene, model, setup, known.noise) for model in known.models]
+            by_group = run_in_order(candidates, jobs, 1)
+        else:
+            by_group = [body_views(model, setup, known.noise) for model in known.models]
+        views = [view for views_of_group in by_group for view in views_of_group]
         chosen = _greedy(known, views, now, count, progress or (lambda *_: None))
     return Advice(
         now,
@@ -172,14 +177,6 @@ def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = No
         forecast(known.models, setup.better_board(0.5), now.derivatives),
         len(views),
     )
-
-
-def _candidates(known: Known) -> list[list[PlannedView]]:
-    """Returns the views that are compared, by group."""
-    if not known.setup.board.rows:
-        return [body_views(model, known.setup, known.noise) for model in known.models]
-    jobs = [(known.scene, model, known.setup, known.noise) for model in known.models]
-    return run_in_order(candidates, jobs, 1)
 
 
 def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, progress: Progress) -> list[Choice]:
@@ -195,7 +192,9 @@ def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, p
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
         chosen.append(Choice(views[best], *worst_of(results[best])))
         models[views[best].group] = models[views[best].group].plus(views[best].model)
-        keep = _promising(results) - {best}
+        # The best views for each of the faces, as another face may become the worst one.
+        ranked = [sorted(range(len(views)), key=lambda i, face=face: results[i][face]) for face in results[0]]
+        keep = {i for order in ranked for i in order[:SHORTLIST]} - {best}
         views = [views[i] for i in sorted(keep)]
     return chosen
 
@@ -204,27 +203,19 @@ def _positions(positions: PositionsWith, views: Sequence[PlannedView]) -> list[d
     return [positions(view.model) for view in views]
 
 
-def _promising(by_view: list[dict[str, float]]) -> set[int]:
-    """Returns the indices of the best views for each of the faces, as another face may become the worst one."""
-    return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
-
-
 def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
     """Returns the pairs of faces that no group shows together but one view can, the best first."""
-    together = {
-        pair
-        for model in known.models
-        for pair in combinations(sorted(key for key in model.points_by_face() if key != "board"), 2)
-    }
+    together = [model.points_by_face().keys() for model in known.models]
     new_groups = []
     for pair in combinations(sorted(face.id for face in known.scene.target.faces), 2):
-        if pair not in together:
-            try:
-                model = _new_model(known, pair, images)
-            except DegenerateError:
-                continue  # the two cannot be seen together at this distance
-            with_model = forecast([*known.models, model], known.setup, now.derivatives)
-            new_groups.append(NewGroup(pair, images, *with_model.worst()))
+        if any(faces >= set(pair) for faces in together):
+            continue
+        try:
+            model = _new_model(known, pair, images)
+        except DegenerateError:
+            continue  # the two cannot be seen together at this distance
+        with_model = forecast([*known.models, model], known.setup, now.derivatives)
+        new_groups.append(NewGroup(pair, images, *with_model.worst()))
     return sorted(new_groups, key=lambda group: group.sigma_mm)
 
 
@@ -255,11 +246,6 @@ def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
     return known.noise.applied(model, scene.camera, known.setup.radius_mm())
 
 
-def stated_noise(sigma_px: float) -> tuple[CentreNoise, str]:
-    """Returns the same σ for every circle and corner."""
-    return CentreNoise(0.0, floor_px=sigma_px, corner_px=sigma_px), "--noise, whatever the size of a circle"
-
-
 @require_arguments
 def noise_of_run(run: AnyRun) -> CentreNoise:
     """Returns the noise of centres by size and tilt of the circles, as estimated from a run.
@@ -280,9 +266,8 @@ def noise_of_run(run: AnyRun) -> CentreNoise:
 
 def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
     """Returns the σ to expect in good photographs; ``of_corners`` : of tags and squares, not of circles."""
-    if of_corners:
-        return CentreNoise.expected(), "what corners of tags have in rendered photographs"
-    return CentreNoise.expected(), (
-        f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale, edges "
-        f"blurred by {BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound"
+    of_circles = (
+        f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale, edges blurred by "
+        f"{BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound"
     )
+    return CentreNoise.expected(), "what corners of tags have in rendered photographs" if of_corners else of_circles

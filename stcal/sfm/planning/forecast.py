@@ -10,7 +10,7 @@ from scipy.special import ellipe, ellipk
 
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, reference_target
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_fields, rms
+from stcal.geometry.arrays import require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Rigid
@@ -36,9 +36,11 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
         if not rough and _is_reference(target):  # of files from before there were rough poses
             return reference_target().rough_poses()
         if missing := [face.id for face in target.faces if face.id not in rough]:
+            *more, last = missing
+            named = f"faces {', '.join(more)} and {last} are" if more else f"face {last} is"
             raise InputError(
                 "E-TARGET-ROUGH-POSE",
-                f"target {target.name}: the design does not say where {_faces(missing)}; add approximate {ROUGH_KEYS} "
+                f"target {target.name}: the design does not say where {named}; add approximate {ROUGH_KEYS} "
                 "to each [[face]] of the target file, or for `plan` give --faces, the faces.json of an earlier run",
             )
         return rough
@@ -52,17 +54,12 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
     return {face.id: poses[face.id] for face in target.faces}
 
 
-def _faces(ids: list[str]) -> str:
-    return f"face {ids[0]} is" if len(ids) == 1 else f"faces {', '.join(ids[:-1])} and {ids[-1]} are"
-
-
 def _is_reference(target: TargetDesign) -> bool:
-    places, reference = _places(target), _places(reference_target())
+    places, reference = (
+        {label: xy for face in each.faces for label, xy in zip(face.labels(), face.xy_mm, strict=True)}
+        for each in (target, reference_target())
+    )
     return places.keys() == reference.keys() and all(np.allclose(places[k], reference[k], atol=0.5) for k in places)
-
-
-def _places(target: TargetDesign) -> dict[str, np.ndarray]:
-    return {label: xy for face in target.faces for label, xy in zip(face.labels(), face.xy_mm, strict=True)}
 
 
 EXACT_SIGMA_PX = 0.005
@@ -275,10 +272,6 @@ class Forecast:
     circle_sigma_mm: dict[CircleLabel, float]  # root of the trace
     scale_sigma: float  # relative, of the target's size
     derivatives: Derivatives  # reusable for other views of the same circles
-
-    def __post_init__(self):
-        fixed = {face: frozen(c, (6, 6), f"face {face}: covariance") for face, c in self.face_covariance.items()}
-        object.__setattr__(self, "face_covariance", fixed)
 
     def position_sigma_mm(self) -> dict[str, float]:
         """Returns the σ of each face's position, see :func:`position_sigma_mm`."""

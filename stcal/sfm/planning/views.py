@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stcal.design import TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel, Label
@@ -93,17 +92,19 @@ def looking_at(centre: np.ndarray, direction: np.ndarray, up: np.ndarray, distan
 def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
     """Returns the scene of a run, target frame: its calibrated faces and circles and its boards, without views."""
     circles = dict(zip(joint.labels, joint.xyz_model, strict=True))
-    groups = {}
+    groups, dots = {}, np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
     for model in models:
-        faces = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
-        target_from_board = joint.model_from_board[model.group]
-        dots = np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
-        groups[model.group] = Group(
-            model.group, faces, _Stand.of(model).axes, target_from_board, target_from_board @ dots, ()
-        )
-    target = _calibrated_part(setup.target, setup.start.target_from_face, circles)
+        seen = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
+        pose = joint.model_from_board[model.group]
+        groups[model.group] = Group(model.group, seen, _Stand.of(model).axes, pose, pose @ dots, ())
+    faces = []
+    for face in setup.target.faces:
+        if face.id in setup.start.target_from_face:
+            keep = [i for i, label in enumerate(face.labels()) if label in circles]
+            ids = tuple(face.ids[i] for i in keep)
+            faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
     return Scene(
-        target=target,
+        target=replace(setup.target, faces=tuple(faces)),
         board=setup.board,
         camera=Camera.of(setup.camera, colmap_model),
         target_from_face=setup.start.target_from_face,
@@ -111,16 +112,6 @@ def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setu
         groups=groups,
         seed=0,
     )
-
-
-def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], circles) -> TargetDesign:
-    faces = []
-    for face in target.faces:
-        if face.id in target_from_face:
-            keep = [i for i, label in enumerate(face.labels()) if label in circles]
-            ids = tuple(face.ids[i] for i in keep)
-            faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
-    return replace(target, faces=tuple(faces))
 
 
 def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
