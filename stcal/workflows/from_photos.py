@@ -26,32 +26,31 @@ from stcal.parallel import Progress, scratch_folder
 from stcal.report.document import Document, Section, bullets, links, listed
 from stcal.report.document import Table as ShownTable
 from stcal.report.text import number
-from stcal.robot.axes.model import AxesFile, AxesResult, robot_from_sweeps
+from stcal.robot import (
+    Identified,
+    IdentifyOptions,
+    Measurements,
+    Robot,
+    Targets,
+    compensate,
+    compensated_csv,
+    evaluate,
+    identify,
+    read_measurements,
+    read_targets,
+    robot_from_sweeps,
+    robot_toml,
+)
+from stcal.robot.axes.model import AxesFile, AxesResult
 from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.observability import predicted_at
 from stcal.robot.identification.report import identified_report
-from stcal.robot.identification.result import (
-    Figures,
-    Identified,
-    IdentifiedFile,
-    IdentifyOptions,
-    require_identified_written,
-)
-from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.file import require_robot_written, robot_toml
-from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
-from stcal.robot.kinematics.model import Robot
-from stcal.robot.use.compensation import (
-    Compensated,
-    CompensationFile,
-    compensate,
-    compensated_csv,
-    compensated_summary,
-)
-from stcal.robot.use.evaluation import evaluate
+from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
+from stcal.robot.kinematics.file import require_robot_written
+from stcal.robot.kinematics.measurements import joint_values, targets_of
+from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
 from stcal.robot.use.report import compensation_report
-from stcal.robot.use.targets import Targets, read_targets
 from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
 from stcal.sfm.measurement.report import (
     IMAGE,
