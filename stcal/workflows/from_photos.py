@@ -163,7 +163,7 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
     ]
     if compensated is not None:
         values = np.column_stack([compensated.before_mm, result.sigma_mm(), _shown(result, result.moves())])
-        rows = zip(compensated.lines, compensated.found.status, values.tolist(), strict=True)
+        rows = zip(compensated.targets.lines, compensated.found.status, values.tolist(), strict=True)
         targets = [[str(line), status, *(number(v, 4) for v in row)] for line, status, row in rows]
     joints = [f"J{i}, {'mm' if slides else '°'}" for i, slides in enumerate(result.nominal.prismatic, 1)]
     at_targets = [
@@ -198,11 +198,14 @@ POSES = "poses.csv"
 
 def _results(result: FromPhotos) -> dict[str, ResultFile]:
     """Returns the result files, by name."""
-    models = {"axes": AxesFile, "identified": IdentifiedFile, "compensated": CompensationFile}
-    parts = {name: getattr(result, name) for name in models}
-    return {"poses.json": poses_file(result.measured)} | {
-        f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None
+    models: dict[str, type[ResultFile]] = {
+        "axes": AxesFile,
+        "identified": IdentifiedFile,
+        "compensated": CompensationFile,
     }
+    parts = {name: getattr(result, name) for name in models}
+    found = {f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None}
+    return {"poses.json": poses_file(result.measured), **found}
 
 
 def files_of(result: FromPhotos) -> dict[str, str]:
