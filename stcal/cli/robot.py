@@ -241,10 +241,10 @@ def identify(
     report: shared.ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
-    from stcal.robot import IdentifyOptions, load_robot, read_measurements, robot_toml
+    from stcal.robot import IdentifyOptions, load_robot, offsets_csv, read_measurements, robot_toml
     from stcal.robot import identify as identified_from
-    from stcal.robot.identification import report as shown
     from stcal.robot.identification.prior import adjusted
+    from stcal.robot.identification.report import identified_report
     from stcal.robot.identification.result import IdentifiedFile, require_identified_written
 
     nominal = load_robot(robot_file)
@@ -254,13 +254,13 @@ def identify(
         observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
     )
     result = identified_from(nominal, data, options)
-    document = shown.identified_report(result)
+    document = identified_report(result)
     say(document.text())
     if out:
         comment = f"Identified from {shared.name_of(source)}: {result.rank} parameters."
         write(out, robot_toml(result.robot, [comment]))
         require_identified_written(out, result)
-    _write_table(offsets, lambda: shown.offsets_csv(result, nominal))
+    _write_table(offsets, lambda: offsets_csv(result, nominal))
     write_if(json_file, lambda: IdentifiedFile.model_validate(result))
     write_if(report, document.page)
 
