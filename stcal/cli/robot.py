@@ -158,11 +158,10 @@ def axes(
     report: shared.ReportFile = None,
 ) -> None:
     """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
-    from stcal.robot.axes.model import AxesFile, robot_from_sweeps
+    from stcal.robot import load_robot, read_measurements, robot_from_sweeps
+    from stcal.robot.axes.model import AxesFile
     from stcal.robot.axes.report import axes_report
     from stcal.robot.axes.sweeps import ring
-    from stcal.robot.kinematics.file import load_robot
-    from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
     source = joined.table(sweeps, "SWEEPS")
@@ -242,12 +241,11 @@ def identify(
     report: shared.ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
-    from stcal.robot.identification import report as shown
+    from stcal.robot import IdentifyOptions, load_robot, offsets_csv, read_measurements, robot_toml
+    from stcal.robot import identify as identified_from
     from stcal.robot.identification.prior import adjusted
-    from stcal.robot.identification.result import IdentifiedFile, IdentifyOptions, require_identified_written
-    from stcal.robot.identification.solve import identify as identified_from
-    from stcal.robot.kinematics.file import load_robot, robot_toml
-    from stcal.robot.kinematics.measurements import read_measurements
+    from stcal.robot.identification.report import identified_report
+    from stcal.robot.identification.result import IdentifiedFile, require_identified_written
 
     nominal = load_robot(robot_file)
     source = joined.table(data_file, "DATA", quaternions=quaternions)
@@ -256,13 +254,13 @@ def identify(
         observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
     )
     result = identified_from(nominal, data, options)
-    document = shown.identified_report(result)
+    document = identified_report(result)
     say(document.text())
     if out:
         comment = f"Identified from {shared.name_of(source)}: {result.rank} parameters."
         write(out, robot_toml(result.robot, [comment]))
         require_identified_written(out, result)
-    _write_table(offsets, lambda: shown.offsets_csv(result, nominal))
+    _write_table(offsets, lambda: offsets_csv(result, nominal))
     write_if(json_file, lambda: IdentifiedFile.model_validate(result))
     write_if(report, document.page)
 
@@ -286,11 +284,10 @@ def evaluate(
     report: shared.ReportFile = None,
 ) -> None:
     """Compare robot files on new measurements, and tell what their residuals depend on."""
-    from stcal.robot.kinematics.file import load_robot
-    from stcal.robot.kinematics.measurements import read_measurements
+    from stcal.robot import evaluate as evaluated
+    from stcal.robot import load_robot, read_measurements
     from stcal.robot.use import report as shown
     from stcal.robot.use.evaluation import EvaluationFile
-    from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
     source = joined.table(data_file, "DATA", quaternions=quaternions)
@@ -358,10 +355,9 @@ def compensate(
     report: shared.ReportFile = None,
 ) -> None:
     """Compute the joint values with which the real robot reaches the commanded poses."""
-    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot import load_robot, read_targets
     from stcal.robot.use import compensation
     from stcal.robot.use.report import compensation_report
-    from stcal.robot.use.targets import read_targets
 
     identified = load_robot(robot_file)
     source = joined.table(targets, "TARGETS", quaternions=quaternions)
@@ -446,10 +442,8 @@ def from_photos(
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
     from stcal.io.files import require_new_folder, save_folder
-    from stcal.robot.identification.result import IdentifyOptions
-    from stcal.robot.kinematics.file import load_robot
-    from stcal.sfm.measurement.images import MeasureOptions
-    from stcal.sfm.measurement.target import read_target
+    from stcal.robot import IdentifyOptions, load_robot
+    from stcal.sfm import MeasureOptions, read_target
     from stcal.workflows.from_photos import files_of, require_files_written, robot_from_photos, story
 
     require_new_folder(out, images)

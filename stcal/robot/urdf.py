@@ -130,16 +130,16 @@ def load_urdf(
     start = from_link or roots[0]
     ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
-    for name, path in paths.items():
-        _require_chain(path, start, ends[name], where)
+    for name, way in paths.items():
+        _require_chain(way, start, ends[name], where)
     first, world = next(iter(paths.values())), Rigid()
-    shared = all(path[0].name == first[0].name for path in paths.values())
+    shared = all(way[0].name == first[0].name for way in paths.values())
     if not from_link and start == WORLD and first[0].kind == "fixed" and shared:
         world, start = first[0].parent_from_child, first[0].child
-        paths = {name: path[1:] for name, path in paths.items()}
+        paths = {name: way[1:] for name, way in paths.items()}
     name = root.get("name") or "robot"
     robot = robot_of(paths, name, convention) if "" in paths else _tree_of(paths, name, convention)
-    moving = list({joint.name: joint for path in paths.values() for joint in path if joint.kind != "fixed"}.values())
+    moving = list({joint.name: joint for way in paths.values() for joint in way if joint.kind != "fixed"}.values())
     notes = tuple(f"joint {j.name} has no limits" for j in moving if j.limit is None and j.kind != "continuous")
     robot = replace(robot, world_from_base=world @ robot.world_from_base)
     return UrdfRobot(robot, tuple(j.name for j in moving), start, ", ".join(ends.values()), notes)

@@ -26,32 +26,31 @@ from stcal.parallel import Progress, scratch_folder
 from stcal.report.document import Document, Section, bullets, links, listed
 from stcal.report.document import Table as ShownTable
 from stcal.report.text import number
-from stcal.robot.axes.model import AxesFile, AxesResult, robot_from_sweeps
+from stcal.robot import (
+    Identified,
+    IdentifyOptions,
+    Measurements,
+    Robot,
+    Targets,
+    compensate,
+    compensated_csv,
+    evaluate,
+    identify,
+    read_measurements,
+    read_targets,
+    robot_from_sweeps,
+    robot_toml,
+)
+from stcal.robot.axes.model import AxesFile, AxesResult
 from stcal.robot.axes.report import axes_report
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.observability import predicted_at
 from stcal.robot.identification.report import identified_report
-from stcal.robot.identification.result import (
-    Figures,
-    Identified,
-    IdentifiedFile,
-    IdentifyOptions,
-    require_identified_written,
-)
-from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.file import require_robot_written, robot_toml
-from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
-from stcal.robot.kinematics.model import Robot
-from stcal.robot.use.compensation import (
-    Compensated,
-    CompensationFile,
-    compensate,
-    compensated_csv,
-    compensated_summary,
-)
-from stcal.robot.use.evaluation import evaluate
+from stcal.robot.identification.result import Figures, IdentifiedFile, require_identified_written
+from stcal.robot.kinematics.file import require_robot_written
+from stcal.robot.kinematics.measurements import joint_values, targets_of
+from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
 from stcal.robot.use.report import compensation_report
-from stcal.robot.use.targets import Targets, read_targets
 from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
 from stcal.sfm.measurement.report import (
     IMAGE,
@@ -164,7 +163,7 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
     ]
     if compensated is not None:
         values = np.column_stack([compensated.before_mm, result.sigma_mm(), _shown(result, result.moves())])
-        rows = zip(compensated.lines, compensated.found.status, values.tolist(), strict=True)
+        rows = zip(compensated.targets.lines, compensated.found.status, values.tolist(), strict=True)
         targets = [[str(line), status, *(number(v, 4) for v in row)] for line, status, row in rows]
     joints = [f"J{i}, {'mm' if slides else '°'}" for i, slides in enumerate(result.nominal.prismatic, 1)]
     at_targets = [
@@ -199,11 +198,14 @@ POSES = "poses.csv"
 
 def _results(result: FromPhotos) -> dict[str, ResultFile]:
     """Returns the result files, by name."""
-    models = {"axes": AxesFile, "identified": IdentifiedFile, "compensated": CompensationFile}
-    parts = {name: getattr(result, name) for name in models}
-    return {"poses.json": poses_file(result.measured)} | {
-        f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None
+    models: dict[str, type[ResultFile]] = {
+        "axes": AxesFile,
+        "identified": IdentifiedFile,
+        "compensated": CompensationFile,
     }
+    parts = {name: getattr(result, name) for name in models}
+    found = {f"{name}.json": models[name].model_validate(part) for name, part in parts.items() if part is not None}
+    return {"poses.json": poses_file(result.measured), **found}
 
 
 def files_of(result: FromPhotos) -> dict[str, str]:

@@ -108,23 +108,19 @@ def pairs_of(frames: list[Rigid], covariance: np.ndarray, robot: Robot) -> tuple
         lengths = {}
         if np.isfinite(value[3]):
             lengths = _lengths(acute, value[3:], sigma_of(jacobian[3:], covariance), size)
+        spread = (
+            jacobian[:3] @ covariance @ jacobian[:3].T
+        )  # of the angle's vector; of exactly parallel axes its largest
+        variance = np.linalg.eigvalsh(spread)[-1] if acute <= EXACTLY else value[:3] @ spread @ value[:3] / acute**2
         pair = Pair(
             joint=i,
             angle_rad=np.pi - acute if opposed else acute,
-            angle_sigma_rad=_angle_sigma(value[:3], jacobian[:3] @ covariance @ jacobian[:3].T),
+            angle_sigma_rad=float(np.sqrt(max(variance, 0))),
             parallel=bool(np.sin(acute) < np.sin(PARALLEL_RAD)),
             **lengths,
         )
         pairs.append(pair)
     return tuple(pairs)
-
-
-def _angle_sigma(angle: np.ndarray, covariance: np.ndarray) -> float:
-    """Returns σ along the angle's vector; for exactly parallel axes the largest σ."""
-    length = float(np.linalg.norm(angle))
-    if length <= EXACTLY:
-        return float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0)))
-    return float(np.sqrt(max(angle @ covariance @ angle, 0)) / length)
 
 
 def _lengths(angle: float, value: np.ndarray, sigma: np.ndarray, size: float) -> dict:
@@ -252,16 +248,16 @@ def off_mm(fit: AxisFit) -> dict[int, float]:
 def _outliers_said(data: Measurements, fit: AxisFit) -> list[str]:
     """Returns a line for each of a few outliers, or one line for all of many."""
     off_arc, limit = off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
-    if len(off_arc) <= FEW:
+    if len(off_arc) > FEW:
+        first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
         return [
-            f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint "
-            f"{fit.joint + 1}, {limit}"
-            for row, size in off_arc.items()
+            f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; "
+            f"the farthest are lines {first}; all are in --json"
         ]
-    first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
     return [
-        f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; the "
-        f"farthest are lines {first}; all are in --json"
+        f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint {fit.joint + 1}, "
+        f"{limit}"
+        for row, size in off_arc.items()
     ]
 
 
@@ -302,14 +298,13 @@ def _alone(data: Measurements, fits: list[AxisFit]) -> list[str]:
     """Returns notes on reflectors that are on no arc."""
     swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
     notes = []
-    for name in dict.fromkeys(data.targets):
-        if name not in swept:
-            rows = [i for i, target in enumerate(data.targets) if target == name]
-            what = called(name) if name else "rows without a target, beside rows with one"
-            notes.append(
-                f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on "
-                f"the flange rests on these rows alone; name it like the others, or leave it out"
-            )
+    for name in dict.fromkeys(each for each in data.targets if each not in swept):
+        rows = [i for i, target in enumerate(data.targets) if target == name]
+        what = called(name) if name else "rows without a target, beside rows with one"
+        notes.append(
+            f"line {data.lines[rows[0]]}: {what}: on no arc of any joint ({len(rows)} rows), so that its place on the "
+            f"flange rests on these rows alone; name it like the others, or leave it out"
+        )
     return notes
 
 

@@ -84,11 +84,6 @@ class AxisFit:
         """RMS of a coordinate of the residuals of the points used, mm."""
         return rms(self.lengths()) / float(np.sqrt(2))
 
-    @property
-    def targets(self) -> list[str]:
-        """Reflectors of the arcs."""
-        return [arc.target for arc in self.arcs]
-
     def influence(self, points: np.ndarray) -> np.ndarray:
         """Returns the change (k, p) of the axis, linear, without each of the fitted ``points`` (k, 3), mm."""
         axes, prismatic = self.world_from_axis.rotation, len(self.gain) == 2

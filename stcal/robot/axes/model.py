@@ -86,7 +86,7 @@ class AxisPart(Part):
     sigma_mm: float
     redundancy: int
     span: float
-    targets: list[str]
+    arcs: Annotated[list[str], BeforeValidator(lambda arcs: [getattr(arc, "target", arc) for arc in arcs])]
     radii: Annotated[list[Finite], BeforeValidator(list)]
     heights: Annotated[list[Finite], BeforeValidator(list)]
 
@@ -106,7 +106,7 @@ class AxesFile(ResultFile):
         description="of each joint in order, all joints at zero: `world_from_axis`, z along positive motion; "
         "`covariance` of rx, ry (rad), tx, ty (mm) in that frame (prismatic: rx, ry) by the noise of its own sweeps; "
         "`rms_mm` of a coordinate of the residuals, `sigma_mm` of a coordinate, `redundancy`; `span` of the joint's "
-        "values, rad or mm; of its arcs `targets`, `radii` and `heights`, mm"
+        "values, rad or mm; reflectors of its `arcs`, their `radii` and `heights`, mm"
     )
     off: list[dict[ByLine, float]] = Field(description="by joint, rows off their arcs and left out, mm")
     covariance: Matrix = Field(

@@ -131,7 +131,10 @@ def linear(state: State, measured: Observed) -> tuple[np.ndarray, np.ndarray]:
     """Returns :func:`residuals` and :func:`jacobian`."""
     tip, full = tip_jacobian(state, measured.data.q, measured.data.targets, measured.kind, measured.data.conditions)
     if len(state.stations) > 1:
-        full = _by_station(state, measured, tip, full)
+        full, names = full.copy(), np.array(measured.data.stations)
+        offset = len(parameter_names(state, measured.kind)) - 6 * (len(state.stations) - 1)
+        for s, name in enumerate(list(state.stations)[1:]):
+            full[names == name, :, offset + 6 * s : offset + 6 * s + 6] = frame_motions(tip[names == name], np.zeros(3))
     return _beside(state, tip, measured), as_seen(state, measured, tip, full)
 
 
@@ -163,16 +166,20 @@ def _stations(state: State, names: Sequence[str]) -> Poses:
     return Poses.of(state.stations.values())[[place[name] for name in names]]
 
 
-def _by_station(state: State, measured: Observed, tip: Poses, full: np.ndarray) -> np.ndarray:
-    """Returns the derivative with the columns of the stations filled in, as small motions of the world."""
-    full, names = full.copy(), np.array(measured.data.stations)
-    offset = len(parameter_names(state, measured.kind)) - 6 * (len(state.stations) - 1)
-    for s, name in enumerate(list(state.stations)[1:]):
-        rows, place = names == name, offset + 6 * s
-        full[rows, :3, place : place + 3] = np.eye(3)
-        full[rows, 3:, place : place + 3] = -skew(tip.translation[rows])
-        full[rows, 3:, place + 3 : place + 6] = np.eye(3)
-    return full
+def frame_motions(tip: Poses, centre: np.ndarray) -> np.ndarray:
+    """Returns the motions (m, 6, 6) of the tools with the world, by its small rotations about ``centre`` and shifts."""
+    moves = np.zeros((len(tip), 6, 6))
+    moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)
+    moves[:, 3:, :3] = -skew(tip.translation - centre)
+    return moves
+
+
+def tool_motions(tip: Poses, targets: Sequence[str], tool: str, kind: Kind) -> np.ndarray:
+    """Returns the motions (m, 6, 6 or 3) of the tools by small motions of one of them on its flange."""
+    moves = np.zeros((len(tip), 6, 6))
+    moves[:, :3, :3] = moves[:, 3:, 3:] = tip.rotation
+    moves *= np.array([name == tool for name in targets])[:, None, None]
+    return moves[..., -tool_width(kind) :]
 
 
 def _beside(state: State, tip: Poses, measured: Observed) -> np.ndarray:
@@ -192,20 +199,12 @@ def tip_jacobian(
 ) -> tuple[Poses, np.ndarray]:
     """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by all parameters, rad over mm."""
     tip = tips(state, q, targets, conditions)
-    width = tool_width(kind)
     axes_part = chain_jacobian(state.chain, q, tip, conditions)
     if state.chain.grown is not None:
         joint = [i for i, _ in chain_parameters(state.chain)]
         axes_part = axes_part * state.chain.carries(targets)[joint].T[:, None]
-    tools_part = np.zeros((len(tip), 6, width * len(state.tools)))
-    names = np.array(targets)
-    for t, name in enumerate(state.tools):
-        rows, place = names == name, width * t
-        if width == 6:
-            tools_part[rows, :3, place : place + 3] = tip.rotation[rows]
-            place += 3
-        tools_part[rows, 3:, place : place + 3] = tip.rotation[rows]
-    parts = [axes_part, tools_part, np.zeros((len(tip), 6, 6 * (len(state.stations) - 1)))]
+    parts = [axes_part, *(tool_motions(tip, targets, name, kind) for name in state.tools)]
+    parts.append(np.zeros((len(tip), 6, 6 * (len(state.stations) - 1))))
     if state.elastic:
         parts.append(elasticity_jacobian(state.chain, q, tip, targets, conditions, state.hysteresis))
     return tip, np.concatenate(parts, axis=2)

@@ -279,13 +279,17 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
         _moves_of(robot, data, tools),
     )
     for level in (*levels, _pairs(robot, thinned)):
-        cases = (Candidate(f"{what}; {cure}" if what else "", partial(tuple, case)) for what, cure, *case in level)
-        found = explain(cases, lambda case: _fitting(*case, tools)[0], most)
+        cases = (
+            Candidate(f"{what}; {cure}" if what else "", partial(tuple, (variant, guess)))
+            for what, cure, variant, guess in level
+        )
+        found = explain(cases, lambda case: _fitting(case[0], case[1], tools)[0], most)
         if found:
-            words = [
-                ", and ".join(filter(None, (each.words, _not_there(case[1], _fitting(*case, tools)[1]))))
-                for each, case in ((each, each.change()) for each, _ in found[:MOST_NAMED])
-            ]
+            words = []
+            for each, _ in found[:MOST_NAMED]:
+                variant, guess = each.change()
+                far = _not_there(guess, _fitting(variant, guess, tools)[1])
+                words.append(", and ".join(filter(None, (each.words, far))))
             raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {', or if '.join(words)}")
     raise InputError(
         "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"

@@ -5,16 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import (
     WIDTH,
     Observed,
     State,
     Weighting,
     as_seen,
+    frame_motions,
     jacobian,
     residuals,
     tips_of,
+    tool_motions,
 )
 from stcal.robot.identification.variances import GROSS
 from stcal.robot.kinematics.forward import joint_frames, joint_motions
@@ -252,17 +254,12 @@ def _order(state: State, measured: Observed) -> list[_Effect]:
     if measured.used == "distance":
         return []
     tip, data = tips_of(state, measured.data), measured.data
-    frame = np.zeros((len(tip), 6, 6))
-    frame[:, :3, :3] = frame[:, 3:, 3:] = np.eye(3)
-    frame[:, 3:, :3] = -skew(tip.translation - tip.translation.mean(0))
+    frame = frame_motions(tip, tip.translation.mean(0))
     advice = "name these rows another station (column station), or measure again"
     what = "the instrument or the robot's base elsewhere"
     order = [_Effect(what, 0, as_seen(state, measured, tip, frame), advice=advice)]
     for name in dict.fromkeys(data.targets):
-        on_flange = np.zeros((len(tip), 6, 6))
-        on_flange[:, :3, :3] = on_flange[:, 3:, 3:] = tip.rotation
-        on_flange *= np.array([each == name for each in data.targets])[:, None, None]
-        on_flange = on_flange if measured.kind == "pose" else on_flange[..., 3:]
+        on_flange = tool_motions(tip, data.targets, name, measured.kind)
         what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
         advice = "name these rows another target (column target), or measure again"
         order.append(_Effect(what, 0, as_seen(state, measured, tip, on_flange), advice=advice))

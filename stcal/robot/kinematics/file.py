@@ -83,17 +83,17 @@ class _ElasticityFile(Strict):
                 raise InputError(
                     "E-ROBOT-ENTRIES", f"{where}: {key} has {len(values)} entries, {count} needed, one for each joint"
                 )
-        none = np.zeros(count)
-        compliance = np.column_stack([self.axis_rad_per_Nm or none, self.across_rad_per_Nm or none])
-        moment = np.array(self.moment_Nm or np.zeros((count, 3)))
-        periodic = np.array(self.periodic_rad or np.zeros((count, 4)))
         if not 0 <= self.payload_kg <= MOST_KG:
             raise InputError("E-PAYLOAD-VALUE", f"{where}: payload_kg is {self.payload_kg:g}; 0 … {MOST_KG:g} needed")
-        centre = np.array(self.payload_centre_mm)
-        load = self.payload_kg, centre
-        hysteresis = np.array(self.hysteresis_rad or none)
-        pivot = np.array(self.pivot_mm or np.zeros((count, 3)))
-        return Elasticity(compliance, moment, periodic, np.array(self.gravity), *load, hysteresis, pivot)
+
+        def given(values: list | None, *width: int) -> np.ndarray:
+            return np.zeros((count, *width)) if values is None else np.array(values)
+
+        compliance = np.column_stack([given(self.axis_rad_per_Nm), given(self.across_rad_per_Nm)])
+        moment, periodic = given(self.moment_Nm, 3), given(self.periodic_rad, 4)
+        load = self.payload_kg, np.array(self.payload_centre_mm)
+        more = given(self.hysteresis_rad), given(self.pivot_mm, 3)
+        return Elasticity(compliance, moment, periodic, np.array(self.gravity), *load, *more)
 
 
 class _RobotFile(Sized):
@@ -145,12 +145,11 @@ def load_robot(path: str | Path) -> Robot:
     coupling = np.eye(n).tolist() if data.coupling is None else data.coupling
     if len(coupling) != n or any(len(row) != n for row in coupling):
         raise InputError("E-ROBOT-COUPLING", f"{where}: coupling: {n} rows of {n} numbers needed for {n} joints")
-    names = [t.name for t in data.target]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError("E-ROBOT-TARGET", f"{where}: target {name} occurs twice; names must differ")
     tools = {"": data.tool.rigid(f"{where}: tool")}
-    tools |= {t.name: t.rigid(f"{where}: target {t.name}") for t in data.target}
+    for t in data.target:
+        if t.name in tools:
+            raise InputError("E-ROBOT-TARGET", f"{where}: target {t.name} occurs twice; names must differ")
+        tools[t.name] = t.rigid(f"{where}: target {t.name}")
     base = data.base.rigid(f"{where}: base")
     elasticity = data.elasticity and data.elasticity.elasticity(n, f"{where}: elasticity")
     tree = _tree(data, where)
@@ -269,27 +268,29 @@ RobotText = Annotated[str, BeforeValidator(lambda robot: robot_toml(robot) if is
 
 def _elasticity_lines(elasticity: Elasticity) -> list[str]:
     axis, across = elasticity.compliance.T
-    load = []
-    if elasticity.hysteresis.any():
-        load.append(f"hysteresis_rad = {_numbers(elasticity.hysteresis)}  # half of it: farther if it came from below")
-    if elasticity.pivot.any():
-        rows = ", ".join(_numbers(row) for row in elasticity.pivot)
-        load.append(f"pivot_mm = [{rows}]  # in the joints' frames: where the links turn when they give way")
-    if elasticity.payload_kg or elasticity.payload_centre.any():
-        load += [
-            f"payload_kg = {_number(elasticity.payload_kg)}",
-            f"payload_centre_mm = {_numbers(elasticity.payload_centre)}  # in the frame of the flange",
-        ]
-    return [
+
+    def rows(values: np.ndarray) -> str:
+        return f"[{', '.join(_numbers(row) for row in values)}]"
+
+    lines = [
         "[elasticity]  # one entry for each joint; compliance about its axis and across it",
         f"gravity = {_numbers(elasticity.gravity)}  # in the base",
         f"axis_rad_per_Nm = {_numbers(axis)}",
         f"across_rad_per_Nm = {_numbers(across)}",
-        f"moment_Nm = [{', '.join(_numbers(row) for row in elasticity.moment)}]",
+        f"moment_Nm = {rows(elasticity.moment)}",
         "# of sin q, cos q, sin 2q, cos 2q",
-        f"periodic_rad = [{', '.join(_numbers(row) for row in elasticity.periodic)}]",
-        *load,
+        f"periodic_rad = {rows(elasticity.periodic)}",
     ]
+    if elasticity.hysteresis.any():
+        lines.append(f"hysteresis_rad = {_numbers(elasticity.hysteresis)}  # half of it: farther if it came from below")
+    if elasticity.pivot.any():
+        lines.append(
+            f"pivot_mm = {rows(elasticity.pivot)}  # in the joints' frames: where the links turn when they give way"
+        )
+    if elasticity.payload_kg or elasticity.payload_centre.any():
+        lines.append(f"payload_kg = {_number(elasticity.payload_kg)}")
+        lines.append(f"payload_centre_mm = {_numbers(elasticity.payload_centre)}  # in the frame of the flange")
+    return lines
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -261,7 +261,8 @@ def inverse(
     m, n = len(poses), len(robot.rows)
     problem = InverseProblem.of(robot if payload_kg is None else robot.loaded(payload_kg), tool)
     if near is None:
-        return _in_sequence(problem, poses)
+        _refuse_redundant(problem)
+        return _by_search(problem, poses, np.arange(m), np.zeros((m, n)), np.zeros(m, bool), None)
     near = np.asarray(near, float)
     if near.shape not in ((n,), (m, n)):
         raise InputError("E-ARRAY-SHAPE", f"reference joint values: shape {near.shape}, ({n},) or ({m}, {n}) needed")
@@ -269,16 +270,7 @@ def inverse(
     if not np.isfinite(near).all():
         raise InputError("E-ARRAY-NOT-FINITE", "reference joint values: hold values that are not finite")
     q, ok = _from_near(problem, poses, near)
-    beyond = np.zeros(m, bool)
-    rest = np.flatnonzero(~ok)
-    for start in range(0, len(rest), GROUP):
-        part = rest[start : start + GROUP]
-        every = _every_solution(problem, poses[part], q[part])
-        for i, solutions in zip(part, every, strict=True):
-            best, beyond[i] = _nearest(problem, poses[[i]], solutions, near[i])
-            q[i] = near[i] if best is None else best
-            ok[i] = best is not None
-    return _finished(problem, poses, q, ok, beyond)
+    return _by_search(problem, poses, np.flatnonzero(~ok), q, ok, near)
 
 
 @require_arguments
@@ -311,7 +303,11 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     _refuse_redundant(problem)
     poses = Poses.of([pose])
     solutions, inside = _turned(problem, _every_solution(problem, poses)[0], problem.middle)
-    solutions = _distinct(solutions[inside])
+    kept: list[np.ndarray] = []
+    for q in solutions[inside]:
+        if all(np.abs(q - other).max() > SAME_BRANCH for other in kept):
+            kept.append(q)
+    solutions = np.array(kept).reshape(-1, solutions.shape[1])
     repeated = Poses(np.repeat(poses.rotation, len(solutions), 0), np.repeat(poses.translation, len(solutions), 0))
     judged = _judge(problem, repeated, solutions)
     keep = np.flatnonzero(judged.usable & _as_good(judged.error_rad))
@@ -335,18 +331,20 @@ def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple
     return q, ok
 
 
-def _in_sequence(problem: InverseProblem, poses: Poses) -> Inverse:
-    """Solves poses without reference: each in the branch nearest to the solution of the previous pose."""
-    _refuse_redundant(problem)
-    m, n = len(poses), len(problem.unit)
-    q, ok, beyond = np.zeros((m, n)), np.zeros(m, bool), np.zeros(m, bool)
-    near = problem.middle
-    for start in range(0, m, GROUP):
-        part = poses[start : start + GROUP]
-        for k, solutions in enumerate(_every_solution(problem, part), start):
-            best, beyond[k] = _nearest(problem, poses[[k]], solutions, near)
-            ok[k] = best is not None
-            q[k] = near = near if best is None else best
+def _by_search(
+    problem: InverseProblem, poses: Poses, rest: np.ndarray, q: np.ndarray, ok: np.ndarray, near: np.ndarray | None
+) -> Inverse:
+    """Returns all joint vectors, after a search over all branches for the poses ``rest``: the nearest to ``near`` (m,
+    n), or if that is None to the solution of the previous pose."""
+    beyond, last = np.zeros(len(poses), bool), problem.middle
+    for start in range(0, len(rest), GROUP):
+        part = rest[start : start + GROUP]
+        every = _every_solution(problem, poses[part], None if near is None else q[part])
+        for i, solutions in zip(part, every, strict=True):
+            wanted = last if near is None else near[i]
+            best, beyond[i] = _nearest(problem, poses[[i]], solutions, wanted)
+            ok[i] = best is not None
+            q[i] = last = wanted if best is None else best
     return _finished(problem, poses, q, ok, beyond)
 
 
@@ -411,15 +409,6 @@ def _is_reached(problem: InverseProblem, off: np.ndarray) -> np.ndarray:
     """Returns (m,) true if errors (m, 6), rad and mm, are within tolerance; fewer than six joints: position only."""
     position = np.linalg.norm(off[:, 3:], axis=1) <= WITHIN_MM
     return position & ((np.linalg.norm(off[:, :3], axis=1) <= WITHIN_RAD) | problem.under_actuated)
-
-
-def _distinct(solutions: np.ndarray) -> np.ndarray:
-    """Returns the solutions without duplicates."""
-    kept: list[np.ndarray] = []
-    for q in solutions:
-        if all(np.abs(q - other).max() > SAME_BRANCH for other in kept):
-            kept.append(q)
-    return np.array(kept).reshape(-1, solutions.shape[1])
 
 
 def _turned(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

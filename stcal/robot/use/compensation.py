@@ -124,14 +124,10 @@ class Compensated(Brief):
         robot.
     identified : Robot
         The identified robot, with the tools that were taken.
-    reach_mm : float
-        Of the arm.
     beyond : dict of int to str
         Joints, and their values, of rows that only joint values beyond the limits reach.
     doubts : tuple of str
         Notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
-    controller : Robot or None
-        The nominal robot, with the tools that were taken.
     """
 
     targets: Targets
@@ -141,10 +137,8 @@ class Compensated(Brief):
     before_mm: np.ndarray
     before_rad: np.ndarray
     identified: Robot
-    reach_mm: float
     beyond: dict[int, str]
     doubts: tuple[str, ...] = ()
-    controller: Robot | None = None
     format: ClassVar = "stcal compensation 1"
 
     def __len__(self) -> int:
@@ -154,11 +148,6 @@ class Compensated(Brief):
     def remarks(self) -> list[str]:
         """Notes of the file of targets, and :meth:`notes`."""
         return [*self.targets.notes, *self.notes()]
-
-    @property
-    def lines(self) -> list[int]:
-        """Lines (m,) of the file."""
-        return [int(line) for line in self.targets.lines]
 
     @property
     def joints(self) -> list[dict[str, float] | None]:
@@ -186,7 +175,7 @@ class Compensated(Brief):
         ]
         if self.nominal is not None:
             moved = np.abs(found.q - self.nominal.q)[:, ~self.identified.prismatic].max(axis=1, initial=0.0)
-            expected = self.before_rad + self.before_mm / self.reach_mm
+            expected = self.before_rad + self.before_mm / reach_mm(self.identified, self.targets.tools[:1])
             for i in np.flatnonzero(self.compared() & (moved > FAR_RAD)).tolist():
                 mm, rad = self.before_mm[i], self.before_rad[i]
                 errs = f"the nominal joint values err by {mm:.4g} mm and {np.degrees(rad):.3g}°"
@@ -290,10 +279,8 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
         before_mm=np.linalg.norm(off[:, 3:], axis=1),
         before_rad=np.linalg.norm(off[:, :3], axis=1),
         identified=identified,
-        reach_mm=reach_mm(identified, targets.tools[:1]),
         beyond=beyond,
         doubts=doubts + of_targets + others + rigid,
-        controller=nominal,
     )
 
 
@@ -402,7 +389,9 @@ class CompensationFile(ResultFile):
 
     format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
     robot: str = Field(validation_alias=AliasPath("identified", "name"), description="name")
-    lines: list[int] = Field(description="of the poses in the file")
+    lines: Annotated[list[int], BeforeValidator(list)] = Field(
+        validation_alias=AliasPath("targets", "lines"), description="of the poses in the file"
+    )
     poses: Annotated[
         np.ndarray,
         Shape((None, 4, 4)),

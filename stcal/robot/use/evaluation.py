@@ -10,7 +10,7 @@ from scipy.stats import t as t_distribution
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.io.json import Matrix, Part, ResultFile
 from stcal.robot.identification.adjustment import (
@@ -19,13 +19,14 @@ from stcal.robot.identification.adjustment import (
     State,
     Weighting,
     as_seen,
+    frame_motions,
     jacobian,
     observed,
     only_of,
-    parameter_names,
     require_enough,
     residuals,
     tips_of,
+    tool_motions,
 )
 from stcal.robot.identification.prior import Placed
 from stcal.robot.identification.result import Figures, PlacedPose, position_errors
@@ -289,13 +290,10 @@ def _derivatives(state: State, base: Rigid, measured: Observed, fit: Fit) -> np.
     parts = [np.zeros((len(measured), WIDTH[measured.kind], 0))]
     tip = tips_of(state, measured.data)
     if "base" in fit and measured.kind != "distance":
-        moves = np.zeros((len(tip), 6, 6))
-        moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)
-        moves[:, 3:, :3] = -skew(tip.translation - base.translation)
-        parts.append(as_seen(state, measured, tip, moves))
+        parts.append(as_seen(state, measured, tip, frame_motions(tip, base.translation)))
     if "tool" in fit:
-        own = [name.startswith("tool") for name in parameter_names(state, measured.kind)]
-        parts.append(jacobian(state, measured)[:, :, own])
+        tools = (tool_motions(tip, measured.data.targets, name, measured.kind) for name in state.tools)
+        parts += [as_seen(state, measured, tip, moves) for moves in tools]
     return np.concatenate(parts, axis=2)
 
 

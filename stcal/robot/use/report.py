@@ -10,7 +10,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.table import QUATERNION, csv_text
-from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
+from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, subheading
 from stcal.report.svg import COLOURS, DASH, INK, Axes, Drawing, count_ticks, limits, log_limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import tips_of
@@ -162,36 +162,15 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
         ),
         "collisions are not checked: only joint limits and the box of the tool",
     ]
-    places = [
-        "Tool in the robot's base (square: its origin); the arrow is the tool's z axis",
-        plots(
-            plot(lambda: _tool_figure(result, 1), "tool positions from above", "From above", ""),
-            plot(lambda: _tool_figure(result, 2), "tool positions from the side", "From the side", ""),
-        ),
-    ]
     chosen = Table(["pose", *joints, "x mm", "y mm", "z mm"], poses)
     return Document(
         f"Measurement poses for {robot.name}",
         f"{len(result.q)} poses for {result.seen} parameters, {result.exchanges} exchanges after the greedy choice",
         [
             Section("Against random poses", against, terminal=True),
-            Section("Where the tool is", places),
             Section("Poses", ["In order of choice: the first ones alone are a good set too", chosen]),
         ],
     )
-
-
-def _tool_figure(result: PoseDesign, up: int) -> Drawing:
-    """Returns a plot of the tool's positions and z axes: x against the coordinate ``up``."""
-    at, z = result.poses.translation[:, [0, up]], result.poses.rotation[:, [0, up], 2]
-    z = 0.12 * float(np.ptp(result.poses.translation, axis=0).max()) * z
-    drawing = Drawing(5, 4.2)
-    axes = Axes.equal(drawing, drawing.panels()[0], np.vstack([at, at + z, np.zeros((1, 2))]))
-    axes.frame("x, mm", f"{'xyz'[up]}, mm", "xy")
-    axes.arrows(at, z, 1.1, COLOURS[2])
-    axes.marks(*at.T, kind="dot", size=4, colour=COLOURS[0])
-    axes.marks(0, 0, "square", 6, INK)
-    return drawing
 
 
 MOST_NOTES = 500
