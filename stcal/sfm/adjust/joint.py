@@ -301,7 +301,11 @@ def _start(
     groups = tuple(_group(model, board, labels) for model in models)
     flatness_mm = np.inf if flatness_mm is None else flatness_mm
     setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis_of(prior), weight, np.inf)
-    return _with_common(setting, setting.values(_shared_circles(groups, len(labels)), start or camera), common)
+    total, count = np.zeros((len(labels), 3)), np.zeros(len(labels))
+    for group in groups:  # circles begin at their means over the groups
+        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
+        np.add.at(count, group.circle_place, 1)
+    return _with_common(setting, setting.values(total / count[:, None], start or camera), common)
 
 
 def _with_common(setting: Setting, values: Values, common: float) -> tuple[Setting, Values]:
@@ -390,15 +394,6 @@ def _common_share(setting: Setting, values: Values) -> float:
         return 0.0
     share = product / square
     return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
-
-
-def _shared_circles(groups: Sequence[Group], count: int) -> np.ndarray:
-    """Returns start values of the circles: their means over the groups."""
-    total, group_count = np.zeros((count, 3)), np.zeros(count)
-    for group in groups:
-        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
-        np.add.at(group_count, group.circle_place, 1)
-    return total / group_count[:, None]
 
 
 def scale_of(sigma0: float) -> float:

@@ -71,13 +71,12 @@ def _size_ratio(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> float
 def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
     """Returns the faces that are turned against most others, with their angles, degrees."""
     off = {face: found[face].rotation @ rough[face].rotation.T for face in rough}
-    angles = {anchor: {face: _angle_deg(own.T @ off[face]) for face in off} for anchor, own in off.items()}
+    angles = {
+        anchor: {face: float(np.degrees(Rigid(own.T @ other).angle_rad())) for face, other in off.items()}
+        for anchor, own in off.items()
+    }
     anchor = max(angles, key=lambda face: sum(angle <= MOST_TURNED_DEG for angle in angles[face].values()))
     return {face: angle for face, angle in angles[anchor].items() if angle > MOST_TURNED_DEG}
-
-
-def _angle_deg(rotation: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
 
 
 def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[str]:

@@ -35,7 +35,11 @@ def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, 
             if pose is not None:
                 poses[image.name] = pose
     placed = [image for image in group if image.name in poses]
-    xyz |= _triangulated(placed, poses, xyz.keys())
+    unknown = {label for image in placed for label in image.labels} - xyz.keys()
+    for label, (centre, direction) in rays_of(placed, poses, unknown).items():
+        if widest_angle_rad(direction) >= MIN_RAY_ANGLE_RAD:  # least squares of distances from the rays
+            across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+            xyz[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
     return assemble(WorldModel, model.group, placed, [poses[image.name] for image in placed], xyz)
 
 
@@ -56,18 +60,6 @@ def _resect(
     if answer is None or answer["num_inliers"] < max(MIN_POINTS, MIN_SHARE * len(known)):
         return None
     return rigid_from_colmap(answer["cam_from_world"])
-
-
-def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], known) -> dict[Label, np.ndarray]:
-    """Returns the places of circles that are not ``known``, by label: least squares of distances from the rays."""
-    unknown = {label for image in images for label in image.labels} - known
-    places = {}
-    for label, (centre, direction) in rays_of(images, poses, unknown).items():
-        if widest_angle_rad(direction) < MIN_RAY_ANGLE_RAD:
-            continue
-        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        places[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
-    return places
 
 
 def rays_of(
@@ -135,7 +127,15 @@ def map_group(
             f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle",
         )
     model, outliers = labelled_model(reconstruction, group, ids, camera)
-    _require_agreement(model, group)
+    count = Counter(label for image in group for label in image.labels)
+    wanted = sum(n >= 2 for n in count.values())
+    if len(model.labels) < MIN_AGREEMENT * wanted:
+        raise MappingError(
+            "E-MAPPING-DISAGREE",
+            f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
+            f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
+            "check that the camera file belongs to the images, and that nothing but the camera moved",
+        )
     return Mapping(model, outliers, left_out(group, model), seeded)
 
 
@@ -176,18 +176,6 @@ def left_out(
                 "check that it is sharp, and that nothing but the camera moved"
             )
     return reasons
-
-
-def _require_agreement(model: WorldModel, group: list[ImageObservations]) -> None:
-    count = Counter(label for image in group for label in image.labels)
-    wanted = sum(n >= 2 for n in count.values())
-    if len(model.labels) < MIN_AGREEMENT * wanted:
-        raise MappingError(
-            "E-MAPPING-DISAGREE",
-            f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
-            f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
-            "check that the camera file belongs to the images, and that nothing but the camera moved",
-        )
 
 
 def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPipelineOptions:
