@@ -251,17 +251,17 @@ class OfTarget:
     def cost(self, values: Mapping[str, Any]) -> float:
         """Returns squared deviations over σ²."""
         rows, known = self._known(values)
-        return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) for _, _, gap in rows)
+        return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
 
     def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Returns normal matrix (3c, 3c) and right side (3c,)."""
         size = values[CIRCLES].array.size
         normal, right = np.zeros((size, size)), np.zeros(size)
         rows, known = self._known(values)
-        for members, slope, gap in rows:
+        for members, slope, gap, sigma in rows:
             place = coordinates(members)
-            normal[np.ix_(place, place)] += slope.T @ slope
-            right[place] -= slope.T @ gap
+            normal[np.ix_(place, place)] += slope.T @ slope / sigma**2
+            right[place] -= slope.T @ gap / sigma**2
         for shape in known:
             place = coordinates(shape.members)
             normal[np.ix_(place, place)] += shape.normal()
@@ -269,8 +269,8 @@ class OfTarget:
         return normal, right
 
 
-KnownRows = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Circles (n,), derivatives (r, 3n) of r deviations by their coordinates, and these (r,), over σ."""
+KnownRows = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+"""Circles (n,), derivatives (r, 3n) of r deviations by their coordinates, these (r,), mm, and their σ, mm."""
 
 
 def coordinates(members: np.ndarray) -> np.ndarray:
@@ -293,8 +293,9 @@ def planes(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
         normal = fit_plane(own).normal
         base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
         design = np.column_stack([np.ones(len(own)), (own - own.mean(0)) @ base])
-        across = (np.eye(len(own)) - design @ np.linalg.pinv(design)) / setting.flatness_mm  # heights to distances
-        yield members, (across[:, :, None] * normal).reshape(len(own), -1), across @ (own @ normal)
+        across = np.eye(len(own)) - design @ np.linalg.pinv(design)  # from heights to distances
+        slope = (across[:, :, None] * normal).reshape(len(own), -1)
+        yield members, slope, across @ (own @ normal), setting.flatness_mm
 
 
 def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
@@ -329,8 +330,8 @@ def bars(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
             members = np.array([place[known.first], place[known.second]])
             apart = xyz[members[0]] - xyz[members[1]]
             length = float(np.linalg.norm(apart))
-            slope = np.concatenate([apart, -apart]) / (length * known.sigma_mm)
-            yield members, slope[None], np.array([(length - known.mm) / known.sigma_mm])
+            slope = np.concatenate([apart, -apart]) / length
+            yield members, slope[None], np.array([length - known.mm]), known.sigma_mm
 
 
 def free_directions(values: Mapping[str, Any]) -> np.ndarray:

@@ -406,7 +406,7 @@ def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: 
     values, groups, camera = solution.values, setting.groups, setting.camera(solution.values)
     models = tuple(group.at(values) for group in groups)
     xyz = values[CIRCLES].array
-    flat = sum(len(members) - 3 for members, _, _ in planes(xyz, setting))
+    flat = sum(len(members) - 3 for members, *_ in planes(xyz, setting))
     for shape in shapes(xyz, setting):
         flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
     flat += sum(1 for _ in bars(xyz, setting))

@@ -274,8 +274,8 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
     intrinsics = inverse[solution.parts[0].places[CAMERA]]
     covariance[INTRINSICS] += intrinsics.T @ setting.prior @ intrinsics
     for kind, known in ((FLATNESS, planes), (DISTANCES, bars)):
-        for members, slope, _ in known(xyz, setting):
-            rows = slope @ inverse[coordinates(members)]
+        for members, slope, _, sigma in known(xyz, setting):
+            rows = slope @ inverse[coordinates(members)] / sigma
             covariance[kind] += rows.T @ rows
     for shape in shapes(xyz, setting):
         rows = inverse[coordinates(shape.members)]

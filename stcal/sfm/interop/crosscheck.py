@@ -298,11 +298,10 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
         network = free_network(with_sigma(model, factors), run.camera)
         covariance = dict(zip(model.images, network.pose_covariance(), strict=True))
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
-        for name, pose in zip(theirs.images, theirs.camera_from_model, strict=True):
+        aligned = theirs.in_world(alignment).camera_from_model
+        for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
             if name not in poses:
                 continue
-            turned = pose.rotation @ alignment.rigid.rotation.T
-            moved = Rigid(turned, alignment.scale * pose.translation - turned @ alignment.rigid.translation)
             target_from_a, target_from_b = pose.inverse(), poses[name].inverse()
             turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
             rows.append(

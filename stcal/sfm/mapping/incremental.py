@@ -113,9 +113,18 @@ def map_group(
 ) -> Mapping:
     """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
     If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
-    names = [image.name for image in group if image.name in skeleton]
+    names, pair, reconstruction = [image.name for image in group if image.name in skeleton], pairs[0], None
+    first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
     try:
-        reconstruction, seeded = _mapped(database, scratch, group, names, ids, pairs[0])
+        if share_board_alone(first, second):
+            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
+            reconstruction = _own_mapping(database, names, ids, pair)
+        if reconstruction is None:
+            seeded = "COLMAP's estimate of the chosen pair"
+            reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
+        if reconstruction is None:
+            seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
+            reconstruction = _own_mapping(database, names, ids, pair)
     except RuntimeError as error:
         if "SQLite" not in str(error):
             raise
@@ -123,8 +132,8 @@ def map_group(
     if reconstruction is None:
         raise MappingError(
             "E-MAPPING-NO-MODEL",
-            f"group {group[0].group}: no model from the pair {pairs[0].first}, {pairs[0].second} "
-            f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle",
+            f"group {group[0].group}: no model from the pair {pair.first}, {pair.second} "
+            f"({pair.shared} circles in common); add views between the two, or change --max-angle",
         )
     model, outliers = labelled_model(reconstruction, group, ids, camera)
     count = Counter(label for image in group for label in image.labels)
@@ -137,28 +146,6 @@ def map_group(
             "check that the camera file belongs to the images, and that nothing but the camera moved",
         )
     return Mapping(model, outliers, left_out(group, model), seeded)
-
-
-def _mapped(
-    database: Path,
-    scratch: Path,
-    group: list[ImageObservations],
-    names: list[str],
-    ids: dict[str, int],
-    pair: PairScore,
-) -> tuple[pycolmap.Reconstruction | None, str]:
-    """Returns the model that grows from the chosen pair, None if none does, and how the pair was registered."""
-    first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
-    if share_board_alone(first, second):
-        reconstruction = _own_mapping(database, names, ids, pair)
-        if reconstruction is not None:
-            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
-            return reconstruction, seeded
-    reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
-    if reconstruction is not None:
-        return reconstruction, "COLMAP's estimate of the chosen pair"
-    seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
-    return _own_mapping(database, names, ids, pair), seeded
 
 
 def left_out(
