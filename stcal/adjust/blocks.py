@@ -34,9 +34,15 @@ class Values(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vector:
-    """Members without curvature."""
+    """Members without curvature.
 
-    array: np.ndarray  # (n, dim)
+    Parameters
+    ----------
+    array : (n, dim) array
+        The members.
+    """
+
+    array: np.ndarray
 
     @property
     def dim(self) -> int:
@@ -53,10 +59,18 @@ class Vector:
 
 @dataclass(frozen=True, slots=True)
 class Huber:
-    """Huber's loss of the lengths of rows over their σ."""
+    """Huber's loss of the lengths of rows over their σ.
 
-    limit: float = np.inf  # length up to which it is the square
-    gross: float = np.inf  # length beyond which it is constant, and the row has no weight
+    Parameters
+    ----------
+    limit : float
+        Length up to which it is the square.
+    gross : float
+        Length beyond which it is constant, and the row has no weight.
+    """
+
+    limit: float = np.inf
+    gross: float = np.inf
 
     def cost(self, length: np.ndarray) -> np.ndarray:
         """Return the loss of lengths (r,)."""
@@ -69,12 +83,24 @@ class Huber:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """A block of unknowns; to be had from :meth:`Adjustment.block`."""
+    """A block of unknowns; to be had from :meth:`Adjustment.block`.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    start : Vector or PoseStack
+        Its n members at the start.
+    eliminate : bool
+        Whether it is eliminated.
+    fixed : (n,) bool array
+        Members that stay.
+    """
 
     name: str
-    start: Values  # its n members at the start
+    start: Values
     eliminate: bool
-    fixed: np.ndarray  # (n,) bool, members that stay
+    fixed: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

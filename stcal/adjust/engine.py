@@ -44,6 +44,13 @@ AT_ONCE = 10_000
 class Adjustment:
     """A problem of least squares.
 
+    Parameters
+    ----------
+    blocks, factors, priors : lists
+        What :meth:`block`, :meth:`factor` and :meth:`prior` have added.
+    sigma : dict of str to float
+        Factor on the σ of a kind of rows, 1 where it is not stated.
+
     Examples
     --------
     >>> a = Adjustment()
@@ -57,7 +64,7 @@ class Adjustment:
     blocks: list[Block] = field(default_factory=list)
     factors: list[Factor] = field(default_factory=list)
     priors: list[Known] = field(default_factory=list)
-    sigma: dict[str, float] = field(default_factory=dict)  # factor on the σ of a kind of rows, 1 where not stated
+    sigma: dict[str, float] = field(default_factory=dict)
 
     def block(self, name: str, start: Values, eliminate: bool = False, fixed: Sequence[int] | np.ndarray = ()) -> Block:
         """Add a block of unknowns.
@@ -165,10 +172,18 @@ class Adjustment:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """An adjustment linearised about a state."""
+    """An adjustment linearised about a state.
+
+    Parameters
+    ----------
+    problem : Adjustment
+        The adjustment.
+    values : dict of str to Vector or PoseStack
+        The members of each block, by its name.
+    """
 
     problem: Adjustment
-    values: dict[str, Any]  # members of each block, by its name
+    values: dict[str, Any]
 
     @property
     def cost(self) -> float:
@@ -431,14 +446,21 @@ def _by_clusters(normal: np.ndarray, told: Iterable[tuple[np.ndarray, np.ndarray
 class Joined:
     """Adjustments that have blocks in common, such as those of groups of photographs by one camera.
 
-    The names of blocks that are not shared differ from part to part, as do the numbers of their clusters. What is known
-    of shared ones stands in one part only. All other unknowns are eliminated.
+    Parameters
+    ----------
+    parts : sequence of Adjustment
+        The adjustments. The names of blocks that are not shared differ from part to part, as do the numbers of their
+        clusters.
+    shared : tuple of str
+        Names of the blocks in common, the first ones of each part. What is known of them stands in one part only. All
+        other unknowns are eliminated.
+    free : callable, optional
+        Returns of a state the orthonormal directions (s, f) of the shared unknowns in which nothing changes, such as
+        motions of all points; the datum is that of smallest trace over them.
     """
 
     parts: Sequence[Adjustment]
-    shared: tuple[str, ...]  # names of the blocks in common, the first ones of each part
-    # returns of a state the orthonormal directions (s, f) of the shared unknowns in which nothing changes, such as
-    # motions of all points; the datum is that of smallest trace over them
+    shared: tuple[str, ...]
     free: Callable[[Mapping[str, Any]], np.ndarray] | None = None
 
     def cost(self, values: Mapping[str, Any]) -> float:
