@@ -159,7 +159,11 @@ def make_pattern(
         least, best = circles + 1, None
         for _ in range(TRIES):
             face = _strewn(side, circles, radius_mm, rng)
-            if face is not None and (alike := _likeness(face, faces)) < least:
+            if face is None:
+                continue
+            # With itself turned or mirrored, or another one or its mirror image.
+            pairs = [(other, mirrored) for other in (face, *faces) for mirrored in (False, True)]
+            if (alike := max(in_common(face, *pair) for pair in pairs)) < least:
                 least, best = alike, face
             if least == 0:
                 break
@@ -178,12 +182,6 @@ def make_pattern(
         faces.append(best)
         likeness = max(likeness, least)
     return MadeTarget(TargetDesign(name, polarity, tuple(faces)), likeness)
-
-
-def _likeness(face: FaceDesign, others: list[FaceDesign]) -> int:
-    """Most circles in common with the face itself turned or mirrored, or another one or its mirror image."""
-    pairs = [(face, False), (face, True), *((other, mirrored) for other in others for mirrored in (False, True))]
-    return max(in_common(face, other, mirrored) for other, mirrored in pairs)
 
 
 def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) -> FaceDesign | None:
@@ -387,22 +385,14 @@ def make_target(options: DesignOptions, progress: Callable[[int, int], None] | N
             f"radius {LARGE * radius:g} mm is {largest:.0f} px in the image, at most {most / FARTHER:.0f} px are "
             "sought; smaller circles or a camera farther away needed",
         )
-    pattern, cases = _named(options, radius, progress)
-    return Made(options, pattern, _board(options, least), radius, least, cases)
-
-
-def _named(
-    options: DesignOptions, radius_mm: float, progress: Callable[[int, int], None] | None
-) -> tuple[MadeTarget, int]:
-    """Returns the first pattern whose faces are identified in every case of hidden circles, and the number of cases."""
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm, options.faces)
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):
         seed = [options.seed, attempt] if attempt else options.seed
-        pattern = make_pattern(sides, options.circles, radius_mm, options.polarity, seed, name)
-        failed, cases = unnamed_cases(pattern.target, options.ideal_camera(), options.distance_mm, HIDDEN, progress)
+        pattern = make_pattern(sides, options.circles, radius, options.polarity, seed, name)
+        failed, cases = unnamed_cases(pattern.target, camera, options.distance_mm, HIDDEN, progress)
         if not failed:
-            return pattern, cases
+            return Made(options, pattern, _board(options, least), radius, least, cases)
     face, hidden_ids = failed[0]
     raise InputError(
         "E-MAKE-UNNAMED",

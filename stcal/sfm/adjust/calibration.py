@@ -140,7 +140,9 @@ def calibrate(
     ConvergenceError
         The adjustment finds no minimum.
     """
-    published, joint_rounds = options.solve == "paper", _joint_rounds(options, prior)
+    published = options.solve == "paper"
+    prior = prior if options.refine_camera else None
+    joint_rounds = 0 if options.solve != "joint" else JOINT_ROUNDS + (prior is not None)  # refined intrinsics: one more
     step = counted(progress or (lambda *_: None), "faces", 1 + joint_rounds + (joint_rounds > 0))
     scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
@@ -157,11 +159,15 @@ def calibrate(
     except MappingError as error:  # a face without a frame may be why
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     factors = image_sigma_factors(models, camera, target.printed_ids())
-    metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
+    metric = [  # in the target frame, placed by its chain
+        m.metric(calibrated.target_from_group[m.group] @ scales[m.group].group_from_world())
+        for m in models
+        if m.group in calibrated.target_from_group
+    ]
     joint, circle_sigma_px = None, None
     step(None)
     if joint_rounds:
-        state, factors = _adjust_all(metric, factors, camera, target, board, options, prior, step)
+        state, factors = _adjust_all(metric, factors, camera, target, board, options, prior, joint_rounds, step)
         state = with_differences(state, calibrated, target, options.frame)
         joint = result_of(state)
         calibrated = calibrated_target(joint, calibrated, target, options.frame, state)
@@ -169,7 +175,12 @@ def calibrate(
         step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
-        notes += _unsettled(joint)
+        if not joint.settled:
+            notes.append(
+                f"joint adjustment: not settled, projections still moved by {joint.last_move_px:.1g} px in the last "
+                f"step, less than {SETTLED_PX:g} px needed; look at the checks for what contradicts the rest, take it "
+                "out and run again"
+            )
         if state.differ > NOTED:
             notes.append(
                 f"photographs differ {state.differ:.1f} times more than their pixels explain: σ are larger by that"
@@ -253,7 +264,13 @@ def _faces(
     """Returns the frames of the faces in all groups, and notes. Frame circles that a group lacks are placed by the
     others, as other groups or the design have them; the joint adjustment starts from there."""
     results = [faces_of_group(model, camera, target, options.frame) for model in models]
-    circles_by_face = _circles_of([face for group_faces, _ in results for face in group_faces])
+    places: dict[str, dict[str, list[np.ndarray]]] = {}
+    for face in (face for group_faces, _ in results for face in group_faces):
+        for label, xyz in zip(face.labels, face.xyz_face, strict=True):
+            places.setdefault(face.face, {}).setdefault(label.circle, []).append(xyz)
+    circles_by_face = {
+        face: {c: np.mean(xyz, axis=0) for c, xyz in centres.items()} for face, centres in places.items()
+    }
     if any(notes for _, notes in results):
         known = {face.id: circles_by_face.get(face.id) for face in target.faces}
         results = [faces_of_group(model, camera, target, options.frame, known) for model in models]
@@ -271,44 +288,13 @@ def _faces(
     return [face for group_faces, _ in results for face in group_faces], notes
 
 
-def _circles_of(faces: Sequence[FaceInGroup]) -> dict[str, dict[str, np.ndarray]]:
-    """Returns circles (3,) in the frame of their face, by face and id, as means over the groups."""
-    places: dict[str, dict[str, list[np.ndarray]]] = {}
-    for face in faces:
-        for label, xyz in zip(face.labels, face.xyz_face, strict=True):
-            places.setdefault(face.face, {}).setdefault(label.circle, []).append(xyz)
-    return {face_id: {c: np.mean(xyz, axis=0) for c, xyz in centres.items()} for face_id, centres in places.items()}
-
-
-def _placed(model: WorldModel, scale: Scale, start: CalibratedTarget) -> MetricModel:
-    """Returns the model in mm in the target frame, placed by its chain."""
-    return model.metric(start.target_from_group[model.group] @ scale.group_from_world())
-
-
-def _unsettled(joint: JointResult) -> list[str]:
-    """Returns the note on a joint adjustment that stopped before its minimum, if it did."""
-    if joint.settled:
-        return []
-    return [
-        f"joint adjustment: not settled, projections still moved by {joint.last_move_px:.1g} px in the last step, less "
-        f"than {SETTLED_PX:g} px needed; look at the checks for what contradicts the rest, take it out and run again"
-    ]
-
-
-def _joint_rounds(options: AdjustOptions, prior: CameraPrior | None) -> int:
-    """Returns the number of joint adjustments; refined intrinsics need one more."""
-    return 0 if options.solve != "joint" else JOINT_ROUNDS + (options.refine_camera and prior is not None)
-
-
 def _adjust_all(
-    models: list[MetricModel], factors: SigmaFactors, camera: Camera, target, board, options: AdjustOptions, prior, step
+    models: list[MetricModel], factors: SigmaFactors, camera: Camera, target, board, options, prior, rounds: int, step
 ) -> tuple[Adjusted, SigmaFactors]:
     """Runs joint adjustments; returns the last state and the factors on the centres' σ. Eccentricity, and for a refined
     camera the factors, are computed again before each."""
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]
-    rounds = _joint_rounds(options, prior)
-    prior = prior if options.refine_camera else None
     current, shape_factors = camera, (1.0, 1.0, 1.0)
     for last in [False] * (rounds - 1) + [True]:
         if options.eccentricity:

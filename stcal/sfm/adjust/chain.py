@@ -118,11 +118,20 @@ def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
 
 def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[FaceChain, ...]]:
     """Returns all ways to every face but the reference face, with their deviations from the calibrated pose."""
-    return {
-        face_id: tuple(_measure(way, faces, pose) for way in _chains(faces, calibrated.reference_face, face_id))
-        for face_id, pose in calibrated.target_from_face.items()
-        if face_id != calibrated.reference_face
-    }
+    found = {}
+    for face_id, pose in calibrated.target_from_face.items():
+        if face_id != calibrated.reference_face:
+            ways = _chains(faces, calibrated.reference_face, face_id)
+            along = [_along(way, faces) for way in ways]
+            found[face_id] = tuple(
+                FaceChain(
+                    *way,
+                    float(np.linalg.norm(chained.translation - pose.translation)),
+                    (chained @ pose.inverse()).angle_rad(),
+                )
+                for way, chained in zip(ways, along, strict=True)
+            )
+    return found
 
 
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
@@ -149,13 +158,6 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
     return complete
 
 
-def _measure(chain, faces: Sequence[FaceInGroup], combined: Rigid) -> FaceChain:
-    way, groups = chain
-    difference = _along(chain, faces) @ combined.inverse()
-    shift = _along(chain, faces).translation - combined.translation
-    return FaceChain(way, groups, float(np.linalg.norm(shift)), difference.angle_rad())
-
-
 def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
     """Returns reference_from_face along one chain."""
     pose = {(face.group, face.face): face.group_from_face for face in faces}
@@ -164,12 +166,6 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
     for group, a, b in zip(groups, way[:-1], way[1:], strict=True):
         result = result @ pose[group, a].inverse() @ pose[group, b]
     return result
-
-
-def _pose_information(each: FaceInGroup) -> np.ndarray:
-    """Returns the 6×6 information of (rotation rad, translation mm) of a face frame, perturbed in that frame."""
-    jacobian = np.concatenate([-skew(each.xyz_face), np.broadcast_to(np.eye(3), (len(each.labels), 3, 3))], axis=2)
-    return np.einsum("nki,nkl,nlj->ij", jacobian, each.information, jacobian)
 
 
 def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
@@ -181,7 +177,11 @@ def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[
     for face_in_group in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
         start_group.setdefault(face_in_group.group, start[face_in_group.face] @ face_in_group.group_from_face.inverse())
     free = [face_id for face_id in start if face_id != reference]
-    roots = [np.linalg.cholesky(_pose_information(face_in_group) + 1e-12 * np.eye(6)).T for face_in_group in faces]
+    roots = []  # of the information of (rotation rad, translation mm) of each face frame, perturbed in that frame
+    for each in faces:
+        by_pose = np.concatenate([-skew(each.xyz_face), np.broadcast_to(np.eye(3), (len(each.labels), 3, 3))], axis=2)
+        information = np.einsum("nki,nkl,nlj->ij", by_pose, each.information, by_pose)
+        roots.append(np.linalg.cholesky(information + 1e-12 * np.eye(6)).T)
 
     names = [("face", f) for f in free] + [("group", g) for g in groups]
     column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(names)}

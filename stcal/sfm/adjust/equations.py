@@ -235,50 +235,42 @@ class _Gap:
 
 @dataclass(slots=True, eq=False)
 class OfTarget:
-    """What is known of the circles: flatness of faces, faces of known shape, known distances."""
+    """What is known of the circles: flatness of faces, known distances, faces of known shape."""
 
     block: Block
     setting: Setting
-    last: tuple[Vector | None, list, list, list] = (None, [], [], [])  # circles, and their faces and distances
+    last: tuple[Vector | None, list, list] = (None, [], [])  # circles, and the rows and shapes at them
 
-    def _known(self, values: Mapping[str, Any]) -> tuple[list, list, list]:
-        """Returns planes, shapes and distances at a state; both cost and equations of it are asked for."""
+    def _known(self, values: Mapping[str, Any]) -> tuple[list, list]:
+        """Returns rows and shapes at a state; both cost and equations of it are asked for."""
         if self.last[0] is not values[CIRCLES]:
             xyz, setting = values[CIRCLES].array, self.setting
-            known = list(planes(xyz, setting)), list(shapes(xyz, setting)), list(bars(xyz, setting))
-            self.last = values[CIRCLES], *known
+            self.last = values[CIRCLES], [*planes(xyz, setting), *bars(xyz, setting)], list(shapes(xyz, setting))
         return self.last[1:]
 
     def cost(self, values: Mapping[str, Any]) -> float:
         """Returns squared deviations over σ²."""
-        xyz, setting = values[CIRCLES].array, self.setting
-        flat, known, distances = self._known(values)
-        cost = sum(shape.cost() for shape in known)
-        for members, across, normal in flat:
-            cost += float(((across @ (xyz[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
-        return cost + sum((off / sigma) ** 2 for _, _, off, sigma in distances)
+        rows, known = self._known(values)
+        return sum(shape.cost() for shape in known) + sum(float((gap**2).sum()) / sigma**2 for _, _, gap, sigma in rows)
 
     def equations(self, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Returns normal matrix (3c, 3c) and right side (3c,)."""
-        xyz, setting = values[CIRCLES].array, self.setting
-        normal, right = np.zeros((xyz.size, xyz.size)), np.zeros(xyz.size)
-        flat, known, distances = self._known(values)
-        for members, across, normal_model in flat:
-            jacobian = across[:, :, None] * normal_model  # derivatives of distances from the plane by the circles
-            rows = jacobian.reshape(len(members), -1)
+        size = values[CIRCLES].array.size
+        normal, right = np.zeros((size, size)), np.zeros(size)
+        rows, known = self._known(values)
+        for members, slope, gap, sigma in rows:
             place = coordinates(members)
-            normal[np.ix_(place, place)] += rows.T @ rows / setting.flatness_mm**2
-            right[place] -= rows.T @ (across @ (xyz[members] @ normal_model)) / setting.flatness_mm**2
+            normal[np.ix_(place, place)] += slope.T @ slope / sigma**2
+            right[place] -= slope.T @ gap / sigma**2
         for shape in known:
             place = coordinates(shape.members)
             normal[np.ix_(place, place)] += shape.normal()
             right[place] -= shape.slope()
-        for members, along, off, sigma in distances:
-            place = coordinates(members)
-            row = np.concatenate([along, -along]) / sigma
-            normal[np.ix_(place, place)] += np.outer(row, row)
-            right[place] -= row * off / sigma
         return normal, right
+
+
+KnownRows = tuple[np.ndarray, np.ndarray, np.ndarray, float]
+"""Circles (n,), derivatives (r, 3n) of r deviations by their coordinates, these (r,), mm, and their σ, mm."""
 
 
 def coordinates(members: np.ndarray) -> np.ndarray:
@@ -286,25 +278,24 @@ def coordinates(members: np.ndarray) -> np.ndarray:
     return (3 * members[:, None] + np.arange(3)).ravel()
 
 
-def planes(xyz: np.ndarray, setting: Setting):
-    """Yields the circles of each face of more than three, the projector from heights to distances from the best plane,
-    and its normal; not of faces of known shape."""
+def planes(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
+    """Yields the distances of the circles of each face of more than three from their best plane; not of faces of known
+    shape."""
     if not np.isfinite(setting.flatness_mm):
         return
     known = {face.id for face in faces_of_known_shape(setting.board)}
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(setting.labels):
-        if label.face in known:
-            continue
-        faces.setdefault(label.face, []).append(i)
-    for indices in faces.values():
-        if len(indices) > 3:
-            members = np.array(indices)
-            own = xyz[members]
-            normal = fit_plane(own).normal
-            base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
-            design = np.column_stack([np.ones(len(indices)), (own - own.mean(0)) @ base])
-            yield members, np.eye(len(indices)) - design @ np.linalg.pinv(design), normal
+        if label.face not in known:
+            faces.setdefault(label.face, []).append(i)
+    for members in (np.array(indices) for indices in faces.values() if len(indices) > 3):
+        own = xyz[members]
+        normal = fit_plane(own).normal
+        base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
+        design = np.column_stack([np.ones(len(own)), (own - own.mean(0)) @ base])
+        across = np.eye(len(own)) - design @ np.linalg.pinv(design)  # from heights to distances
+        slope = (across[:, :, None] * normal).reshape(len(own), -1)
+        yield members, slope, across @ (own @ normal), setting.flatness_mm
 
 
 def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
@@ -331,15 +322,16 @@ def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
             continue
 
 
-def bars(xyz: np.ndarray, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
-    """Yields the known distances: both points, the direction to the first, how much too long, and σ, mm."""
+def bars(xyz: np.ndarray, setting: Setting) -> Iterator[KnownRows]:
+    """Yields by how much known distances are too long."""
     place = {label: i for i, label in enumerate(setting.labels)}
     for known in known_distances(setting.board):
         if known.first in place and known.second in place:
             members = np.array([place[known.first], place[known.second]])
             apart = xyz[members[0]] - xyz[members[1]]
             length = float(np.linalg.norm(apart))
-            yield members, apart / length, length - known.mm, known.sigma_mm
+            slope = np.concatenate([apart, -apart]) / length
+            yield members, slope[None], np.array([length - known.mm]), known.sigma_mm
 
 
 def free_directions(values: Mapping[str, Any]) -> np.ndarray:

@@ -265,7 +265,9 @@ def faces_of_group(
     """Returns the frames of all faces of one group, and the reasons why other faces have none; frame circles of
     ``known`` faces may be placed by their other circles."""
     xyz = model.xyz_model
-    information = _point_information(model, camera)
+    by_point = model.whiten(projection_jacobians(model, camera)[1])
+    information = np.zeros((len(model.labels), 3, 3))  # inverse covariance of each point, given the cameras, mm⁻²
+    np.add.at(information, model.point_index, np.swapaxes(by_point, 1, 2) @ by_point)
     cameras = np.stack([pose.inverse().translation for pose in model.camera_from_model])
     faces, notes = [], []
     for face in target.faces:
@@ -299,11 +301,3 @@ def faces_of_group(
             f"group {model.group}: no face mapped (two images must see it); add views that show faces and board"
         )
     return faces, notes
-
-
-def _point_information(model: MetricModel, camera: Camera) -> np.ndarray:
-    """Returns the inverse covariance (p, 3, 3) of each point, given the cameras, mm⁻²."""
-    jacobian = model.whiten(projection_jacobians(model, camera)[1])
-    information = np.zeros((len(model.labels), 3, 3))
-    np.add.at(information, model.point_index, np.swapaxes(jacobian, 1, 2) @ jacobian)
-    return information

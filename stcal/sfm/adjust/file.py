@@ -1,7 +1,6 @@
 """``faces.json``: the calibrated target as a file."""
 
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -11,7 +10,6 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.files import require_written
 from stcal.io.json import (
     ByFace,
     ByLabel,
@@ -24,9 +22,7 @@ from stcal.io.json import (
     Vector,
     Vector3,
     mistake,
-    read_result,
 )
-from stcal.io.table import POSE_MM, pose_values
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import AdjustOptions, Solve
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -174,16 +170,3 @@ class FacesFile(ResultFile):
     def poses(self) -> dict[str, Rigid]:
         """Returns target_from_face of every face, by face."""
         return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}
-
-
-def require_faces_written(path: str | Path, target: CalibratedTarget) -> None:
-    """Read a written ``faces.json`` again, and require the faces and circles that were reported."""
-
-    def values(poses: Mapping[str, Rigid], circles: Iterable[np.ndarray]) -> np.ndarray:
-        return np.concatenate([pose_values(poses).ravel(), np.ravel(list(circles))])
-
-    def again() -> np.ndarray:
-        faces = read_result(path, FacesFile, "faces", "report this with its data")
-        return values(faces.poses(), faces.circles.values())
-
-    require_written(path, again, values(target.target_from_face, target.circles.values()), POSE_MM, "mm")

@@ -301,7 +301,11 @@ def _start(
     groups = tuple(_group(model, board, labels) for model in models)
     flatness_mm = np.inf if flatness_mm is None else flatness_mm
     setting = Setting(groups, labels, board, 0.0, flatness_mm, camera, basis_of(prior), weight, np.inf)
-    return _with_common(setting, setting.values(_shared_circles(groups, len(labels)), start or camera), common)
+    total, count = np.zeros((len(labels), 3)), np.zeros(len(labels))
+    for group in groups:  # circles begin at their means over the groups
+        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
+        np.add.at(count, group.circle_place, 1)
+    return _with_common(setting, setting.values(total / count[:, None], start or camera), common)
 
 
 def _with_common(setting: Setting, values: Values, common: float) -> tuple[Setting, Values]:
@@ -392,15 +396,6 @@ def _common_share(setting: Setting, values: Values) -> float:
     return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
 
 
-def _shared_circles(groups: Sequence[Group], count: int) -> np.ndarray:
-    """Returns start values of the circles: their means over the groups."""
-    total, group_count = np.zeros((count, 3)), np.zeros(count)
-    for group in groups:
-        np.add.at(total, group.circle_place, group.model.xyz_model[group.circles])
-        np.add.at(group_count, group.circle_place, 1)
-    return total / group_count[:, None]
-
-
 def scale_of(sigma0: float) -> float:
     """Returns the factor on σ by which residuals of ``sigma0`` times their σ enlarge the covariances."""
     return max(1.0, sigma0)
@@ -411,7 +406,7 @@ def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: 
     values, groups, camera = solution.values, setting.groups, setting.camera(solution.values)
     models = tuple(group.at(values) for group in groups)
     xyz = values[CIRCLES].array
-    flat = sum(len(members) - 3 for members, _, _ in planes(xyz, setting))
+    flat = sum(len(members) - 3 for members, *_ in planes(xyz, setting))
     for shape in shapes(xyz, setting):
         flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
     flat += sum(1 for _ in bars(xyz, setting))

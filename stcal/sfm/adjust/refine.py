@@ -137,7 +137,14 @@ def refine(
             is_outlier, new_outliers = _outliers(model, camera)
             if len(new_outliers):
                 outliers += new_outliers
-                _require_few(outliers, observations, model.group)
+                if len(outliers) > MAX_OUTLIER_SHARE * observations:  # the model is wrong, not the observations
+                    raise MappingError(
+                        "E-GROUP-CONTRADICTS",
+                        f"group {model.group}: more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} "
+                        f"observations contradict the others, first {outliers[0].image} {outliers[0].label} by "
+                        f"{outliers[0].residual_px:.1f} px; check that nothing but the camera moved, and that the "
+                        "camera file belongs to the images (without --camera it is found from the board's dots)",
+                    )
                 model = adjust(model.without(is_outlier), camera)
                 rounds -= 1
                 continue
@@ -148,18 +155,6 @@ def refine(
         f"group {model.group}: the eccentricity still changes by {change:.2g} px after {MAX_ROUNDS} rounds, "
         f"{SETTLED_PX:g} needed; check the radii in the target and board files",
     )
-
-
-def _require_few(outliers: list[Outlier], observations: int, group: str) -> None:
-    """Raises an error if the outliers are many: then the model is wrong, not the observations."""
-    if len(outliers) > MAX_OUTLIER_SHARE * observations:
-        raise MappingError(
-            "E-GROUP-CONTRADICTS",
-            f"group {group}: more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} observations contradict the "
-            f"others, first {outliers[0].image} {outliers[0].label} by {outliers[0].residual_px:.1f} px; "
-            "check that nothing but the camera moved, and that the camera file belongs to the images (without --camera "
-            "the camera is found from the board's dots)",
-        )
 
 
 def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, float], mm_per_unit: float) -> np.ndarray:

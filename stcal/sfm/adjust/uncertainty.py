@@ -143,7 +143,7 @@ def derivatives(result: JointResult, start: CalibratedTarget, target: TargetDesi
             twist = (target_from_model @ ahead).difference(target_from_model @ behind)
             by_face[moved.face.id][:, columns] = twist.T / (2 * STEP_MM)
             rotated = np.transpose(moves @ target_from_model.rotation.T, (1, 2, 0))
-            circles[np.ix_(moved.rows, range(3), columns)] = rotated
+            circles[np.ix_(moved.rows, np.arange(3), columns)] = rotated
             continue
         ahead, behind = ahead.inverse(), behind.inverse()
         for face_id, pose in poses.items():
@@ -273,18 +273,15 @@ def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> Parts:
     inverse = solution.inverse[:, : xyz.size] if quantities is None else solution.inverse[:, : xyz.size] @ quantities
     intrinsics = inverse[solution.parts[0].places[CAMERA]]
     covariance[INTRINSICS] += intrinsics.T @ setting.prior @ intrinsics
-    for members, across, plane_normal in planes(xyz, setting):
-        heights = inverse[: xyz.size].reshape(-1, 3, k)[members]
-        rows = across @ np.einsum("j,mjk->mk", plane_normal, heights) / setting.flatness_mm
-        covariance[FLATNESS] += rows.T @ rows
+    for kind, known in ((FLATNESS, planes), (DISTANCES, bars)):
+        for members, slope, _, sigma in known(xyz, setting):
+            rows = slope @ inverse[coordinates(members)] / sigma
+            covariance[kind] += rows.T @ rows
     for shape in shapes(xyz, setting):
         rows = inverse[coordinates(shape.members)]
         by_size = rows.T @ shape.by_size()
         covariance[SIZES] += np.outer(by_size, by_size)
         covariance[PRINT] += rows.T @ shape.normal() @ rows - np.outer(by_size, by_size)
-    for members, along, _, sigma in bars(xyz, setting):
-        row = along @ (inverse[3 * members[0] + np.arange(3)] - inverse[3 * members[1] + np.arange(3)]) / sigma
-        covariance[DISTANCES] += np.outer(row, row)
     return covariance, by_scale, by_intrinsics
 
 

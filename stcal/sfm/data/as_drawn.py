@@ -36,7 +36,12 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
         return []
     notes = []
     found = {face: target_from_face[face] for face in rough}
-    ratio = _size_ratio(found, rough)
+    apart = [
+        [float(np.linalg.norm(of[a].translation - of[b].translation)) for of in (rough, found)]
+        for a, b in combinations(rough, 2)
+    ]
+    ratios = [seen / drawn for drawn, seen in apart if drawn > 0]
+    ratio = float(np.median(ratios)) if ratios else 1.0
     if not 1 / LIKE_DRAWN < ratio < LIKE_DRAWN:
         notes.append(
             f"{NOT_AS_DRAWN}faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has "
@@ -58,26 +63,15 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
     return [*notes, f"{NOT_AS_DRAWN}{what}: {folders}correct names, ids or rough_pose"]
 
 
-def _size_ratio(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> float:
-    """Returns the median ratio of distances between origins of faces, found over rough; 1 where all are one."""
-    ratios = []
-    for a, b in combinations(rough, 2):
-        drawn, seen = (float(np.linalg.norm(of[a].translation - of[b].translation)) for of in (rough, found))
-        if drawn > 0:
-            ratios.append(seen / drawn)
-    return float(np.median(ratios)) if ratios else 1.0
-
-
 def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
     """Returns the faces that are turned against most others, with their angles, degrees."""
     off = {face: found[face].rotation @ rough[face].rotation.T for face in rough}
-    angles = {anchor: {face: _angle_deg(own.T @ off[face]) for face in off} for anchor, own in off.items()}
+    angles = {
+        anchor: {face: float(np.degrees(Rigid(own.T @ other).angle_rad())) for face, other in off.items()}
+        for anchor, own in off.items()
+    }
     anchor = max(angles, key=lambda face: sum(angle <= MOST_TURNED_DEG for angle in angles[face].values()))
     return {face: angle for face, angle in angles[anchor].items() if angle > MOST_TURNED_DEG}
-
-
-def _angle_deg(rotation: np.ndarray) -> float:
-    return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
 
 
 def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[str]:

@@ -141,20 +141,9 @@ class Centres(CircleRows, Measured):
         cls, centre_px: np.ndarray, centre: np.ndarray, shape: np.ndarray, covariance_px2: np.ndarray, contrast=None
     ) -> "Centres":
         """Returns centres of which no rim is measured, as those of corners; ``contrast`` is zero if None."""
-        n = len(centre_px)
-        return cls(
-            centre_px,
-            centre,
-            shape,
-            covariance_px2,
-            blur_px=np.zeros(n),
-            contrast=np.zeros(n) if contrast is None else contrast,
-            noise=np.zeros(n),
-            rim=np.ones(n),
-            uneven_px=np.zeros((n, 2)),
-            domes=np.zeros((n, 3)),
-            ok=np.ones(n, bool),
-        )
+        n, zero, one = len(centre_px), np.zeros(len(centre_px)), np.ones(len(centre_px))
+        contrast, uneven, domes = zero if contrast is None else contrast, np.zeros((n, 2)), np.zeros((n, 3))
+        return cls(centre_px, centre, shape, covariance_px2, zero, contrast, zero, one, uneven, domes, ok=one)
 
 
 _PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")

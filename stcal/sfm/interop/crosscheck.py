@@ -119,45 +119,67 @@ def _compared(
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
     require_listable([image.name for image in run.observations])
-    ids = image_ids(run.observations)
-    native_models, pycolmap_models, adjusted = [], [], []
-    groups = run.groups()
+    ids, groups, options = image_ids(run.observations), run.groups(), run.options.adjustment(run.target_design)
+    native_models, own_models, adjusted = [], [], []
     with scratch_folder("crosscheck") as folder:
         write_copy(run, folder / "native.db", find_schema(schema))
         write_copy(run, folder / "ours.db", find_schema("4.2"))
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
-            names = [image.name for image in group]
+            names, work = [image.name for image in group], folder / f"group{index}"
             chosen = next(row for row in run.report["groups"] if row["name"] == name)["pairs"][0]
-            pair = ids[chosen["first"]], ids[chosen["second"]]
-            work = folder / f"group{index}"
-            options = mapper_options(native, names, pair)
-            _require_enough(name, pair, ids, run)
-            map_natively(native, folder / "native.db", work, names, options, timeout_s)
+            first, second = (next(i for i in group if i.name == chosen[which]) for which in ("first", "second"))
+            pair, shared = (ids[first.name], ids[second.name]), len(set(first.labels) & set(second.labels))
+            if shared < MIN_INLIERS:  # few tags have few corners
+                raise MappingError(
+                    "E-CROSSCHECK-FEW",
+                    f"group {name}: {first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to "
+                    "begin with; COLMAP cannot map it, check the run with the checks of its report",
+                )
+            map_natively(native, folder / "native.db", work, names, mapper_options(native, names, pair), timeout_s)
             path, model = _native_model(work / "models", name, native, run, ids)
             native_models.append(model)
-            adjusted.append(_adjusted(path, group, ids, run))
-            pycolmap_models.append(_own(folder, work, names, pair, name, run, ids))
+            labelled, _ = labelled_model(open_model(path), group, ids, run.camera)
+            refined = refine(labelled, run.camera, run.target_design, run.board_design, options.eccentricity)
+            adjusted.append(refined.model)
+            own_models.append(_own_model(folder, work, names, pair, name, run, ids))
         progress("crosscheck", len(groups), len(groups))
-        of_native, of_pycolmap = faces_from_models(native_models, run), faces_from_models(pycolmap_models, run)
-    options = run.options.adjustment(run.target_design)
-    readjusted = calibrate(adjusted, run.camera, run.target_design, run.board_design, options)
+        of_native, of_pycolmap = faces_from_models(native_models, run), faces_from_models(own_models, run)
+    again = calibrate(adjusted, run.camera, run.target_design, run.board_design, options)
     heights, rim_sigma_mm = run.rims_mm()
     if heights:
-        readjusted = on_luminous_surface(readjusted, heights, rim_sigma_mm, run.target_design, options.frame)
-    return _comparison(run, native, schema, of_native, of_pycolmap, readjusted, tolerances)
-
-
-def _require_enough(group: str, pair: tuple[int, int], ids: dict[str, int], run: SavedRun) -> None:
-    """Refuses a group whose initial pair shares fewer labels than COLMAP starts with: few tags have few corners."""
-    first, second = (image for image in run.observations if ids[image.name] in pair)
-    shared = len(set(first.labels) & set(second.labels))
-    if shared < MIN_INLIERS:
-        raise MappingError(
-            "E-CROSSCHECK-FEW",
-            f"group {group}: {first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to begin with; "
-            "COLMAP cannot map it, check the run with the checks of its report",
-        )
+        again = on_luminous_surface(again, heights, rim_sigma_mm, run.target_design, options.frame)
+    native_images, own_images = ({name for m in of.models for name in m.images} for of in (of_native, of_pycolmap))
+    images = ImagesRegistered(
+        native=len(native_images),
+        pycolmap=len(own_images),
+        run=len(run.observations),
+        only_native=sorted(native_images - own_images),
+        only_pycolmap=sorted(own_images - native_images),
+    )
+    ours = of_pycolmap.target
+    between = _targets(of_native.target, ours.target_from_face, ours.circles, run)
+    mapping = MappingCompared(**dict(between), cameras=_cameras(of_native, of_pycolmap, run))
+    result = _targets(again.target, run.faces.poses(), run.faces.circles, run)
+    if not run.faces.target_from_face_covariance:
+        tolerances = tolerances.without_sigma()
+    of_native_px, of_pycolmap_px = (
+        rms(np.concatenate([model.residuals_px(run.camera) for model in of.models])) for of in (of_native, of_pycolmap)
+    )
+    of_run_px = run.report["summary"]["residual_rms_px"]
+    return Crosscheck(
+        native=native.version,
+        pycolmap=pycolmap.__version__,
+        schema=schema,
+        tolerances=tolerances,
+        images=images,
+        residual_rms_px=ResidualRms(native=of_native_px, pycolmap=of_pycolmap_px, run=of_run_px),
+        mapping=mapping,
+        result=result,
+        plain=FacesCompared(faces=face_differences(of_native.target, run)),
+        notes=list(of_native.notes),
+        differences=_differences(images, mapping, result, tolerances),
+    )
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
@@ -197,12 +219,7 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
         ) from error
 
 
-def _adjusted(path: Path, group, ids, run: SavedRun):
-    model = labelled_model(open_model(path), group, ids, run.camera)[0]
-    return refine(model, run.camera, run.target_design, run.board_design, run.options.eccentricity).model
-
-
-def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids):
+def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids) -> ReadModel:
     """Returns the model of the same mapping by pycolmap."""
     reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
     if reconstruction is None:
@@ -215,48 +232,6 @@ def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids)
     written.mkdir()
     write_reconstruction(reconstruction, written)
     return read_model(written, run.observations, ids, run.corrected_px)
-
-
-def _comparison(
-    run: SavedRun,
-    native: NativeColmap,
-    schema: str,
-    external: Calibration,
-    of_pycolmap: Calibration,
-    again: Calibration,
-    tolerances: Tolerances,
-) -> Crosscheck:
-    native_images, pycolmap_images = _images(external), _images(of_pycolmap)
-    images = ImagesRegistered(
-        native=len(native_images),
-        pycolmap=len(pycolmap_images),
-        run=len(run.observations),
-        only_native=sorted(native_images - pycolmap_images),
-        only_pycolmap=sorted(pycolmap_images - native_images),
-    )
-    ours = of_pycolmap.target
-    between = _targets(external.target, ours.target_from_face, ours.circles, run)
-    mapping = MappingCompared(**dict(between), cameras=_cameras(external, of_pycolmap, run))
-    result = _targets(again.target, run.faces.poses(), run.faces.circles, run)
-    if not run.faces.target_from_face_covariance:
-        tolerances = tolerances.without_sigma()
-    return Crosscheck(
-        native=native.version,
-        pycolmap=pycolmap.__version__,
-        schema=schema,
-        tolerances=tolerances,
-        images=images,
-        residual_rms_px=ResidualRms(
-            native=_rms_px(external, run),
-            pycolmap=_rms_px(of_pycolmap, run),
-            run=run.report["summary"]["residual_rms_px"],
-        ),
-        mapping=mapping,
-        result=result,
-        plain=FacesCompared(faces=face_differences(external.target, run)),
-        notes=[*external.notes, *_camera_notes(mapping, result)],
-        differences=_differences(images, mapping, result, tolerances),
-    )
 
 
 def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, run: SavedRun) -> ResultCompared:
@@ -323,11 +298,10 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
         network = free_network(with_sigma(model, factors), run.camera)
         covariance = dict(zip(model.images, network.pose_covariance(), strict=True))
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
-        for name, pose in zip(theirs.images, theirs.camera_from_model, strict=True):
+        aligned = theirs.in_world(alignment).camera_from_model
+        for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
             if name not in poses:
                 continue
-            turned = pose.rotation @ alignment.rigid.rotation.T
-            moved = Rigid(turned, alignment.scale * pose.translation - turned @ alignment.rigid.translation)
             target_from_a, target_from_b = pose.inverse(), poses[name].inverse()
             turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
             rows.append(
@@ -339,28 +313,6 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
                 )
             )
     return sorted(rows, key=lambda row: row.image)
-
-
-def _camera_notes(mapping: MappingCompared, result: ResultCompared) -> list[str]:
-    """Returns a note on the camera that differs most, if the difference is more than its σ."""
-    worst = max(mapping.cameras, key=lambda camera: camera.sigmas, default=None)
-    if worst is None or worst.sigmas <= 1:
-        return []
-    count = sum(camera.sigmas > 1 for camera in mapping.cameras)
-    faces = max((row.translation_um for row in result.faces.values() if row is not None), default=0.0)
-    return [
-        f"camera {worst.image}{f' and {count - 1} more' if count > 1 else ''}: {worst.position_um:.1f} µm, "
-        f"{worst.sigmas:.1f} σ between the programs, which end their iterations at other places; from the native "
-        f"models our adjustment comes to the same faces within {faces:.3f} µm"
-    ]
-
-
-def _images(calibration: Calibration) -> set[str]:
-    return {name for model in calibration.models for name in model.images}
-
-
-def _rms_px(calibration: Calibration, run: SavedRun) -> float:
-    return rms(np.concatenate([model.residuals_px(run.camera) for model in calibration.models]))
 
 
 def comparison_text(check: Crosscheck) -> str:
@@ -410,8 +362,9 @@ def _differences(
             if row is None:
                 clauses.append(f"face {face} ({source}): only one of the two has it")
                 continue
-            limits = _exceeded(row, tolerances, sigma)
-            if limits:
+            each = (row.translation_um, tolerances.face_um, "µm"), (row.rotation_mdeg, tolerances.face_mdeg, "mdeg")
+            each = (*each, (row.sigmas, sigma, "σ"))
+            if limits := [f"{most:g} {unit}" for v, most, unit in each if v and most is not None and v > most]:
                 sigma_text = "" if row.sigmas is None else f", {row.sigmas:.2f} σ"
                 clauses.append(
                     f"face {face} ({source}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{sigma_text}; "
@@ -432,16 +385,6 @@ def _differences(
         if limit is not None and worst > limit:
             clauses.append(f"camera {image}: {source} {worst:.1f} {unit}; {limit:g} {unit} allowed")
     return clauses
-
-
-def _exceeded(row: FaceDifference, tolerances: Tolerances, sigma: float) -> list[str]:
-    """Returns the limits that the difference of a face exceeds, as texts."""
-    limits = (
-        (row.translation_um, tolerances.face_um, "µm"),
-        (row.rotation_mdeg, tolerances.face_mdeg, "mdeg"),
-        (row.sigmas, sigma, "σ"),
-    )
-    return [f"{limit:g} {unit}" for v, limit, unit in limits if v is not None and limit is not None and v > limit]
 
 
 def database_text(written: Exported) -> str:

@@ -17,9 +17,10 @@ import numpy as np
 from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.files import json_text, save
+from stcal.io.json import require_result_written
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import AdjustOptions, Calibration, calibrate
-from stcal.sfm.adjust.file import FacesFile, require_faces_written
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, find_models, read_model
@@ -242,5 +243,5 @@ def calibrate_models(
         factor = calibration.sigma_factors.of_target
         faces = FacesFile.of(calibration.target, run.target_design, _options(run, solve), factor)
         save(Path(out), json_text(faces.content()))
-        require_faces_written(out, calibration.target)
+        require_result_written(out, faces)
     return calibration

@@ -484,8 +484,9 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
     if not len(length):
         return []
     usual = np.full(len(length), max(robust_sigma(length, 2), 1e-3))
-    for own in _members(np.column_stack([used.face, used.corner])):
-        usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
+    _, corner = np.unique(np.column_stack([used.face, used.corner]), axis=0, return_inverse=True)
+    for k in range(corner.max() + 1):
+        usual[corner == k] = np.maximum(usual[corner == k], robust_sigma(length[corner == k], 2))
     limit = tailed_limit(length / usual, BY_CHANCE / len(length), SHARING) * usual
     return [
         Outlier(
@@ -495,13 +496,6 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
         )
         for k in np.flatnonzero(length > limit)
     ]
-
-
-def _members(key: np.ndarray) -> list[np.ndarray]:
-    """Returns the indices of the rows of each different key (n, k)."""
-    _, of_row = np.unique(key, axis=0, return_inverse=True)
-    order = np.argsort(of_row, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(of_row[order])) + 1)
 
 
 def _robust(length: np.ndarray) -> float:

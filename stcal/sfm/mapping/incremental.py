@@ -35,7 +35,11 @@ def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, 
             if pose is not None:
                 poses[image.name] = pose
     placed = [image for image in group if image.name in poses]
-    xyz |= _triangulated(placed, poses, xyz.keys())
+    unknown = {label for image in placed for label in image.labels} - xyz.keys()
+    for label, (centre, direction) in rays_of(placed, poses, unknown).items():
+        if widest_angle_rad(direction) >= MIN_RAY_ANGLE_RAD:  # least squares of distances from the rays
+            across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+            xyz[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
     return assemble(WorldModel, model.group, placed, [poses[image.name] for image in placed], xyz)
 
 
@@ -56,18 +60,6 @@ def _resect(
     if answer is None or answer["num_inliers"] < max(MIN_POINTS, MIN_SHARE * len(known)):
         return None
     return rigid_from_colmap(answer["cam_from_world"])
-
-
-def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], known) -> dict[Label, np.ndarray]:
-    """Returns the places of circles that are not ``known``, by label: least squares of distances from the rays."""
-    unknown = {label for image in images for label in image.labels} - known
-    places = {}
-    for label, (centre, direction) in rays_of(images, poses, unknown).items():
-        if widest_angle_rad(direction) < MIN_RAY_ANGLE_RAD:
-            continue
-        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        places[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
-    return places
 
 
 def rays_of(
@@ -121,9 +113,18 @@ def map_group(
 ) -> Mapping:
     """Maps one group: COLMAP maps the ``skeleton`` from the chosen pair, the other images are resected by their labels.
     If COLMAP's checks reject the pair, the relative pose of the ranking is registered instead."""
-    names = [image.name for image in group if image.name in skeleton]
+    names, pair, reconstruction = [image.name for image in group if image.name in skeleton], pairs[0], None
+    first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
     try:
-        reconstruction, seeded = _mapped(database, scratch, group, names, ids, pairs[0])
+        if share_board_alone(first, second):
+            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
+            reconstruction = _own_mapping(database, names, ids, pair)
+        if reconstruction is None:
+            seeded = "COLMAP's estimate of the chosen pair"
+            reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
+        if reconstruction is None:
+            seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
+            reconstruction = _own_mapping(database, names, ids, pair)
     except RuntimeError as error:
         if "SQLite" not in str(error):
             raise
@@ -131,34 +132,20 @@ def map_group(
     if reconstruction is None:
         raise MappingError(
             "E-MAPPING-NO-MODEL",
-            f"group {group[0].group}: no model from the pair {pairs[0].first}, {pairs[0].second} "
-            f"({pairs[0].shared} circles in common); add views between the two, or change --max-angle",
+            f"group {group[0].group}: no model from the pair {pair.first}, {pair.second} "
+            f"({pair.shared} circles in common); add views between the two, or change --max-angle",
         )
     model, outliers = labelled_model(reconstruction, group, ids, camera)
-    _require_agreement(model, group)
+    count = Counter(label for image in group for label in image.labels)
+    wanted = sum(n >= 2 for n in count.values())
+    if len(model.labels) < MIN_AGREEMENT * wanted:
+        raise MappingError(
+            "E-MAPPING-DISAGREE",
+            f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
+            f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
+            "check that the camera file belongs to the images, and that nothing but the camera moved",
+        )
     return Mapping(model, outliers, left_out(group, model), seeded)
-
-
-def _mapped(
-    database: Path,
-    scratch: Path,
-    group: list[ImageObservations],
-    names: list[str],
-    ids: dict[str, int],
-    pair: PairScore,
-) -> tuple[pycolmap.Reconstruction | None, str]:
-    """Returns the model that grows from the chosen pair, None if none does, and how the pair was registered."""
-    first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
-    if share_board_alone(first, second):
-        reconstruction = _own_mapping(database, names, ids, pair)
-        if reconstruction is not None:
-            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
-            return reconstruction, seeded
-    reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
-    if reconstruction is not None:
-        return reconstruction, "COLMAP's estimate of the chosen pair"
-    seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
-    return _own_mapping(database, names, ids, pair), seeded
 
 
 def left_out(
@@ -176,18 +163,6 @@ def left_out(
                 "check that it is sharp, and that nothing but the camera moved"
             )
     return reasons
-
-
-def _require_agreement(model: WorldModel, group: list[ImageObservations]) -> None:
-    count = Counter(label for image in group for label in image.labels)
-    wanted = sum(n >= 2 for n in count.values())
-    if len(model.labels) < MIN_AGREEMENT * wanted:
-        raise MappingError(
-            "E-MAPPING-DISAGREE",
-            f"group {model.group}: {len(model.labels)} of {wanted} circles agree between the images to "
-            f"{MAX_REPROJECTION_PX:g} px, {MIN_AGREEMENT * wanted:.0f} needed; "
-            "check that the camera file belongs to the images, and that nothing but the camera moved",
-        )
 
 
 def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPipelineOptions:

@@ -201,7 +201,15 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
                 _require_whole(file)
         for file in Path(path).glob("*.txt"):
             require_size(file, TABLE_BYTES)
-        _require_second_lines(Path(path) / "images.txt")
+        texts = Path(path) / "images.txt"
+        text = read_bytes(texts, TABLE_BYTES).decode("utf-8-sig", "replace") if texts.exists() else ""
+        for image in image_lines(text, f"model {texts}"):
+            if not image.followed:  # COLMAP passes over images without points that lack their empty line
+                raise InputError(
+                    "E-MODEL-UNREADABLE",
+                    f"model {texts}: line {image.number}: {image.name[:80]} has no second line, which is empty without "
+                    "points; add it after each such image, or export the model anew",
+                )
         return pycolmap.Reconstruction(str(path))
     except (RuntimeError, ValueError, IndexError, OverflowError, OSError) as error:
         reason = _CHECK.sub("", " ".join(str(error).split()))[-150:] or "a line or record of another form"
@@ -212,19 +220,6 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
 
 _CHECK = re.compile(r"\[\w.]+:\d+\] Check failed: .*")
 """COLMAP's words for a fault of a file: a place in its own source."""
-
-
-def _require_second_lines(file: Path) -> None:
-    """Refuse an ``images.txt`` without the empty lines of images without points: COLMAP passes over such images."""
-    if not file.exists():
-        return
-    for image in image_lines(read_bytes(file, TABLE_BYTES).decode("utf-8-sig", "replace"), f"model {file}"):
-        if not image.followed:
-            raise InputError(
-                "E-MODEL-UNREADABLE",
-                f"model {file}: line {image.number}: {image.name[:80]} has no second line, which is empty without "
-                "points; add it after each such image, or export the model anew",
-            )
 
 
 def parameter_count(model: int) -> int:

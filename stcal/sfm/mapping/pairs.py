@@ -229,7 +229,7 @@ def image_graph(
     observations: Sequence[ImageObservations], board: BoardDesign, kind: GraphKind | None = None
 ) -> ImageGraph:
     """Returns all pairs of images with six common labels, or just enough to keep every track connected (sparse)."""
-    kind = kind or kind_of_graph(len(observations))
+    kind = kind or ("sparse" if len(observations) > SPARSE_FROM else "all")
     sees = incidence(observations)
     shared = (sees.astype(np.float32) @ sees.T.astype(np.float32)).astype(np.int32)
     groups: dict[str, list[int]] = {}
@@ -247,11 +247,6 @@ def image_graph(
         pairs |= _links(indices, chosen, direction, sees, shared)
     _join_tracks(pairs, sees, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
     return ImageGraph(kind, np.array(sorted(pairs), int).reshape(-1, 2), skeleton)
-
-
-def kind_of_graph(images: int) -> GraphKind:
-    """Returns the kind of graph for this number of images."""
-    return "sparse" if images > SPARSE_FROM else "all"
 
 
 def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:

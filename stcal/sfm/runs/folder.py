@@ -32,13 +32,13 @@ from stcal.io.files import (
     read_bytes,
     save,
 )
-from stcal.io.json import checked, read_json
+from stcal.io.json import checked, read_json, require_result_written
 from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
 from stcal.report.document import Document, Notes, Section, Table, macro, pdf_of, require_pdf
 from stcal.report.text import join
-from stcal.sfm.adjust.file import FacesFile, require_faces_written
+from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectedImage, DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
@@ -136,7 +136,7 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
         doubted, rims = judgement.use if judgement.verdict == "no" else "", result.calibration.rim_mm
         faces = FacesFile.of(result.target, result.target_design, options, factor, rims, doubted)
         save(out / "faces.json", json_text(faces.content()))
-        require_faces_written(out / "faces.json", result.target)
+        require_result_written(out / "faces.json", faces)
     write_report(out, report, out)
     (out / "detections.csv").unlink(missing_ok=True)  # `labels.csv` has more of them
     progress("report", 1, 1)
