@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from stcal.design import Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_fields
+from stcal.geometry.arrays import freeze, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
 from stcal.io.images import percentiles, shrunk
@@ -64,9 +64,8 @@ class EllipseOptions:
         for name, (low, high) in OPTION_RANGES.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise InputError(
-                    "E-OPTION-RANGE", f"option {name} {value:g}: {low:g} to {high:g} possible; give another"
-                )
+                needed = f"option {name} {value:g}: {low:g} to {high:g} possible; give another"
+                raise InputError("E-OPTION-RANGE", needed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +77,8 @@ class Ellipses(CircleRows):
     contrast: np.ndarray  # (n,) middle against surroundings, grey values of the 8-bit image, positive
 
     def __post_init__(self):
-        n = len(self.centre_px)
-        object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
-        object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
-        object.__setattr__(self, "contrast", frozen(self.contrast, (n,), "contrasts"))
+        for name, shape in (("centre_px", (2,)), ("shape_px", (2, 2)), ("contrast", ())):
+            freeze(self, name, (len(self.centre_px), *shape), name)
 
     def __len__(self) -> int:
         return len(self.centre_px)
@@ -229,11 +226,8 @@ def outline_area(contour: np.ndarray) -> float:
 
 def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
     """Returns the ellipses of one level, rows as in :meth:`Level.in_full`."""
-    ellipses = [
-        gates.ellipse(contour)
-        for mask, gates in masks(level, polarity, threshold, options)
-        for contour in outlines(mask)
-    ]
+    found = masks(level, polarity, threshold, options)
+    ellipses = [gates.ellipse(contour) for mask, gates in found for contour in outlines(mask)]
     return level.in_full([row for row in ellipses if row is not None])
 
 
@@ -251,11 +245,9 @@ def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns centres and shapes without duplicates: of coincident rows the first, from the finest level, is kept."""
     if not len(table):
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    centre = table[:, :2]
-    radius = np.sqrt(table[:, 2] * table[:, 3]) / 2
+    centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
     pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
-    smaller = np.minimum(radius[pairs[:, 0]], radius[pairs[:, 1]])
-    larger = np.maximum(radius[pairs[:, 0]], radius[pairs[:, 1]])
+    smaller, larger = np.sort(radius[pairs], axis=1).T
     near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
     keep = np.ones(len(table), bool)
     keep[pairs[near & (smaller > 0.75 * larger), 1]] = False
