@@ -40,7 +40,7 @@ def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | No
     other's, if both are parts of one pattern; the motion that leaves them there is excluded. None if no motion puts all
     circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more than ``MOST_CIRCLES``.
     """
-    centres, other_centres = (np.asarray(points, float) @ [1, 1j] for points in (xy, other_xy))
+    centres, other_centres = (x + 1j * y for x, y in (np.asarray(points, float).T for points in (xy, other_xy)))
     n, m = len(centres), len(other_centres)
     if not 2 <= n <= m <= MOST_CIRCLES:
         return None

@@ -207,11 +207,10 @@ class FaceFinder:
         circles = _pairs(self.target)
         index = np.stack([starts.index(rank, circles.face_radius.shape[1]) for rank in ranks])
         face = starts.face[ranks]
-        matches = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
+        found, homographies, holds = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
         size = [len(self.target.faces[number].ids) for number in face.tolist()]
-        parts = zip(matches.index, matches.homography, size, strict=True)
-        grown = [(index[:n], homography) for index, homography, n in parts]
-        return {rank: own if holds else None for rank, own, holds in zip(ranks, grown, matches.holds, strict=True)}
+        grown = [(own[:n], homography) for own, homography, n in zip(found, homographies, size, strict=True)]
+        return {rank: own if sure else None for rank, own, sure in zip(ranks, grown, holds, strict=True)}
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
         """Returns faces that appear mirrored in the image; none if a ``named`` face shows that it is not mirrored."""

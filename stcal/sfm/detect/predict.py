@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
@@ -61,10 +61,8 @@ class PredictedCircles:
     wanted: np.ndarray  # (n,) those that have no label yet
 
     def __post_init__(self):
-        n = len(self.labels)
-        object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
-        object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
-        object.__setattr__(self, "wanted", frozen(self.wanted, (n,), "wanted", dtype=bool))
+        for name, shape, dtype in (("centre_px", (2,), float), ("shape_px", (2, 2), float), ("wanted", (), bool)):
+            freeze(self, name, (len(self.labels), *shape), name, dtype)
 
     def shifted(self, by_px: np.ndarray) -> "PredictedCircles":
         """Returns all circles shifted by (2,) px."""

@@ -192,11 +192,17 @@ def _rims(fits: Fits) -> _Rims:
         covariance, chance = covariances(fits)
         domes = fits.domes()
     ok = ~fits.failed
+    numbers = (chance, fits.blur, contrast, noise, rim)
+    chance, blur, contrast, noise, rim = (np.where(ok, value, 0.0) for value in numbers)
     return _Rims(
         np.where(ok[:, None], fits.centre, fits.start),
         np.where(ok[:, None, None], np.linalg.inv(fits.inverse_shape), fits.radius[:, None, None] * np.eye(2)),
         np.where(ok[:, None, None], covariance, np.eye(2)),
-        *(np.where(ok, value, 0.0) for value in (chance, fits.blur, contrast, noise, rim)),
+        chance,
+        blur,
+        contrast,
+        noise,
+        rim,
         np.where(ok[:, None], fits.uneven, 0.0),
         np.where(ok[:, None] & np.isfinite(domes), domes, 0.0),
     )
