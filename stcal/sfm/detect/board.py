@@ -184,7 +184,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
         mirror = np.eye(3)
         mirror[:2, :2] = steps @ np.linalg.solve(steps.T, [[0.0, 1.0], [1.0, 0.0]]).T
         uv, homography = uv[:, ::-1], homography @ mirror
-    if len(uv) < needed_dots(board):
+    if len(uv) < max(MIN_SHARE * len(board.cells()), MIN_SIDE**2):
         return None
     placements: list[_Placement] = []
     for turn in range(directions(board)):
@@ -224,11 +224,6 @@ HOLE_SHARE = 0.5
 """Smallest difference between middle and body of a dot with a hole, over that between bodies and the board."""
 MOST_WRONG = 1
 """Largest number of dots whose hole is missed, or seen where none is."""
-
-
-def needed_dots(board: BoardDesign) -> float:
-    """Returns the smallest number of dots for a reading of the board."""
-    return max(MIN_SHARE * len(board.cells()), MIN_SIDE**2)
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
