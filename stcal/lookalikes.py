@@ -19,18 +19,13 @@ MOST_CIRCLES = 100
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """Best motion of a whole pattern onto another one.
+    """Best motion of a whole pattern onto another one."""
 
-    ``gap_mm`` : largest distance of two centres; ``radius_mm`` : largest difference of two radii; both at the size of
-    the other pattern; ``turn_rad`` : rotation, −π … π; ``scale`` : the other pattern's size over the pattern's own;
-    ``shift_mm`` : translation after rotation and scale.
-    """
-
-    gap_mm: float
-    radius_mm: float
-    turn_rad: float
-    scale: float
-    shift_mm: tuple[float, float]
+    gap_mm: float  # largest distance of two centres, at the size of the other pattern
+    radius_mm: float  # largest difference of two radii, likewise
+    turn_rad: float  # −π … π
+    scale: float  # the other pattern's size over the pattern's own
+    shift_mm: tuple[float, float]  # after rotation and scale
 
     def moved(self, xy: np.ndarray) -> np.ndarray:
         """Returns a point (2,) of the pattern, moved onto the other pattern."""
@@ -41,16 +36,11 @@ class Likeness:
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
     """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest gap.
 
-    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm;
-    ``in_place`` : (n,) places among the other's, optional Places of the same circles, if both are parts of one pattern.
-    The motion that leaves the circles in place is excluded.
-
-    Returns None if no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of
-    more than ``MOST_CIRCLES``.
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``in_place`` : (n,) places of the same circles among the
+    other's, if both are parts of one pattern; the motion that leaves them there is excluded. None if no motion puts all
+    circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more than ``MOST_CIRCLES``.
     """
-    centres, other_centres = (
-        points[:, 0] + 1j * points[:, 1] for points in (np.asarray(xy, float), np.asarray(other_xy, float))
-    )
+    centres, other_centres = (x + 1j * y for x, y in (np.asarray(points, float).T for points in (xy, other_xy)))
     n, m = len(centres), len(other_centres)
     if not 2 <= n <= m <= MOST_CIRCLES:
         return None
@@ -59,21 +49,15 @@ def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | No
     p, q = p[p != q], q[p != q]
     factor = (other_centres[q] - other_centres[p]) / (centres[j] - centres[i])
     fits = alike(abs(factor) * radius[i], other_radius[p]) & alike(abs(factor) * radius[j], other_radius[q])
-    tree, best = KDTree(np.column_stack([other_centres.real, other_centres.imag])), None
+    tree, found = KDTree(np.column_stack([other_centres.real, other_centres.imag])), []
     for start, turn in zip(p[fits], factor[fits], strict=True):
         moved = other_centres[start] + turn * (centres - centres[i])
         nearest = np.asarray(tree.query(np.column_stack([moved.real, moved.imag]))[1])
         if len(np.unique(nearest)) < n or (in_place is not None and (nearest == in_place).all()):
             continue
         likeness = _fitted(centres, radius, other_centres[nearest], other_radius[nearest])
-        if likeness is not None and (best is None or _order(likeness) < _order(best)):
-            best = likeness
-    return best
-
-
-def _order(likeness: Likeness) -> tuple[float, float]:
-    """Returns the key that orders similarities by gap, then by angle."""
-    return round(likeness.gap_mm, 6), abs(likeness.turn_rad)
+        found += [] if likeness is None else [likeness]
+    return min(found, key=lambda each: (round(each.gap_mm, 6), abs(each.turn_rad)), default=None)
 
 
 def _fitted(own, radius, other, other_radius) -> Likeness | None:
@@ -94,26 +78,20 @@ def _fitted(own, radius, other, other_radius) -> Likeness | None:
 
 
 def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozenset[int]]:
-    """Finds sets of circles that coincide with circles of another pattern under a rigid motion of the plane.
+    """Finds sets of ``MIN_COMMON`` or more circles that coincide with circles of another pattern under a rigid motion.
 
-    The motions that are tried put two circles of the pattern onto two circles of the other one.
-
-    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm; ``same`` :
-    True if both are the same pattern. The motion that leaves it in place is then excluded.
-
-    Returns places in ``xy``; each set has ``MIN_COMMON`` or more.
+    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``same`` : True if both are the same pattern, so that the
+    motion that leaves it in place is excluded. Returns places in ``xy``.
     """
     fits, _ = _motions(xy, radius, other_xy, other_radius, same)
     return {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0)}
 
 
 def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
-    """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, radii included.
+    """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, as above.
 
-    ``xy``, ``other_xy`` : (n, 2) and (m, 2) centres, mm; ``radius``, ``other_radius`` : (n,) and (m,) mm.
-
-    Returns places of the same circle in ``xy`` and in ``other_xy``, for each rigid motion under which ``MIN_COMMON`` or
-    more coincide, the most circles first. A part of another result is omitted.
+    Returns places of the same circles in ``xy`` and in ``other_xy`` for each motion, the most circles first. A part of
+    another result is omitted.
     """
     fits, nearest = _motions(xy * [1, -1], radius, other_xy, other_radius, same=False)
     found: list[np.ndarray] = []

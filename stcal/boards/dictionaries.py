@@ -18,15 +18,11 @@ OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """A family of AprilTag 3 that ``pupil_apriltags`` detects: its number of tags, and of cells across the white ring.
+    """A family of AprilTag 3 that ``pupil_apriltags`` detects. Corners are those of the white ring."""
 
-    The corners are those of the white ring, where it meets the black one about it; further cells lie outside.
-    ``most_wrong`` : number of misread cells that are put right; with more of them, other squares would pass for tags.
-    """
-
-    tags: int
-    cells: int
-    most_wrong: int
+    tags: int  # their number
+    cells: int  # across the white ring; further cells lie outside
+    most_wrong: int  # misread cells that are put right; with more of them, other squares would pass for tags
 
 
 FAMILIES = MappingProxyType({"tagStandard41h12": Family(2115, 5, 2), "tagCircle21h7": Family(38, 5, 0)})
@@ -40,9 +36,7 @@ _APRILTAG = re.compile(r"(?:april)?[_ -]?(?:t(?:ag)?)?[_ -]?(standard|circle|cus
 def known_dictionary(name: str) -> str:
     """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
 
-    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``.
-
-    Raises ValueError: the name is unknown; the message lists similar names. Or OpenCV lacks the family.
+    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``. Raises ValueError.
     """
     family = _APRILTAG.fullmatch(name.strip())
     if family is not None and f"DICT_APRILTAG_{family[2].lower()}" in dir(cv2.aruco) and family[1] is None:
@@ -68,28 +62,22 @@ def dictionary_of(name: str):
         except ValueError as error:
             raise InputError("E-TAG-DICTIONARY", f"dictionary {name!r}: {error}") from None
     if name in FAMILIES:
-        raise InputError(
-            "E-TAG-DICTIONARY",
-            f"dictionary {name}: its tags are found in images, not drawn here; draw them with AprilTag's own program",
-        )
+        found = f"dictionary {name}: its tags are found in images, not drawn here"
+        raise InputError("E-TAG-DICTIONARY", f"{found}; draw them with AprilTag's own program")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 def _of_apriltag(name: str) -> str:
     """Return the name of a family that OpenCV lacks, if it can be detected; errors as :func:`known_dictionary`."""
     instead = f"print tags of {', '.join(OF_OPENCV)}"
+    unread = "OpenCV does not detect this family of AprilTag"
     if name in TOO_LARGE:
-        raise ValueError(
-            f"a family of 42 000 tags and more, whose table takes over a gigabyte in each process; {instead} or of "
-            f"{', '.join(FAMILIES)} for the target"
-        )
+        large = "a family of 42 000 tags and more, whose table takes over a gigabyte in each process"
+        raise ValueError(f"{large}; {instead} or of {', '.join(FAMILIES)} for the target")
     if name not in FAMILIES:
-        raise ValueError(f"OpenCV does not detect this family of AprilTag; {instead} for the target")
+        raise ValueError(f"{unread}; {instead} for the target")
     if find_spec("pupil_apriltags") is None:
-        raise ValueError(
-            f"OpenCV does not detect this family of AprilTag, which is read after `{EXTRA}`; or {instead} for the "
-            "target"
-        )
+        raise ValueError(f"{unread}, which is read after `{EXTRA}`; or {instead} for the target")
     return name
 
 
@@ -102,16 +90,11 @@ def is_of_apriltag(name: str) -> bool:
 
 
 def of_opencv(name: str) -> str:
-    """Return the full name of a dictionary, as :func:`known_dictionary`, for boards that only OpenCV finds.
-
-    Raises ValueError: also: a family that OpenCV lacks.
-    """
+    """Return the full name of a dictionary, as :func:`known_dictionary`, for boards that only OpenCV finds."""
     full = known_dictionary(name)
     if full in FAMILIES:
-        raise ValueError(
-            "tags that OpenCV does not detect, which only a layout of tags may have; one of "
-            f"{', '.join(OF_OPENCV)} needed"
-        )
+        only = "tags that OpenCV does not detect, which only a layout of tags may have"
+        raise ValueError(f"{only}; one of {', '.join(OF_OPENCV)} needed")
     return full
 
 
@@ -151,10 +134,7 @@ def find_family(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:
 
 
 def known_tags(tags: Sequence[tuple[str, int]], where: str) -> tuple[tuple[str, int], ...]:
-    """Return tags with the full names of their dictionaries; ``where`` : what holds them, for messages.
-
-    Raises InputError: a dictionary is unknown or lacks the id, or a tag occurs twice.
-    """
+    """Return tags with the full names of their dictionaries; ``where`` : what holds them, for messages."""
     known: list[tuple[str, int]] = []
     for name, tag in tags:
         try:
@@ -167,7 +147,6 @@ def known_tags(tags: Sequence[tuple[str, int]], where: str) -> tuple[tuple[str, 
             )
         known.append((full, int(tag)))
     if twice := [tag for k, tag in enumerate(known) if tag in known[:k]]:
-        raise InputError(
-            "E-TAG-REPEATED", f"{where}: tag {twice[0][1]} of {twice[0][0]} occurs twice; tags must differ"
-        )
+        repeated = f"{where}: tag {twice[0][1]} of {twice[0][0]} occurs twice; tags must differ"
+        raise InputError("E-TAG-REPEATED", repeated)
     return tuple(known)

@@ -11,16 +11,14 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.cells import black_areas, clear_mm
-from stcal.boards.target import body_toml
+from stcal.boards.target import save_body
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
-from stcal.io.cameras.model import write_cameras_txt
-from stcal.parallel import run_parallel
-from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile, new_dataset
-from stcal.synthetic.render import encode
+from stcal.io.cameras.read import save_camera
+from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile, new_dataset, write_images
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
 DRAWING_PX = 2000
@@ -492,22 +490,14 @@ def write_body(
     InputError
         The folder is not empty or cannot be written.
     """
-    folder = Path(folder)
+    folder, count = Path(folder), len(scene.camera_from_target)
     with new_dataset(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        write_cameras_txt(folder / "cameras.txt", scene.camera)
-        (folder / "target.toml").write_text(body_toml(scene.target), encoding="utf-8")
+        save_camera(folder / "cameras.txt", scene.camera)
+        save_body(folder / "target.toml", scene.target)
         truth = json.dumps(body_truth(scene, image_format).content())
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-        drawings = scene.drawings()
-        count = len(scene.camera_from_target)
-        paths = [folder / "images" / _image_name(i, image_format) for i in range(count)]
-        jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]
-        for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
-            if progress:
-                progress(done, count)
+        drawings, paths = scene.drawings(), [folder / "images" / _image_name(i, image_format) for i in range(count)]
+        arguments = [(scene, i, drawings) for i in range(count)]
+        write_images(render_body, paths, arguments, jpeg_quality, workers, progress)
     return paths
-
-
-def _write_image(path: Path, scene: BodyScene, image: int, drawings: dict[str, Drawing], jpeg_quality: int) -> None:
-    path.write_bytes(encode(render_body(scene, image, drawings), path.suffix, jpeg_quality))

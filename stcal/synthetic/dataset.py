@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -241,21 +241,29 @@ def write_dataset(
         save_body(folder / "target.toml", scene.target)
         save_run_board(folder / "board.toml", scene.board)
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-        jobs = {
-            image_name(group, i, image_format): (scene, group, i, options, jpeg_quality)
-            for group, g in scene.groups.items()
-            for i in range(len(g.camera_from_target))
-        }
-        paths = {name: folder / "images" / name for name in jobs}
-        written = run_parallel(_write_image, [(path, *jobs[name]) for name, path in paths.items()], workers)
-        for done, _ in enumerate(written, 1):
-            if progress:
-                progress(done, len(jobs))
-    return list(paths.values())
+        views = [(group, i) for group, g in scene.groups.items() for i in range(len(g.camera_from_target))]
+        paths = [folder / "images" / image_name(*view, image_format) for view in views]
+        write_images(render, paths, [(scene, *view, options) for view in views], jpeg_quality, workers, progress)
+    return paths
 
 
-def _write_image(path: Path, scene: Scene, group: str, image: int, options: RenderOptions, jpeg_quality: int) -> None:
-    data = encode(render(scene, group, image, options), path.suffix, jpeg_quality)
+def write_images(
+    make: Callable[..., np.ndarray],
+    paths: Sequence[Path],
+    arguments: Sequence[tuple],  # of ``make``, by image
+    jpeg_quality: int,
+    workers: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    """Writes images as they are made, in processes side by side."""
+    jobs = [(make, path, own, jpeg_quality) for path, own in zip(paths, arguments, strict=True)]
+    for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
+        if progress:
+            progress(done, len(jobs))
+
+
+def _write_image(make: Callable[..., np.ndarray], path: Path, arguments: tuple, jpeg_quality: int) -> None:
+    data = encode(make(*arguments), path.suffix, jpeg_quality)
     try:
         path.write_bytes(data)
     except OSError as error:

@@ -27,19 +27,15 @@ BODY_GAP = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupShape:
-    """Geometry that the images of one group must show; target frame unless named otherwise, mm.
-
-    ``circles``, ``normals`` : (n, 3), circles of the two faces; ``axes`` : (3, 3), see :func:`viewing_axes`;
-    ``body`` : (k, 3) corners of the target's faces; ``dots_board`` : (m, 3); ``outline_board`` : (4, 3) corners.
-    """
+    """Geometry that the images of one group must show; target frame unless named otherwise, mm."""
 
     name: str
-    circles: np.ndarray
-    normals: np.ndarray
-    axes: np.ndarray
-    body: np.ndarray
-    dots_board: np.ndarray
-    outline_board: np.ndarray
+    circles: np.ndarray  # (n, 3) of the two faces
+    normals: np.ndarray  # (n, 3)
+    axes: np.ndarray  # (3, 3), see :func:`viewing_axes`
+    body: np.ndarray  # (k, 3) corners of the target's faces
+    dots_board: np.ndarray  # (m, 3)
+    outline_board: np.ndarray  # (4, 3) corners
 
 
 @dataclass(frozen=True, slots=True, eq=False)

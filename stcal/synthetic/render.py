@@ -391,10 +391,11 @@ def _add_circles(
         normal, radius = circles.normal_camera[i], float(circles.radius_mm[i])
         planes = [top[i]] if rim_mm[i] <= 0 else [top[i], top[i] + rim_mm[i] * normal]
         steep = circles.tilt_rad[i] > STEEP_RAD
-        shares = [_fine_coverage(camera, (x0, y0, x1, y1), plane, normal, radius, steep=steep) for plane in planes]
+        ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
+        shares = [_fine_coverage(camera, ideal, plane, normal, radius, steep) for plane in planes]
         own = None
         if (options.slope or options.fade) and slopes[i].any():
-            own = _light_of_disc(camera, (x0, y0, x1, y1), planes[-1], normal, radius, slopes[i], options)
+            own = _light_of_disc(ideal, planes[-1], normal, radius, slopes[i], options)
         if lens is not None and confusion[i] > SHARP_PX:
             share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px, own)
         else:
@@ -411,11 +412,10 @@ def _add_circles(
 
 
 def _fine_coverage(
-    camera: Camera, box, centre: np.ndarray, normal: np.ndarray, radius: float, steep: bool
+    camera: Camera, ideal: np.ndarray, centre: np.ndarray, normal: np.ndarray, radius: float, steep: bool
 ) -> np.ndarray:
-    """Returns the share of each ¼ px square of a box that one disc covers, (4·(y1 - y0), 4·(x1 - x0)) float32."""
-    x0, y0, x1, y1 = box
-    ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
+    """Returns the share of each ¼ px square that one disc covers, (4 h, 4 w); ``ideal`` : (h, w, 2) of the pixels."""
+    height, width = ideal.shape[:2]
     outside = _relative_distance(ideal, centre, normal, radius)
     rim = np.abs(outside) < RIM_REACH_PX * np.hypot(*np.gradient(outside))
     if steep:  # the ellipse is so narrow that the linear estimate of the distance fails
@@ -431,24 +431,19 @@ def _fine_coverage(
     slope = np.hypot(*np.gradient(cells_outside, axis=(1, 2)))
     cells_share = np.clip(0.5 - cells_outside / np.maximum(slope, 1e-12), 0, 1)
 
-    share = np.empty((y1 - y0, x1 - x0, FINE, FINE), np.float32)
+    share = np.empty((height, width, FINE, FINE), np.float32)
     share[:] = (outside <= 0)[..., None, None]
     share[rim] = cells_share.reshape(-1, FINE, SUBSAMPLES // FINE, FINE, SUBSAMPLES // FINE).mean((2, 4))
-    return share.transpose(0, 2, 1, 3).reshape((y1 - y0) * FINE, (x1 - x0) * FINE)
+    return share.transpose(0, 2, 1, 3).reshape(height * FINE, width * FINE)
 
 
-def _light_of_disc(
-    camera: Camera, box, centre: np.ndarray, normal: np.ndarray, radius: float, x: np.ndarray, options: RenderOptions
-) -> np.ndarray:
+def _light_of_disc(ideal: np.ndarray, centre, normal, radius: float, x, options: RenderOptions) -> np.ndarray:
     """Returns the light of a disc over its mean level on the squares of :func:`_fine_coverage`; ``x`` : unit vector."""
-    x0, y0, x1, y1 = box
-    ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
     rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=-1)
     place = (rays * ((normal @ centre) / (rays @ normal))[..., None] - centre) / radius
     light = 1 + options.slope / 2 * np.clip(place @ x, -1.5, 1.5)
     light -= options.fade * np.minimum((place**2).sum(-1), 1.5)
-    size = (FINE * (x1 - x0), FINE * (y1 - y0))
-    return cv2.resize(light.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(light.astype(np.float32), None, fx=FINE, fy=FINE, interpolation=cv2.INTER_LINEAR)
 
 
 def _relative_distance(xy: np.ndarray, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:

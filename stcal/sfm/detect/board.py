@@ -126,24 +126,18 @@ def _turn(board: BoardDesign, turn: int) -> np.ndarray:
 
 def _grow(candidates: Candidates, links, steps, seed: int, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
     """Returns cells (u, v) by candidate, grown from neighbour to neighbour; the steps are updated on the way."""
-    start = np.array(steps[seed])
-    half = directions(board) // 2
-    for axis, (ahead, behind) in enumerate(((0, half), (1, 1 + half))):
-        steps_at_seed = [
-            s * (candidates.xy[links[seed][d]] - candidates.xy[seed])
-            for d, s in ((ahead, 1), (behind, -1))
-            if links[seed][d] >= 0
-        ]
-        if steps_at_seed:
-            start[:, axis] = np.mean(steps_at_seed, axis=0)
+    start, half = np.array(steps[seed]), directions(board) // 2
+    for axis in (0, 1):
+        linked = [(links[seed][axis], 1), (links[seed][axis + half], -1)]
+        known = [sign * (candidates.xy[other] - candidates.xy[seed]) for other, sign in linked if other >= 0]
+        if known:
+            start[:, axis] = np.mean(known, axis=0)
     across = np.linalg.solve(candidates.shape[seed], start)
     lengths = np.linalg.norm(across, axis=0)
     cosine = across[:, 0] @ across[:, 1] / lengths.prod() - board.steps()[:, 0] @ board.steps()[:, 1]
     if abs(cosine) > MAX_COSINE or lengths.max() > DIAGONAL * lengths.min():
         return {}
-    cells = {int(seed): (0, 0)}
-    taken_cells = {(0, 0)}
-    queue = [(int(seed), start)]
+    cells, taken_cells, queue = {int(seed): (0, 0)}, {(0, 0)}, [(int(seed), start)]
     for node, step in queue:
         u, v = cells[node]
         ahead = np.array([step[:, 0], step[:, 1], -step[:, 0], -step[:, 1]])
@@ -168,8 +162,7 @@ def _grow(candidates: Candidates, links, steps, seed: int, free, board: BoardDes
 
 def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardReading | None:
     """Fits the homography of the grown cells, matches all dots with it, and lists the numberings that fit."""
-    index = np.array(list(cells))
-    uv = np.array(list(cells.values()))
+    index, uv = np.array(list(cells)), np.array(list(cells.values()))
     homography = _robust_homography(board.flat(uv), candidates, index)
     if homography is None:
         return None
@@ -191,15 +184,13 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
         mirror = np.eye(3)
         mirror[:2, :2] = steps @ np.linalg.solve(steps.T, [[0.0, 1.0], [1.0, 0.0]]).T
         uv, homography = uv[:, ::-1], homography @ mirror
-    if len(uv) < needed_dots(board):
+    if len(uv) < max(MIN_SHARE * len(board.cells()), MIN_SIDE**2):
         return None
-    readings = [
-        _place(candidates, uv, index, turn, board, homography, image_corners) for turn in range(directions(board))
-    ]
-    placements = sorted((p for reading in readings for p in reading), key=lambda p: (p.unexplained, -len(p.inside)))
-    if not placements:
-        return None
-    return _reading(placements, index, candidates, board)
+    placements: list[_Placement] = []
+    for turn in range(directions(board)):
+        placements += _place(candidates, uv, index, turn, board, homography, image_corners)
+    placements.sort(key=lambda p: p.unexplained)
+    return _reading(placements, index, candidates, board) if placements else None
 
 
 def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
@@ -221,9 +212,8 @@ def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera
         middle, body, outside = values
         holes = np.abs(middle - body) > HOLE_SHARE * np.median(np.abs(body - outside)[inside])
         wrong.append(int((holes != rings)[inside].sum()))
-    best = min(wrong)
-    kept = [i for i, count in enumerate(wrong) if count == best]
-    if best > MOST_WRONG:
+    kept = [i for i, count in enumerate(wrong) if count == min(wrong)]
+    if min(wrong) > MOST_WRONG:
         return reading
     return replace(reading, numberings=reading.numberings[kept], homographies=reading.homographies[kept])
 
@@ -234,11 +224,6 @@ HOLE_SHARE = 0.5
 """Smallest difference between middle and body of a dot with a hole, over that between bodies and the board."""
 MOST_WRONG = 1
 """Largest number of dots whose hole is missed, or seen where none is."""
-
-
-def needed_dots(board: BoardDesign) -> float:
-    """Returns the smallest number of dots for a reading of the board."""
-    return max(MIN_SHARE * len(board.cells()), MIN_SIDE**2)
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
@@ -274,8 +259,7 @@ def _place(
     candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners
 ) -> list[_Placement]:
     """Returns the placements of the grid turned by ``turn`` of the board's directions."""
-    rotation = _turn(board, turn)
-    turned = uv @ rotation.T
+    turned = uv @ _turn(board, turn).T
     size = np.array([board.columns, board.rows])
     all_cells = board.cells()[:, ::-1]
     has_dot = np.zeros(size[::-1], bool)
@@ -298,7 +282,7 @@ def _place(
         occupied[tuple(column_row[inside, ::-1].T)] = True
         missing = ~occupied[tuple(all_cells[:, ::-1].T)]
         absent = board.flat(grid_cells[missing])
-        expected = _inside_image(apply_homography(homography, absent), homography, absent, image_corners)
+        expected = _inside_image(homography, absent, image_corners)
         unexplained = int(expected.sum() + outside_count)
         placements.append(_Placement(unexplained, inside, column_row[:, ::-1]))
     return placements
@@ -322,8 +306,9 @@ def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homograph
     return size / np.median(size) > 1 + CORNER_MARGIN * (board.corner_radius_mm / board.radius_mm - 1)
 
 
-def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
+def _inside_image(homography: np.ndarray, uv: np.ndarray, image_corners: np.ndarray) -> np.ndarray:
     """Returns the mask of the predicted dots that lie in the image with their whole rim and some margin."""
+    xy = apply_homography(homography, uv)
     margin = 0.35 * np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
     edge = np.roll(image_corners, -1, axis=0) - image_corners
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.linalg.norm(edge, axis=1)[:, None]

@@ -74,6 +74,8 @@ class _Pairs:
     uses: np.ndarray  # (p + 1,) start of each pair's rows in the next two
     face: np.ndarray  # (u,) number of the face
     circles: np.ndarray  # (u, s) numbers of the circles in it, −1 if there is none
+    face_xy: np.ndarray  # (f, m, 2) all circles of the f faces, mm
+    face_radius: np.ndarray  # (f, m), 0 behind the last circle of a face
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,26 +127,14 @@ class _Starts:
         return chosen
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Circles:
-    """All faces of a design: ``xy`` : (f, m, 2), mm, and ``radius`` : (f, m), 0 behind the last circle of a face."""
-
-    xy: np.ndarray
-    radius: np.ndarray
-
-
-@lru_cache(maxsize=8)
-def _circles(target: TargetDesign) -> _Circles:
-    width = max(len(face.ids) for face in target.faces)
-    xy, radius = np.zeros((len(target.faces), width, 2)), np.zeros((len(target.faces), width))
-    for i, face in enumerate(target.faces):
-        xy[i], xy[i, : len(face.ids)], radius[i, : len(face.ids)] = face.xy_mm[0], face.xy_mm, face.radius_mm
-    return _Circles(xy, radius)
-
-
 @lru_cache(maxsize=8)
 def _pairs(target: TargetDesign) -> _Pairs:
-    width = min(SUPPORT + 2, max(len(face.ids) for face in target.faces))
+    most = max(len(face.ids) for face in target.faces)
+    width = min(SUPPORT + 2, most)
+    xy, radii_of_face = np.zeros((len(target.faces), most, 2)), np.zeros((len(target.faces), most))
+    for i, face in enumerate(target.faces):
+        n = len(face.ids)
+        xy[i], xy[i, :n], radii_of_face[i, :n] = face.xy_mm[0], face.xy_mm, face.radius_mm
     occurrences: dict[tuple, list] = {}
     for number, face in enumerate(target.faces):
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
@@ -170,6 +160,8 @@ def _pairs(target: TargetDesign) -> _Pairs:
         np.cumsum([0, *(len(uses) for _, _, uses in occurrences.values())]),
         np.array([number for number, _ in uses], int),
         circles,
+        xy,
+        radii_of_face,
     )
 
 
@@ -202,22 +194,23 @@ class FaceFinder:
                 grown |= self._grown(candidates, starts, starts.unlike(rank, wanted))
             match, number = grown[rank], int(starts.face[rank])
             face = self.target.faces[number]
-            if match is not None and _seen_from_outside(match[1], face):
+            if match is None:
+                continue
+            depth = face.xy_mm[0] @ match[1][2, :2] + match[1][2, 2]
+            if np.linalg.det(match[1]) * depth < 0:  # on the mirror image of a face, its Z points away from the camera
                 readings.append(FaceReading(face, _of_one_size(candidates, face, *match)))
                 is_open[starts.agree(number, readings[-1].index)] = False
         return _decide(readings, self.target)
 
     def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
         """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
-        circles = _circles(self.target)
-        index = np.stack([starts.index(rank, circles.radius.shape[1]) for rank in ranks])
+        circles = _pairs(self.target)
+        index = np.stack([starts.index(rank, circles.face_radius.shape[1]) for rank in ranks])
         face = starts.face[ranks]
-        matches = grow_matches(candidates, index, circles.xy[face], circles.radius[face])
+        found, homographies, holds = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
         size = [len(self.target.faces[number].ids) for number in face.tolist()]
-        return {
-            rank: (matches.index[i, : size[i]], matches.homography[i]) if matches.holds[i] else None
-            for i, rank in enumerate(ranks)
-        }
+        grown = [(own[:n], homography) for own, homography, n in zip(found, homographies, size, strict=True)]
+        return {rank: own if sure else None for rank, own, sure in zip(ranks, grown, holds, strict=True)}
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
         """Returns faces that appear mirrored in the image; none if a ``named`` face shows that it is not mirrored."""
@@ -287,12 +280,6 @@ def _support(candidates: Candidates, pairs: _Pairs, pair: np.ndarray, xy: np.nda
     return np.where(ok, nearest, -1)
 
 
-def _seen_from_outside(homography: np.ndarray, face: FaceDesign) -> bool:
-    """Returns whether the face's Z points to the camera. On the mirror image of a face it points away."""
-    depth = face.xy_mm[0] @ homography[2, :2] + homography[2, 2]
-    return np.linalg.det(homography) * depth < 0
-
-
 def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Returns ``index`` without circles whose ratio of size to design deviates from the median."""
     local = homography_jacobian(homography, face.xy_mm)
@@ -320,14 +307,8 @@ def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
         if settled & used:
             continue
         settled |= used
-        ambiguous = [
-            r
-            for r in readings
-            if r is not reading
-            and used & set(r.used())
-            and r.count() >= reading.count()
-            and not (r.face is reading.face and (r.index == reading.index).all())
-        ]
+        rivals = [r for r in readings if used & set(r.used()) and r.count() >= reading.count()]
+        ambiguous = [r for r in rivals if r.face is not reading.face or (r.index != reading.index).any()]
         if ambiguous or not is_named(reading.face, reading.index >= 0, target):
             refused.append((reading, *ambiguous))
         else:

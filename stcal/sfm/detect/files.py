@@ -306,38 +306,28 @@ def _without_copies(
 ) -> tuple[list[DetectedImage], list[Skipped]]:
     """Returns the images without copies of photographs, and the files that are skipped. Of equal content the plainest
     name stays, of several ``forms`` the lossless one; if ``grouped``, none of a photograph that is in two groups."""
-    if grouped:
-        misplaced = _in_two_groups([outcome for outcome in outcomes if isinstance(outcome, DetectedImage)])
-        outcomes = [misplaced.get(o.file.name, o) if isinstance(o, DetectedImage) else o for o in outcomes]
     detected = [outcome for outcome in outcomes if isinstance(outcome, DetectedImage)]
-    plainest: dict[str, DetectedImage] = {}
+    same: dict[str, list[DetectedImage]] = {}
     for image in sorted(detected, key=lambda image: _plainness(image.file)):
-        plainest.setdefault(image.digest, image)
-    firsts = [(image, plainest[image.digest]) for image in detected]
-    copies = {image.file.name: copy_of(image.file, first.file.name) for image, first in firsts if image is not first}
-    for one, two in _in_two_forms([image for image, first in firsts if image is first] if forms else []):
-        first, second = sorted((one, two), key=lambda image: _plainness(image.file))
-        if {first.file.name, second.file.name} & copies.keys() or not _same_pixels(first.file, second.file):
-            continue
-        copies[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
+        same.setdefault(image.digest, []).append(image)
+    groups = {digest: {image.file.group for image in images} for digest, images in same.items()}
+    whole = {group for each in groups.values() if len(each) == 1 for group in each}  # others are copied folders
+    copies: dict[str, Skipped] = {}
+    for digest, (first, *others) in same.items():
+        both = sorted(groups[digest] & whole) if grouped else []
+        reason = f"the same photograph is in groups {' and '.join(both)}, and belongs to one; delete the other file"
+        for image in (first, *others) if len(both) > 1 else others:
+            skipped = (
+                Skipped(image.file.name, reason, "copy") if len(both) > 1 else copy_of(image.file, first.file.name)
+            )
+            copies[image.file.name] = skipped
+    for pair in _in_two_forms([image for image in detected if image.file.name not in copies] if forms else []):
+        first, second = sorted((image.file for image in pair), key=_plainness)
+        if not {first.name, second.name} & copies.keys() and _same_pixels(first, second):
+            copies[second.name] = copy_of(second, first.name, ", saved in another form")
     images = [image for image in detected if image.file.name not in copies]
-    skipped = [outcome if isinstance(outcome, Skipped) else copies.get(outcome.file.name) for outcome in outcomes]
-    return images, [reason for reason in skipped if reason is not None]
-
-
-def _in_two_groups(images: list[DetectedImage]) -> dict[str, Skipped]:
-    """Returns, by name, the images whose content is in two groups that have further images of their own."""
-    groups_of: dict[str, set[str]] = {}
-    for image in images:
-        groups_of.setdefault(image.digest, set()).add(image.file.group)
-    whole = {image.file.group for image in images if len(groups_of[image.digest]) == 1}  # others are copied folders
-    found = {}
-    for image in images:
-        groups = sorted(groups_of[image.digest] & whole)
-        if len(groups) > 1:
-            reason = f"the same photograph is in groups {' and '.join(groups)}, and belongs to one"
-            found[image.file.name] = Skipped(image.file.name, f"{reason}; delete the other file", "copy")
-    return found
+    reasons = [outcome if isinstance(outcome, Skipped) else copies.get(outcome.file.name) for outcome in outcomes]
+    return images, [reason for reason in reasons if reason is not None]
 
 
 def _plainness(file: ImageFile) -> tuple[bool, bool, int]:

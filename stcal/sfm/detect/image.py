@@ -74,9 +74,10 @@ def _read_once(
 ) -> ImageReading:
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
     outlines: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
-    for polarity, found in outlines.items() if aside is not None else ():
-        inside = [cv2.pointPolygonTest(aside.astype(np.float32), at, False) > 0 for at in found.centre_px.tolist()]
-        outlines[polarity] = found.select(~np.array(inside, bool))
+    if aside is not None:
+        for polarity, found in outlines.items():
+            inside = [cv2.pointPolygonTest(aside.astype(np.float32), at, False) > 0 for at in found.centre_px.tolist()]
+            outlines[polarity] = found.select(~np.array(inside, bool))
     boards: list[BoardReading] = []
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:

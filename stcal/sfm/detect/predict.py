@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
@@ -61,10 +61,8 @@ class PredictedCircles:
     wanted: np.ndarray  # (n,) those that have no label yet
 
     def __post_init__(self):
-        n = len(self.labels)
-        object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
-        object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
-        object.__setattr__(self, "wanted", frozen(self.wanted, (n,), "wanted", dtype=bool))
+        for name, shape, dtype in (("centre_px", (2,), float), ("shape_px", (2, 2), float), ("wanted", (), bool)):
+            freeze(self, name, (len(self.labels), *shape), name, dtype)
 
     def shifted(self, by_px: np.ndarray) -> "PredictedCircles":
         """Returns all circles shifted by (2,) px."""
@@ -119,9 +117,8 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     place = {label: i for i, label in enumerate(predicted.labels)}
     rows = np.array([k for k, label in enumerate(observed.labels) if label in place], int)
     predicted_rows = np.array([place[observed.labels[k]] for k in rows], int)
-    widest, narrowest = _stretch(
-        predicted.shape_px[predicted_rows], observed.shape[rows], observed.centre[rows], camera
-    )
+    shapes_px = predicted.shape_px[predicted_rows]
+    widest, narrowest = _stretch(shapes_px, observed.shape[rows], observed.centre[rows], camera)
     planes = np.array([observed.labels[k].plane for k in rows], str)
     reasons: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
@@ -129,7 +126,7 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
             stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])
-            _, reason = _disagreement(predicted.shape_px[predicted_rows[k]], 0.0, stretch, blur)
+            _, reason = _disagreement(shapes_px[k], 0.0, stretch, blur)
             if reason:
                 reasons[observed.labels[rows[k]]] = reason
     return reasons
@@ -164,28 +161,17 @@ def measure_predicted(
     wanted = np.flatnonzero(predicted.wanted)
     low, high = options.min_diameter_px or MIN_DIAMETER_PX, options.max_diameter_px
     diameter = 2 * everything.radius_px()
-    missed = {
-        predicted.labels[i]: f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for; "
-        + REMEDIES["small" if diameter[i] < low else "large"]
-        for i in wanted
-        if not low <= diameter[i] <= high
-    }
+    missed = {}
+    for i in wanted[(diameter[wanted] < low) | (diameter[wanted] > high)]:
+        remedy = REMEDIES["small" if diameter[i] < low else "large"]
+        missed[predicted.labels[i]] = f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for; {remedy}"
     wanted = np.array([i for i in wanted if predicted.labels[i] not in missed], int)
     expected = everything.select(wanted)
     centres = measure_centres(grey, camera, expected, everything)
     reasons = _reasons(centres, expected, [predicted.polarity[i] for i in wanted], camera)
-    accepted = [k for k, reason in enumerate(reasons) if not reason]
-    return SecondLook(
-        tuple(predicted.labels[wanted[k]] for k in accepted),
-        centres.select(np.array(accepted, int)),
-        missed | {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason},
-    )
-
-
-def stands_out(found: Centres, polarity: Sequence[Polarity]) -> np.ndarray:
-    """Returns the mask of the circles whose contrast has the right sign and is far above the noise."""
-    contrast, needed = _contrast(found, polarity)
-    return contrast >= needed
+    accepted = np.array([k for k, reason in enumerate(reasons) if not reason], int)
+    missed |= {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason}
+    return SecondLook(tuple(predicted.labels[i] for i in wanted[accepted]), centres.select(accepted), missed)
 
 
 def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray, np.ndarray]:
@@ -222,8 +208,7 @@ def missed_notes(missed: dict[Label, str]) -> list[str]:
         planes.setdefault(label.plane, []).append((label, reason))
     notes = []
     for plane, rows in planes.items():
-        place = "board" if plane == BOARD else f"face {plane}"
-        first, reason = rows[0]
+        place, (first, reason) = "board" if plane == BOARD else f"face {plane}", rows[0]
         others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
         notes.append(f"{place}: {first}{others} should be in view and not measured; {first}: {reason}")
     return notes
@@ -250,7 +235,8 @@ def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles)
     planes = [label.plane for label in predicted.labels]
     number = {plane: i for i, plane in enumerate(dict.fromkeys(planes))}
     found = measure_centres(image, camera, expected, expected, np.array([number[plane] for plane in planes], int))
-    seen = np.flatnonzero(found.ok & stands_out(found, predicted.polarity))
+    contrast, needed = _contrast(found, predicted.polarity)
+    seen = np.flatnonzero(found.ok & (contrast >= needed))
     return tuple(predicted.labels[i] for i in seen.tolist()), found.select(seen)
 
 
@@ -273,7 +259,8 @@ def common_shift(grey: np.ndarray, predicted: PredictedCircles) -> np.ndarray:
     reach = round(margin / scale)
     part = _part(grey, low - reach, low + np.round(size / scale).astype(int) + reach)
     small = cv2.resize(part, tuple((size + 2 * margin).tolist()), interpolation=cv2.INTER_AREA).astype(np.float32)
-    correlation = cv2.matchTemplate(_levelled(small), _levelled(discs), cv2.TM_CCOEFF_NORMED)
+    small, discs = (each - cv2.blur(each, (LEVEL_PX, LEVEL_PX)) for each in (small, discs))
+    correlation = cv2.matchTemplate(small, discs, cv2.TM_CCOEFF_NORMED)
     row, column = np.unravel_index(int(correlation.argmax()), correlation.shape)
     if not correlation[row, column] >= CORRELATED:
         return np.zeros(2)
@@ -286,8 +273,3 @@ def _part(grey: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     inside = grey[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
     borders = max(-top, 0), max(bottom - height, 0), max(-left, 0), max(right - width, 0)
     return cv2.copyMakeBorder(inside, *borders, cv2.BORDER_REPLICATE) if any(borders) else inside
-
-
-def _levelled(image: np.ndarray) -> np.ndarray:
-    """Returns the image minus the local mean around each pixel."""
-    return image - cv2.blur(image, (LEVEL_PX, LEVEL_PX))

@@ -82,60 +82,29 @@ class PublishedPattern:
 
     @classmethod
     def _of(cls, target: TargetDesign) -> "PublishedPattern":
-        first = target.faces[0]
-        common, circle_of_face = _common(target)
-        place = {circle: first.xy_mm[i] for i, circle in enumerate(first.ids) if circle in common}
-        radius = {circle: float(first.radius_mm[first.ids.index(circle)]) for circle in common}
-        largest = max(radius.values())
-        large = [circle for circle in common if radius[circle] > 0.75 * largest and circle != first.origin]
-        small = [circle for circle in common if circle not in large and circle != first.origin]
-        lines = []
-        for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
-            lines.append(_along(np.array(direction), {circle: place[circle] for circle in large}))
-        (a, step_x), (b, step_y) = (
-            _along(np.array(d), {circle: place[circle] for circle in small})[0] for d in ((1.0, 0.0), (0.0, 1.0))
-        )
-        if not np.isclose(step_x, step_y) or len(large) != sum(len(line) for line in lines) or len(small) != 2:
+        first, places = target.faces[0], [dict(zip(face.ids, face.xy_mm, strict=True)) for face in target.faces]
+        place, radius = places[0], dict(zip(first.ids, first.radius_mm.tolist(), strict=True))
+        common = [i for i in first.ids if all(i in other and np.allclose(other[i], place[i]) for other in places)]
+        different = {tuple(circle for circle in face.ids if circle not in common) for face in target.faces}
+        if len(different) != 1 or len(names_face := different.pop()) != 1:
+            raise ValueError("not one circle alone differs from face to face")
+        largest = max(radius[circle] for circle in common)
+        large = {i: place[i] for i in common if radius[i] > 0.75 * largest and i != first.origin}
+        small = {i: place[i] for i in common if i not in large and i != first.origin}
+        lines = [_along(np.array(direction), large) for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))]
+        (a, step_x), (b, step_y) = (_along(np.array(direction), small)[0] for direction in ((1.0, 0.0), (0.0, 1.0)))
+        if not np.isclose(step_x, step_y) or len(large) != sum(map(len, lines)) or len(small) != 2:
             raise ValueError("its circles lie elsewhere")
-        last = lines[2][-1][0]
-        names: dict[tuple[int, int], str] = {}
-        distances = []
-        for face, circle in circle_of_face.items():
-            direction = _place(face, circle) - place[last]
-            distances.append(float(np.linalg.norm(direction)))
-            names[_signs(direction, np.ones(2))] = face.id
+        (c,), last = names_face, lines[2][-1][0]
+        directions = [other[c] - place[last] for other in places]
+        names = {_signs(way, np.ones(2)): face.id for way, face in zip(directions, target.faces, strict=True)}
+        distances = np.linalg.norm(directions, axis=1)
         if len(names) < len(target.faces) or not np.allclose(distances, distances[0], rtol=0.05):
             raise ValueError("the circles beside the last do not tell its faces apart")
-        return cls(
-            origin=first.origin,
-            a=a,
-            b=b,
-            c=next(iter(circle_of_face.values())),
-            last=last,
-            lines=tuple(tuple((circle, far / step_x) for circle, far in line) for line in lines),
-            names=names,
-            step_radii=step_x / radius[first.origin],
-            c_radii=distances[0] / radius[last],
-            small=(radius[a] / radius[first.origin]) ** 2,
-        )
-
-
-def _place(face: FaceDesign, circle: str) -> np.ndarray:
-    return face.xy_mm[face.ids.index(circle)]
-
-
-def _common(target: TargetDesign) -> tuple[list[str], dict[FaceDesign, str]]:
-    """Returns the circles at the same place in every face, and by face the circle that is not."""
-    first = target.faces[0]
-    common = [
-        circle
-        for circle in first.ids
-        if all(circle in f.ids and np.allclose(_place(f, circle), _place(first, circle)) for f in target.faces)
-    ]
-    own = {face: [circle for circle in face.ids if circle not in common] for face in target.faces}
-    if any(len(circles) != 1 for circles in own.values()) or len({c[0] for c in own.values()}) != 1:
-        raise ValueError("not one circle alone differs from face to face")
-    return common, {face: circles[0] for face, circles in own.items()}
+        in_steps = tuple(tuple((circle, far / step_x) for circle, far in line) for line in lines)
+        step_radii, c_radii = step_x / radius[first.origin], float(distances[0]) / radius[last]
+        small_share = (radius[a] / radius[first.origin]) ** 2
+        return cls(first.origin, a, b, c, last, in_steps, names, step_radii, c_radii, small_share)
 
 
 def _along(direction: np.ndarray, place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
@@ -181,9 +150,12 @@ def detect_published(
             if board.polarity == target.polarity:
                 free[grid.candidates] = False
     faces, notes = _Rules(pattern, target, candidates[target.polarity], ellipses[target.polarity]).find(free)
-    first = start[target.polarity]
+    first, centres = start[target.polarity], []
+    for polarity, every in ellipses.items():
+        equal, found = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(every), 2, 2)), candidates[polarity]
+        centres.append(Centres.without_rims(every.centre_px, found.xy, found.shape, equal, every.contrast))
     return ImageDetection(
-        centres=Centres.concatenate([_centres(ellipses[p], candidates[p]) for p in ellipses]),
+        centres=Centres.concatenate(centres),
         faces=tuple(FaceSighting(face, first + rows, circles) for face, rows, circles in faces),
         boards=tuple(boards),
         notes=tuple(notes),
@@ -209,11 +181,6 @@ def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptio
     return Ellipses(centre[keep], shape[keep], contrast[keep])
 
 
-def _centres(ellipses: Ellipses, candidates: Candidates) -> Centres:
-    equal = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(ellipses), 2, 2))
-    return Centres.without_rims(ellipses.centre_px, candidates.xy, candidates.shape, equal, ellipses.contrast)
-
-
 class _Rules:
     """§1.2 (3) on the ellipses of one image; directions are taken in the image without its distortion."""
 
@@ -231,7 +198,9 @@ class _Rules:
             beside = self._beside(origin, self.pattern.step_radii, free)
             if len(beside) != 2:
                 continue
-            circles = {self.pattern.origin: origin} | self._axes(origin, beside)
+            if _cross(*(self.found.xy[beside] - self.found.xy[origin])) > 0:  # the image's y points down
+                beside.reverse()
+            circles = {self.pattern.origin: origin, self.pattern.a: beside[0], self.pattern.b: beside[1]}
             where = "a pattern about ({:.0f}, {:.0f}) px".format(*self.ellipses.centre_px[origin])
             named = self._walk(circles, free) or self._name(circles, free)
             if isinstance(named, str):
@@ -245,21 +214,12 @@ class _Rules:
 
     def _beside(self, centre: int, radii: float, free: np.ndarray) -> list[int]:
         """Returns the small circles at the given distance from a large one, in its radii."""
-        away = np.linalg.norm(
-            np.linalg.solve(self.found.shape[centre], (self.found.xy - self.found.xy[centre]).T), axis=0
-        )
+        off = (self.found.xy - self.found.xy[centre]).T
+        away = np.linalg.norm(np.linalg.solve(self.found.shape[centre], off), axis=0)
         size = self.area / (self.pattern.small * self.area[centre])
         near = (away > radii / STEP_RATIO) & (away < radii * STEP_RATIO)
         alike = (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
         return np.flatnonzero(free & near & alike).tolist()
-
-    def _axes(self, origin: int, beside: list[int]) -> dict[str, int]:
-        """Returns a and b, distinguished by the sign of the vector product; the image's y points down."""
-        first, second = beside
-        at = self.found.xy[origin]
-        if _cross(self.found.xy[first] - at, self.found.xy[second] - at) > 0:
-            first, second = second, first
-        return {self.pattern.a: first, self.pattern.b: second}
 
     def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
         """Labels the large circles along the three directions; returns the reason if one is missing, else ""."""
@@ -276,15 +236,10 @@ class _Rules:
                 along = off @ direction
                 across = np.abs(off @ [-direction[1], direction[0]])
                 relative_steps = along / (steps * np.linalg.norm(step))
-                candidates = (
-                    large
-                    & (across < self.found.radius)
-                    & (relative_steps > 1 / STEP_RATIO)
-                    & (relative_steps < STEP_RATIO)
-                )
-                if not candidates.any():
+                near = (relative_steps > 1 / STEP_RATIO) & (relative_steps < STEP_RATIO)
+                rows = np.flatnonzero(large & (across < self.found.radius) & near)
+                if not len(rows):
                     return f"circle {circle} not found in its direction"
-                rows = np.flatnonzero(candidates)
                 circles[circle] = int(rows[np.argmin(np.abs(relative_steps[rows] - 1))])
                 on_line = self.found.xy[[origin, *(circles[c] for c, _ in line if c in circles)]]
                 direction = _fitted_direction(on_line, direction)
@@ -306,17 +261,15 @@ class _Rules:
         placed = self._placed(circles, beside[0])
         if isinstance(placed, str):
             return placed
-        face = min(self.target.faces, key=lambda f: float(np.linalg.norm(_place(f, pattern.c) - placed)))
+        places = [face.xy_mm[face.ids.index(pattern.c)] for face in self.target.faces]
+        face = self.target.faces[int(np.linalg.norm(places - placed, axis=1).argmin())]
         rows = np.array([{**circles, pattern.c: beside[0]}[circle] for circle in face.ids])
         if published == face.id:
             return face, rows, ""
         cosine = direction @ diagonal / np.linalg.norm(direction)
-        return (
-            face,
-            rows,
-            f"perspective breaks the published name: the products in the image (cosine {cosine:+.2f}) say "
-            f"{f'face {published}' if published else 'no face'}, its own plane says face {face.id}, which was taken",
-        )
+        said = f"(cosine {cosine:+.2f}) say {f'face {published}' if published else 'no face'}"
+        broken = f"perspective breaks the published name: the products in the image {said}, its own plane says"
+        return face, rows, f"{broken} face {face.id}, which was taken"
 
     def _placed(self, circles: dict[str, int], c: int) -> np.ndarray | str:
         """Returns circle c in the plane of the face, mm, or the reason why the others are no face."""

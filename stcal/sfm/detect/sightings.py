@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
@@ -125,31 +126,26 @@ Readings = list[PlaneView]
 
 def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
     """Returns the readings of one image with poses; not of patterns in view twice, one of which may be a reflection."""
-    readings = []
+    readings: list[list[PlaneView | None]] = []
     ids = [each.face for each in detection.faces]
     for each in (each for each in detection.faces if ids.count(each.face) == 1):
         readings.append([_face_view(each, target, detection, named=True)])
     for faces in detection.open_faces:
-        candidates_of_pattern = [_face_view(each, target, detection, named=False) for each in faces]
-        readings.append([view for view in candidates_of_pattern if view is not None])
+        views = [_face_view(each, target, detection, named=False) for each in faces]
+        readings.append([view for view in views if view is not None])
     if board is not None and BOARD not in detection.repeated:
         for each in detection.boards:
-            readings.append(_board_views(each, each.numberings, board, detection))
-            covered = _board_views(each, each.unlikely, board, detection)
-            readings[-1] += [replace(view, likely=False) for view in covered if view is not None]
+            labels = [tuple(DotLabel(*cell) for cell in n.tolist()) for n in (*each.numberings, *each.unlikely)]
+            views = [_view(BOARD, own, each.rows, board.places_mm(own)[:, :2], detection) for own in labels]
+            count = len(each.numberings)
+            covered = [replace(view, likely=False) for view in views[count:] if view is not None]
+            readings.append(views[:count] + covered)
     return [[v for v in views if v is not None] for views in readings if views and all(v is not None for v in views)]
 
 
 def likely_views(readings: list[Readings]) -> list[Readings]:
     """Returns the readings without those that require covered circles."""
     return [[view for view in views if view.likely] for views in readings]
-
-
-def _board_views(
-    each: BoardSighting, numberings: np.ndarray, board: BoardDesign, detection: ImageDetection
-) -> list[PlaneView | None]:
-    labels = [tuple(DotLabel(*cell) for cell in cells.tolist()) for cells in numberings]
-    return [_view(BOARD, own, each.rows, board.places_mm(own)[:, :2], detection) for own in labels]
 
 
 def _face_view(each: FaceSighting, target: TargetDesign, detection: ImageDetection, named: bool) -> PlaneView | None:
@@ -182,9 +178,8 @@ def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
     sets_of_face = {}
     for face_id, xy, radius in faces:
         sets: set[frozenset[int]] = set()
-        for other_id, other_xy, other_radius in faces:
-            for common in common_circles(xy, radius, other_xy, other_radius, same=face_id == other_id):
-                sets.add(common)
+        for other_id, *other in faces:
+            sets |= common_circles(xy, radius, *other, same=face_id == other_id)
         sets_of_face[face_id] = tuple(s for s in sets if not any(s < t for t in sets))
     return sets_of_face
 
@@ -224,8 +219,7 @@ def likeness_notes(target: TargetDesign) -> list[str]:
         notes.append(f"target {target.name}: faces are mirror images: {listed}; a reflection passes for a face")
     partly = [
         (len(pairs), face.id, other.id, len(other.ids))
-        for face in target.faces
-        for other in target.faces
+        for face, other in product(target.faces, target.faces)
         if other.id not in alike.get(face.id, ())
         for pairs in mirrored_as(face, other)
         if len(pairs) >= MIN_NAMING and is_named(other, np.isin(np.arange(len(other.ids)), pairs[:, 1]), target)
@@ -257,15 +251,11 @@ def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str,
 
 def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
     """Returns by face the faces that its mirror image looks like, whole and with its radii; others have no entry."""
-    found = {
-        face.id: tuple(
-            other.id
-            for other in target.faces
-            if any(len(face.ids) == len(other.ids) == len(pairs) for pairs in mirrored_as(face, other))
-        )
-        for face in target.faces
-    }
-    return {face: others for face, others in found.items() if others}
+    found: dict[str, tuple[str, ...]] = {}
+    for face, other in product(target.faces, target.faces):
+        if any(len(face.ids) == len(other.ids) == len(pairs) for pairs in mirrored_as(face, other)):
+            found[face.id] = (*found.get(face.id, ()), other.id)
+    return found
 
 
 def mirrored_as(face: FaceDesign, other: FaceDesign) -> tuple[np.ndarray, ...]:

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from stcal.design import Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_fields
+from stcal.geometry.arrays import freeze, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian, singular_values
 from stcal.io.images import percentiles, shrunk
@@ -64,9 +64,8 @@ class EllipseOptions:
         for name, (low, high) in OPTION_RANGES.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                raise InputError(
-                    "E-OPTION-RANGE", f"option {name} {value:g}: {low:g} to {high:g} possible; give another"
-                )
+                needed = f"option {name} {value:g}: {low:g} to {high:g} possible; give another"
+                raise InputError("E-OPTION-RANGE", needed)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +77,8 @@ class Ellipses(CircleRows):
     contrast: np.ndarray  # (n,) middle against surroundings, grey values of the 8-bit image, positive
 
     def __post_init__(self):
-        n = len(self.centre_px)
-        object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
-        object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
-        object.__setattr__(self, "contrast", frozen(self.contrast, (n,), "contrasts"))
+        for name, shape in (("centre_px", (2,)), ("shape_px", (2, 2)), ("contrast", ())):
+            freeze(self, name, (len(self.centre_px), *shape), name)
 
     def __len__(self) -> int:
         return len(self.centre_px)
@@ -91,58 +88,10 @@ class Ellipses(CircleRows):
         return np.sqrt(np.abs(np.linalg.det(self.shape_px)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Level:
-    """One level of the pyramid."""
-
-    image: np.ndarray
-    scale: float  # of its pixels in px of the full image
-    lowest: float  # diameter sought, px of the level
-
-    def in_full(self, rows: list[tuple[float, ...]]) -> np.ndarray:
-        """Converts ellipses (x, y, full axis 1, full axis 2, angle of axis 1 in deg) from the level to the image."""
-        table = np.array(rows).reshape(-1, 5)
-        table[:, :2] = table[:, :2] * self.scale + (self.scale - 1) / 2
-        table[:, 2:4] *= self.scale
-        return table
-
-
-@dataclass(frozen=True, slots=True)
-class OutlineGates:
-    """Limits for outlines in one mask; px of the level, ``shortest`` and ``longest`` in points."""
-
-    width: int
-    height: int
-    lowest: float
-    highest: float
-    min_axis_ratio: float
-    shortest: float
-    longest: float
-
-    def ellipse(self, contour: np.ndarray) -> tuple[float, ...] | None:
-        """Returns an ellipse within the limits, (x, y, full axes 1 and 2, angle of axis 1 in deg), or None."""
-        if not self.shortest <= len(contour) <= self.longest:
-            return None
-        x, y, w, h = cv2.boundingRect(contour)
-        if x == 0 or y == 0 or x + w == self.width or y + h == self.height:
-            return None
-        (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
-        if not np.isfinite(d1 + d2 + cx + cy):
-            return None
-        # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
-        d1, d2 = d1 + 1, d2 + 1
-        if min(d1, d2) < self.min_axis_ratio * max(d1, d2) or not self.lowest <= np.sqrt(d1 * d2) <= self.highest:
-            return None
-        if abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1) > MAX_AREA_ERROR:
-            return None
-        deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
-        return None if deviation > 1 else (cx, cy, d1, d2, angle)
-
-
 def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
     """Finds blobs of one polarity with an elliptic outline in an 8-bit grey image; centres are good to about 0.1 px."""
     threshold = contrast_threshold(image, options)
-    found = [_rows(level, polarity, threshold, options) for level in levels(image, options)]
+    found = [_rows(*level, polarity, threshold, options) for level in _levels(image, options)]
     centre, shape = distinct(np.concatenate(found))
     contrast = contrast_of(image, polarity, centre, shape)
     keep = contrast > threshold
@@ -161,8 +110,8 @@ def diameter_limits_px(pixels: int, options: EllipseOptions) -> tuple[float, flo
     return options.min_diameter_px or default, options.max_diameter_px
 
 
-def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
-    """Yields the levels of the pyramid, the finest first."""
+def _levels(image: np.ndarray, options: EllipseOptions) -> Iterator[tuple[np.ndarray, float, float]]:
+    """Yields the levels of the pyramid, the finest first: image, size of its pixels in px, and diameter sought."""
     scale, minimum = 1.0, diameter_limits_px(image.size, options)[0]
     if image.size > HALF_SCALE_FROM_PX and minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX:
         image, scale = shrunk(image, 0.5), 2.0
@@ -173,7 +122,7 @@ def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
         # Both of the first two levels of a small image look for everything: the coarser one sees less noise.
         fine = first or scale <= 1
         smallest = max(MIN_LEVEL_DIAMETER_PX, minimum / scale) if fine else MIN_COARSE_DIAMETER_PX
-        yield Level(image, scale, max((options.min_diameter_px or 0) / scale, smallest))
+        yield image, scale, max((options.min_diameter_px or 0) / scale, smallest)
         if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
             return
         scale, first = 2 * scale, False
@@ -194,28 +143,6 @@ def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape
     return (sample(0.4, 0.0) - sample(1.25, 2.0)) * (1 if polarity == "bright" else -1)
 
 
-def masks(
-    level: Level, polarity: Polarity, threshold: float, options: EllipseOptions
-) -> Iterator[tuple[np.ndarray, OutlineGates]]:
-    """Yields masks of blobs, one for each window that circles of the level fit into, and the limits for outlines."""
-    smooth = cv2.GaussianBlur(level.image, (3, 3), 0)
-    for window in WINDOWS_PX:
-        highest = min(options.max_diameter_px / level.scale, window / WINDOW_OVER_DIAMETER)
-        if highest < level.lowest:
-            continue
-        mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
-        difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
-        # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.
-        peak = cv2.dilate(difference, np.ones((REACH_PX, REACH_PX), np.uint8))
-        mask = cv2.bitwise_and(
-            cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)[1],
-            cv2.compare(difference, cv2.convertScaleAbs(peak, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
-        )
-        shortest, longest = max(6.0, 2 * level.lowest), 4 * highest / np.sqrt(options.min_axis_ratio)
-        height, width = mask.shape
-        yield mask, OutlineGates(width, height, level.lowest, highest, options.min_axis_ratio, shortest, longest)
-
-
 def outlines(mask: np.ndarray) -> list[np.ndarray]:
     """Returns the outer outlines in a mask, without outlines of holes."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -227,14 +154,52 @@ def outline_area(contour: np.ndarray) -> float:
     return cv2.contourArea(contour) + 0.5 * cv2.arcLength(contour, True) + 1
 
 
-def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
-    """Returns the ellipses of one level, rows as in :meth:`Level.in_full`."""
-    ellipses = [
-        gates.ellipse(contour)
-        for mask, gates in masks(level, polarity, threshold, options)
-        for contour in outlines(mask)
-    ]
-    return level.in_full([row for row in ellipses if row is not None])
+def _rows(
+    image: np.ndarray, scale: float, lowest: float, polarity: Polarity, threshold: float, options: EllipseOptions
+) -> np.ndarray:
+    """Returns the ellipses of one level, in px of the full image: x, y, full axes 1 and 2, angle of axis 1 in deg."""
+    smooth, rows = cv2.GaussianBlur(image, (3, 3), 0), []
+    for window in WINDOWS_PX:
+        highest = min(options.max_diameter_px / scale, window / WINDOW_OVER_DIAMETER)
+        if highest < lowest:
+            continue
+        mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
+        difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
+        # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.
+        peak = cv2.dilate(difference, np.ones((REACH_PX, REACH_PX), np.uint8))
+        mask = cv2.bitwise_and(
+            cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)[1],
+            cv2.compare(difference, cv2.convertScaleAbs(peak, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
+        )
+        points = max(6.0, 2 * lowest), 4 * highest / np.sqrt(options.min_axis_ratio)
+        limits = mask.shape, points, (lowest, highest), options.min_axis_ratio
+        rows += [_ellipse(contour, *limits) for contour in outlines(mask)]
+    table = np.array([row for row in rows if row is not None]).reshape(-1, 5)
+    table[:, :2] = table[:, :2] * scale + (scale - 1) / 2
+    table[:, 2:4] *= scale
+    return table
+
+
+def _ellipse(
+    contour: np.ndarray, shape: tuple[int, ...], points: tuple, diameter_px: tuple, min_axis_ratio: float
+) -> tuple[float, ...] | None:
+    """Returns an ellipse within the limits, (x, y, full axes 1 and 2, angle of axis 1 in deg), or None."""
+    if not points[0] <= len(contour) <= points[1]:
+        return None
+    x, y, w, h = cv2.boundingRect(contour)
+    if x == 0 or y == 0 or x + w == shape[1] or y + h == shape[0]:
+        return None
+    (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
+    if not np.isfinite(d1 + d2 + cx + cy):
+        return None
+    # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
+    d1, d2 = d1 + 1, d2 + 1
+    if min(d1, d2) < min_axis_ratio * max(d1, d2) or not diameter_px[0] <= np.sqrt(d1 * d2) <= diameter_px[1]:
+        return None
+    if abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1) > MAX_AREA_ERROR:
+        return None
+    deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
+    return None if deviation > 1 else (cx, cy, d1, d2, angle)
 
 
 def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
@@ -251,11 +216,9 @@ def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns centres and shapes without duplicates: of coincident rows the first, from the finest level, is kept."""
     if not len(table):
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    centre = table[:, :2]
-    radius = np.sqrt(table[:, 2] * table[:, 3]) / 2
+    centre, radius = table[:, :2], np.sqrt(table[:, 2] * table[:, 3]) / 2
     pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
-    smaller = np.minimum(radius[pairs[:, 0]], radius[pairs[:, 1]])
-    larger = np.maximum(radius[pairs[:, 0]], radius[pairs[:, 1]])
+    smaller, larger = np.sort(radius[pairs], axis=1).T
     near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
     keep = np.ones(len(table), bool)
     keep[pairs[near & (smaller > 0.75 * larger), 1]] = False
@@ -329,21 +292,13 @@ def match_pattern(
     return index
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Grown:
-    """k grown patterns."""
-
-    index: np.ndarray  # (k, m) candidates of their circles, −1 if there is none
-    homography: np.ndarray  # (k, 3, 3) to normalised coordinates
-    holds: np.ndarray  # (k,) whether the match converged with four circles or more
-
-
 def grow_matches(
     candidates: Candidates, index: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, rounds: int = 8
-) -> Grown:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Alternates between fitting homographies to the matched circles and matching again, until nothing changes.
     ``index``: (k, m) start, −1 if there is none; ``xy_plane``: (k, m, 2); ``radius``: (k, m), 0 behind the last circle
-    of a shorter pattern, with the place of an existing circle."""
+    of a shorter pattern, with the place of an existing circle. Returns index, homographies (k, 3, 3) to normalised
+    coordinates, and whether matches converged with four circles or more, (k,)."""
     index, there = index.copy(), radius > 0
     homography, holds = np.full((len(index), 3, 3), np.nan), np.zeros(len(index), bool)
     active = np.arange(len(index))
@@ -366,7 +321,7 @@ def grow_matches(
         homography[active[settled]], holds[active[settled]] = found[settled], True
         index[active[~settled]] = again[~settled]
         active = active[~settled]
-    return Grown(index, homography, holds)
+    return index, homography, holds
 
 
 def _spread_out(matched: np.ndarray, xy: np.ndarray) -> np.ndarray:

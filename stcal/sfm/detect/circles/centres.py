@@ -47,7 +47,9 @@ def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
     influence = np.maximum(4 * np.sqrt(weight) - 3, 0)
     chance = _chance(fits, np.sqrt(share / weight), total) / noise2
     spread = (pull.sum(1, dtype=float) / (pull * influence).sum(1, dtype=float))[:, None, None] * np.eye(2)
-    wide = (fits.blur >= np.minimum(SHARP_PX, SHARP * _narrowest(fits))) & ~fits.failed
+    xx, xy, yy = fits.inverse_shape[:, 0, 0], fits.inverse_shape[:, 0, 1], fits.inverse_shape[:, 1, 1]
+    narrowest = 2 / (xx + yy + np.hypot(xx - yy, 2 * xy))
+    wide = (fits.blur >= np.minimum(SHARP_PX, SHARP * narrowest)) & ~fits.failed
     for i in np.flatnonzero(wide).tolist():
         n = len(fits.rows[i])
         slope = _exact_slope(fits, i, fits.scores[i, :2, :n] / weight[i, :n]) - _residual_slope(fits, i)
@@ -71,12 +73,6 @@ def _chance(fits: Fits, edge: np.ndarray, total: np.ndarray) -> np.ndarray:
     left = CHANCE_WAVES * total - (taken @ fits.inverse * taken).sum((1, 2))
     found = waves @ (fits.weight * fits.residual)[..., None]
     return (found**2).sum((1, 2)) / left
-
-
-def _narrowest(fits: Fits) -> np.ndarray:
-    """Returns the ellipses' smaller radii, px."""
-    xx, xy, yy = fits.inverse_shape[:, 0, 0], fits.inverse_shape[:, 0, 1], fits.inverse_shape[:, 1, 1]
-    return 2 / (xx + yy + np.hypot(xx - yy, 2 * xy))
 
 
 def _exact_slope(fits: Fits, i: int, slope: np.ndarray) -> np.ndarray:
@@ -196,15 +192,17 @@ def _rims(fits: Fits) -> _Rims:
         covariance, chance = covariances(fits)
         domes = fits.domes()
     ok = ~fits.failed
+    numbers = (chance, fits.blur, contrast, noise, rim)
+    chance, blur, contrast, noise, rim = (np.where(ok, value, 0.0) for value in numbers)
     return _Rims(
         np.where(ok[:, None], fits.centre, fits.start),
         np.where(ok[:, None, None], np.linalg.inv(fits.inverse_shape), fits.radius[:, None, None] * np.eye(2)),
         np.where(ok[:, None, None], covariance, np.eye(2)),
-        np.where(ok, chance, 0.0),
-        np.where(ok, fits.blur, 0.0),
-        np.where(ok, contrast, 0.0),
-        np.where(ok, noise, 0.0),
-        np.where(ok, rim, 0.0),
+        chance,
+        blur,
+        contrast,
+        noise,
+        rim,
         np.where(ok[:, None], fits.uneven, 0.0),
         np.where(ok[:, None] & np.isfinite(domes), domes, 0.0),
     )

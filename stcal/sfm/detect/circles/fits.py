@@ -297,13 +297,11 @@ class Fits:
         planes[:, 0], planes[:, 1], planes[:, 2] = 1, x, y
         planes[:, 3], planes[:, 4], planes[:, 5] = inside, inside * x, inside * y
         # A slope that is blurred with its disc: of x D, blurred by G of variance s², there is x (D∗G) + s² ∂(D∗G)/∂x.
-        edge = (
-            bell
-            * blur
-            / (slope_rho * np.float32(np.sqrt(2 * np.pi)) * self.radius[selection].astype(np.float32)[:, None])
-        )
+        radius = self.radius[selection].astype(np.float32)[:, None]
+        edge = bell * blur / (slope_rho * np.float32(np.sqrt(2 * np.pi)) * radius)
         planes[:, 4:6] -= edge[:, None] * gradient
-        around = _around(a, b) if waves else np.zeros((len(active), 0, rho.shape[1]), np.float32)
+        angle = np.arctan2(b, a)[:, None] * np.array(WAVES if waves else (), np.float32)[:, None]
+        around = np.concatenate([np.cos(angle), np.sin(angle)], 1)  # harmonics around the rim
         for k, within in enumerate(waves):
             planes[:, 6 + k * per_side : 6 + (k + 1) * per_side] = around * (inside if within else 1 - inside)[:, None]
         levels = self.levels[selection, : count - 6]
@@ -362,12 +360,6 @@ def _normal_above(x: np.ndarray, bell: np.ndarray) -> np.ndarray:
         tail *= t
     tail *= bell
     return np.where(x < 0, 1 - tail, tail)
-
-
-def _around(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the cosines and sines of the harmonics around the rim, (n, 2 k, m)."""
-    angle = np.arctan2(b, a)[:, None] * np.array(WAVES, np.float32)[:, None]
-    return np.concatenate([np.cos(angle), np.sin(angle)], 1)
 
 
 def _levels(planes: np.ndarray, weight: np.ndarray, grey: np.ndarray) -> np.ndarray:
