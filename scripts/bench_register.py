@@ -59,7 +59,7 @@ def parts_once(path: Path) -> tuple[dict[str, float], int]:
     found = timed("registration", lambda: register(pairs.xyz_a, pairs.xyz_b, lines=pairs.lines))
     every = timed("field and cubes", lambda: findings("pairs", pairs.lines, pairs.xyz_a, pairs.xyz_b, found))
     timed("tables", registration_report(every).text)
-    timed("JSON", lambda: json_text(RegistrationFile.of(every)))
+    timed("JSON", lambda: json_text(RegistrationFile.model_validate(every)))
     timed("page", registration_report(every).page)
     return took, len(found.outliers)
 

@@ -1,7 +1,8 @@
 """Range of validity of a registration: systematic residuals over the workspace, and errors around cubes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -26,6 +27,8 @@ LENGTHS, RATIOS = 12, np.geomspace(1e-3, 1e7, 41)
 WILD = 0.01
 """Probability that a clean set has any point that is taken for an outlier of the field."""
 ROUNDS = 5
+GRID, MARGIN = 7, 0.25
+"""Number of places along each side of the grid of the field, and its margin beyond the box of the points."""
 _LAPACK = ("sytrd", "sytrd_lwork", "ormqr", "pttrf", "pttrs")
 _sytrd, _sytrd_lwork, _ormqr, _pttrf, _pttrs = get_lapack_funcs(_LAPACK, dtype=np.float64)
 
@@ -68,6 +71,25 @@ class Field:
     @property
     def size_mm(self) -> float:
         return float(np.sqrt((self.at(self._model.xyz_a)[0] ** 2).sum(1).mean()))
+
+    @property
+    def plain(self) -> ErrorFigures:
+        return ErrorFigures.of(self.plain_mm)
+
+    @property
+    def corrected(self) -> ErrorFigures:
+        return ErrorFigures.of(self.corrected_mm)
+
+    @property
+    def grid(self) -> dict[str, np.ndarray]:
+        """Places in and around the points, frame a, with the error to expect there and its σ per axis, mm."""
+        low, high = self._model.xyz_a.min(0), self._model.xyz_a.max(0)
+        side = MARGIN * (high - low)
+        axes = [np.linspace(a, b, GRID) if b > a else [a] for a, b in zip(low - side, high + side, strict=True)]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        error, covariance = self.at(places)
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
+        return {"xyz_a_mm": places, "error_mm": error, "sigma_mm": sigma}
 
     def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the expected systematic error (g, 3) of the transform at places (g, 3), and its covariance, mm."""
@@ -344,35 +366,38 @@ def _errors(problem: Problem, inside: np.ndarray, folds: int, seed: int) -> np.n
     return error
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Findings:
-    """A registration of file ``where`` and its checks. ``lines`` : (n,) of the points; ``field``, ``cubes`` : or
-    None."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Findings(Registration):
+    """A registration of the file ``pairs`` and its checks. ``lines`` : (n,) of the points; ``xyz_a`` : (n, 3) points,
+    mm; ``field``, ``cubes`` : or None."""
 
-    where: str
+    format: ClassVar = "stcal registration 1"
+    pairs: str
     lines: Sequence[int]
     xyz_a: Array
-    registration: Registration
     field: Field | None
     cubes: Cubes | None
 
     def __post_init__(self):
-        freeze(self, "xyz_a", (len(self.registration), 3), "points")
+        Registration.__post_init__(self)
+        freeze(self, "xyz_a", (len(self), 3), "points")
+
+    @property
+    def covariance_of(self) -> tuple[str, ...]:
+        """Names of the covariance's rows, with units."""
+        if len(self.covariance) < 12:
+            return ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm", "scale")[: len(self.covariance)]
+        return tuple(f"m{row}{column}" + ("_mm" if column == "4" else "") for row in "123" for column in "1234")
 
     @property
     def length_mm(self) -> np.ndarray:
         """Lengths (n,) of the residuals, mm."""
-        return np.linalg.norm(self.registration.residuals, axis=1)
-
-    def middle(self) -> np.ndarray:
-        """Middle (3,) of the inliers, frame a, mm."""
-        return self.xyz_a[self.registration.inliers].mean(0)
+        return np.linalg.norm(self.residuals, axis=1)
 
     def sigma_mm_at(self, xyz_a: np.ndarray) -> np.ndarray:
         """Returns σ (3,) by the transform's covariance at a point of frame a, along b's axes."""
-        found = self.registration
-        by_step = jacobian(MODELS[found.model], found.b_from_a, xyz_a[None])[0]
-        return np.sqrt(np.diag(by_step @ found.covariance @ by_step.T).clip(0))
+        by_step = jacobian(MODELS[self.model], self.b_from_a, xyz_a[None])[0]
+        return np.sqrt(np.diag(by_step @ self.covariance @ by_step.T).clip(0))
 
 
 @one_thread()
@@ -389,4 +414,5 @@ def findings(
     field = residual_field(registration, xyz_a, xyz_b, weights, covariances)
     back = None if field is None else field.taken_back
     reach = cubes(registration, xyz_a, xyz_b, back, weights, covariances)
-    return Findings(where, lines, xyz_a, registration, field, reach)
+    found = {each.name: getattr(registration, each.name) for each in fields(registration)}
+    return Findings(**found, pairs=where, lines=lines, xyz_a=xyz_a, field=field, cubes=reach)
