@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import null_space
@@ -339,6 +339,8 @@ class CalibratedLayout(Brief):
         Images that were not used, and why.
     """
 
+    format: ClassVar = "stcal layout calibration 1"
+    unit: ClassVar = "mm"
     layout: TargetLayout
     published: np.ndarray
     board_from_obj: Rigid

@@ -289,21 +289,12 @@ def _varies(found: Poses) -> tuple[float, float]:
     return float(np.sqrt((mm**2).mean())), float(np.sqrt((rad**2).mean()))
 
 
-def camera_from_obj(located: Located) -> Rigid | None:
-    """Returns camera_from_obj by the method that was asked for, or None."""
-    if located.patent is not None:
-        return located.patent.camera_from_obj
-    return None if located.pose is None else located.pose.camera_from_obj
-
-
 def uncertain(located: Located) -> UncertainRigid:
     """Returns camera_from_obj with its covariance, which is zero for the patent's method."""
-    if located.pose is None:
-        pose = camera_from_obj(located)
-        if pose is None:
-            raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
-        return UncertainRigid.exact(pose)
-    return UncertainRigid(located.pose.camera_from_obj, located.pose.covariance)
+    pose = located.camera_from_obj
+    if pose is None:
+        raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
+    return UncertainRigid(pose, np.zeros((6, 6)) if located.pose is None else located.pose.covariance)
 
 
 def accepted(results: Sequence[Located]) -> list[Located]:

@@ -445,6 +445,10 @@ class Merged:
     repeated: tuple[tuple[str, int], ...]
     unknown: tuple[tuple[str, int], ...]
 
+    @property
+    def rows(self) -> np.ndarray:
+        return self.seen.rows
+
 
 def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] = ()) -> Merged:
     """Returns weighted means of the corners over the exposures, with their covariance. The part of their errors that

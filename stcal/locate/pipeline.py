@@ -13,11 +13,12 @@ from stcal.boards.tags import seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import decode, grey_8bit, grey_of, size_fault
 from stcal.locate.estimate import Merged, ObjPose, Shift, locate, merge
-from stcal.locate.exposures import SceneFiles, SceneTags, detect, read_scenes
+from stcal.locate.exposures import Exposure, SceneFiles, SceneTags, detect, read_scenes
 from stcal.locate.layout import TargetLayout
 from stcal.locate.patent import PatentOptions, PatentPose, locate_as_patent
 from stcal.locate.verdict import Verdict, VerdictOptions, judge, likely_mistake
@@ -90,6 +91,17 @@ class Located(Brief):
     def name(self) -> str:
         """Name of the scene."""
         return self.tags.name
+
+    @property
+    def exposures(self) -> tuple[Exposure, ...]:
+        """Readable exposures of the scene."""
+        return self.tags.exposures
+
+    @property
+    def camera_from_obj(self) -> Rigid | None:
+        """Pose of the target by the method that was asked for, mm; None if there is none."""
+        found = self.patent or self.pose
+        return found and found.camera_from_obj
 
 
 @require_arguments
@@ -173,8 +185,8 @@ def locate_scene(
 ) -> Located:
     """Locates the target in one scene and judges the pose."""
     options = options or LocateOptions()
-    notes = [f"left out: {exposure.trouble}" for exposure in scene.unreadable()]
-    used = scene.readable()
+    notes = [f"left out: {trouble}" for trouble in scene.unreadable]
+    used = scene.exposures
     troubles = _size_troubles(scene, camera)
     if troubles:
         return Located(scene, None, None, _rejected(troubles), tuple(notes))
@@ -217,7 +229,7 @@ def locate_scene(
 
 
 def _size_troubles(scene: SceneTags, camera: CameraModel) -> list[str]:
-    used = scene.readable()
+    used = scene.exposures
     if not used:
         return ["no readable image; 1 needed"]
     sizes = {exposure.size: exposure.name for exposure in reversed(used)}
@@ -296,7 +308,7 @@ def _named(located: Located, layout: TargetLayout, image: Callable[[], np.ndarra
 
 
 def _first_image(tags: SceneTags, files: SceneFiles) -> np.ndarray:
-    used = {exposure.name for exposure in tags.readable()}
+    used = {exposure.name for exposure in tags.exposures}
     file = next(file for file in files.files if file.name in used)
     return decode(file.read(), file.name)
 
@@ -309,4 +321,4 @@ def _why_no_tag(located: Located, merged: Merged, image: np.ndarray, layout: Tar
         return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
     reason = f"no tag of {', '.join(dictionaries)}; 1 of the layout needed"
     shown = seen_otherwise(image, layout.rows(), "the layout file")
-    return f"{reason}, and {located.tags.readable()[0].name} shows {shown}" if shown else reason
+    return f"{reason}, and {located.tags.exposures[0].name} shows {shown}" if shown else reason
