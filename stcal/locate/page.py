@@ -92,9 +92,7 @@ def run_report(
         f"Tags located: {layout.name}",
         f"target {layout.name}, {len(layout.tags)} tags: {count}",
         [
-            Section(
-                "Scenes", [Table(heads, _overview(results), css="text"), Table(goal_heads, goal_rows)], terminal=True
-            ),
+            Section("Scenes", scenes_and_goals, terminal=True),
             *(
                 Section(each.name, _scene(each, files, layout, model), terminal=each.patent is not None)
                 for each, files in zip(results, scenes, strict=True)

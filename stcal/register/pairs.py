@@ -1,8 +1,9 @@
 """Pairs of points of two instruments: their files and their noise."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -182,14 +183,28 @@ class PointNoise:
         return self if self.precision is None else PointNoise(self.precision[rows], self.sigma_mm)
 
 
+SHOWN = 5
+"""Number of rows that a message names."""
+
+
+def some_of(items: Sequence | np.ndarray, say: Callable[[Any], str]) -> str:
+    """Returns the first of some items in words, and the number of others."""
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    return ", ".join(say(item) for item in items[:SHOWN]) + more
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Point pairs (n, 3) mm, neither copied nor checked, as subsets are taken in inner loops, and a model."""
+    """Point pairs (n, 3) mm, neither copied nor checked, as subsets are taken in inner loops, and a model.
+
+    ``lines`` : of a file, by which messages name all points; subsets have none.
+    """
 
     model: Model
     xyz_a: np.ndarray
     xyz_b: np.ndarray
     noise: PointNoise
+    lines: Sequence[int] | None = None
 
     def __len__(self) -> int:
         return len(self.xyz_a)
@@ -197,6 +212,14 @@ class Problem:
     def __getitem__(self, rows: np.ndarray) -> "Problem":
         """Returns the point pairs selected by a mask or by indices."""
         return Problem(self.model, self.xyz_a[rows], self.xyz_b[rows], self.noise[rows])
+
+    def name(self, row: Any) -> str:
+        """Returns a point's name for messages: its line in the file, else its row from 1."""
+        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+
+    def names(self, rows: np.ndarray) -> str:
+        """Returns the names of the first of some points, and the number of others."""
+        return some_of(rows, self.name)
 
     @property
     def redundancy(self) -> int:
