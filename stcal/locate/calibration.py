@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space
 from scipy.optimize import root_scalar
 
 from stcal.adjust.blocks import Huber, Vector
@@ -19,10 +19,10 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import PoseStack, block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, align_rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.geometry.variances import sigma_factor
-from stcal.locate.layout import LayoutPlan, TargetLayout, obj_from_plane
+from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
 
 MAX_STEPS = 60
@@ -62,15 +62,6 @@ class ImageCorners:
     seen: np.ndarray
     noise: np.ndarray
     focal_px: float
-
-    def numbered(self, rows: np.ndarray) -> "ImageCorners":
-        """Returns the image with other row numbers of the tags."""
-        return replace(self, rows=rows)
-
-    def turned(self, board_from_board: Rigid) -> "ImageCorners":
-        """Returns the image with the board numbered as after one of its symmetries."""
-        inverse = board_from_board.inverse()
-        return replace(self, pose=self.pose @ inverse, board_xyz=board_from_board @ self.board_xyz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -416,7 +407,7 @@ def calibrate(
             f"layout: tag {plan.tags[plan.origin][1]}, which holds the origin, is in none of {len(images)} images; "
             "show it, or name another origin in the layout file",
         )
-    images = [image.numbered(np.searchsorted(seen_rows, image.rows)) for image in images]
+    images = [replace(image, rows=np.searchsorted(seen_rows, image.rows)) for image in images]
     start = _median_corners(images, len(seen_rows))
     adjusted = adjust(images, start)
     return _collected(plan, images, seen_rows, start, adjusted, left_out)
@@ -426,29 +417,22 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
     """Returns board and tags of one image in normalised coordinates, and the pose of the board."""
     board_seen = camera.normalised_from_pixel(view.xy_px)
     xy = view.xyz_board[:, :2]
-    pose = refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen)
-    pixels = found.corners_px[own].reshape(-1, 2)
-    ideal = camera.normalised_from_pixel(pixels)
     board_px2 = np.tile(np.eye(2), (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
     seen_from_px = np.linalg.inv(camera.pixel_jacobian(board_seen))
+    # A tag's corners err as measured, and by the edges' common shift.
+    direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
+    shift = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
     return ImageCorners(
         name,
-        pose,
+        refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen),
         view.xyz_board,
         board_seen,
         seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2),
         np.array([rows[found.tags[k]] for k in own]),
-        ideal,
-        _tag_covariances(found, own),
+        camera.normalised_from_pixel(found.corners_px[own].reshape(-1, 2)),
+        shift + np.asarray(found.joint_px2)[own],
         float(camera.focal.mean()),
     )
-
-
-def _tag_covariances(found: Tags, own: list[int]) -> np.ndarray:
-    """Returns the covariance of each tag's corners, (k, 8, 8) px²: as measured, and of the edges' common shift."""
-    direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
-    shift = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
-    return shift + np.asarray(found.joint_px2)[own]
 
 
 def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
@@ -465,7 +449,9 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
         i = max(left, key=lambda i: (sum(row in place_of_tag for row in images[i].rows), len(images[i].rows), -i))
         left.remove(i)
         image = images[i]
-        choices = [image, *(image.turned(symmetry) for symmetry in symmetries)]
+        choices = [image]
+        for turn in symmetries:
+            choices.append(replace(image, pose=image.pose @ turn.inverse(), board_xyz=turn @ image.board_xyz))
         places = [plane_points(choice.pose, choice.seen).reshape(-1, 4, 2) for choice in choices]
         common = [k for k, row in enumerate(image.rows) if row in place_of_tag]
         if common:
@@ -510,16 +496,14 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
         adjusted.tag_sigma_px,
         plan.unusual_size,
     )
-    obj_from_board = Rigid(np.block([[turn, np.zeros((2, 1))], [np.zeros((1, 2)), 1.0]]), np.append(shift, 0.0))
-    first_turn, first_shift = obj_from_plane(start[origin])
-    counts = np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows))
+    obj_from_board = Rigid(np.asarray(block_diag(turn, 1.0)), np.append(shift, 0.0))
     return CalibratedLayout(
         layout,
-        start @ first_turn.T + first_shift,
+        in_obj(start, origin),
         obj_from_board.inverse(),
         adjusted,
         tuple(image.name for image in images),
-        counts,
+        np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows)),
         tuple(row for row in range(len(plan.tags)) if row not in tag_rows),
         _deviation(plan.corners_mm[tag_rows], layout.corners_mm),
         tuple(left_out),
@@ -550,10 +534,8 @@ def _deviation(nominal: np.ndarray, corners: np.ndarray) -> np.ndarray:
     placed = np.isfinite(nominal).all((1, 2))
     deviation = np.full(len(nominal), np.nan)
     if placed.any():
-        a, b = corners[placed].reshape(-1, 2), nominal[placed].reshape(-1, 2)
-        u, _, vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
-        turn = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
-        distance = np.linalg.norm((b - b.mean(0)) @ turn.T + a.mean(0) - a, axis=1)
+        a, b = (np.pad(each[placed].reshape(-1, 2), ((0, 0), (0, 1))) for each in (corners, nominal))
+        distance = np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
         deviation[placed] = distance.reshape(-1, 4).max(1)
     return deviation
 

@@ -102,7 +102,7 @@ class TargetLayout(Brief):
     @classmethod
     def of(cls, layout: TagLayout, name: str = "") -> "TargetLayout":
         """Returns tags with known places as a target. The middle of the first tag is the origin of {obj}."""
-        corners = _in_obj(layout.corners_mm, 0)
+        corners = in_obj(layout.corners_mm, 0)
         covariance = layout.sigma_mm**2 * np.eye(corners.size)
         return cls(name, layout.tags, corners, covariance, 0, unusual_size=layout.unusual_size)
 
@@ -169,7 +169,7 @@ def load_layout(path: str | Path) -> TargetLayout:
         )
     corners, stated = plan.corners_mm, data.covariance()
     if stated is None:
-        corners = _in_obj(corners, plan.origin)
+        corners = in_obj(corners, plan.origin)
         covariance = data.sigma_mm**2 * np.eye(corners.size)
     else:  # without the negative eigenvalues that rounding makes of zeros
         value, vector = np.linalg.eigh(stated)
@@ -246,6 +246,7 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
     return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)
 
 
-def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
+def in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
+    """Returns corners (n, 4, 2) in the plane in the frame of the tag in row ``origin``."""
     turn, shift = obj_from_plane(corners[origin])
     return corners @ turn.T + shift
