@@ -19,9 +19,10 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import PoseStack, block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
-from stcal.geometry.rigid import Poses, Rigid, align_rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, align_rigid
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.geometry.variances import sigma_factor
+from stcal.locate.estimate import normalised
 from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
 
@@ -38,7 +39,6 @@ TOGETHER = np.tile(np.eye(2), (4, 1))
 APART = null_space(TOGETHER.T)
 """Basis (8, 6) of all other displacements of a tag's corners."""
 NEAR_PX = 0.005
-NEAR_DEPTH = 1e-9
 TINY_MM2 = 1e-12
 """Variance of a mode of the print at an amplitude of 0, for an inverse."""
 
@@ -111,23 +111,16 @@ class _Rows:
 
     def off(self, poses: PoseStack, xyz: np.ndarray) -> np.ndarray:
         """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board."""
-        return (self._projected(poses, xyz)[2] - self.seen).reshape(len(xyz), -1)
+        return (self._projected(poses, xyz)[0] - self.seen).reshape(len(xyz), -1)
 
     def slopes(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns its derivatives by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
-        turned, depth, uv = self._projected(poses, xyz)
-        by_point = np.zeros((*uv.shape, 3))
-        by_point[..., 0, 0] = by_point[..., 1, 1] = 1
-        by_point[..., 2] = -uv
-        by_point /= depth[..., None, None]
-        by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+        _, by_point, by_pose = self._projected(poses, xyz)
         return by_pose.reshape(len(xyz), -1, 6), by_point @ poses.rotation[self.image][:, None]
 
     def _projected(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         turned = xyz @ np.swapaxes(poses.rotation[self.image], 1, 2)
-        placed = turned + poses.translation[self.image][:, None]
-        depth = np.where(np.abs(placed[..., 2]) > NEAR_DEPTH, placed[..., 2], NEAR_DEPTH)
-        return turned, depth, placed[..., :2] / depth[..., None]
+        return normalised(turned, turned + poses.translation[self.image][:, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -384,14 +377,15 @@ def calibrate(
     images, left_out = [], []
     for name, view, detected in zip(names, views, tags, strict=True):
         listed = [k for k, tag in enumerate(detected.tags) if tag in rows]
-        if view is None or len(view) < MIN_BOARD_POINTS or not listed:
-            left_out.append(f"{name}: {'no tag of the layout' if listed == [] else 'the board is not seen'}")
-            continue
         repeated = [tag for _, tag in (t for t in detected.repeated if t in rows)]
-        if repeated:
+        if not listed:
+            left_out.append(f"{name}: no tag of the layout")
+        elif view is None or len(view) < MIN_BOARD_POINTS:
+            left_out.append(f"{name}: the board is not seen")
+        elif repeated:
             left_out.append(f"{name}: tag {repeated[0]} is seen twice")
-            continue
-        images.append(_image(name, view, detected, listed, rows, camera))
+        else:
+            images.append(_image(name, view, detected, listed, rows, camera))
     if len(images) < MIN_IMAGES:
         raise DegenerateError(
             "E-LAYOUT-FEW-IMAGES",

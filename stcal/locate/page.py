@@ -137,15 +137,15 @@ def _scene(located: Located, files: SceneFiles, layout: TargetLayout, model: Cam
     def photo(exposure: Exposure, width_px: int) -> Html:
         return macro("tag_photo", lambda: _picture(exposure, by_name[exposure.name], located, layout, model, width_px))
 
-    best = best_exposure(located.exposures, layout)
-    several = located.exposures if len(located.exposures) > 1 else ()
+    rows, shown = layout.rows(), located.exposures
+    best = max(shown, key=lambda each: sum(tag in rows for tag in each.tags.tags), default=None)
     return [
         " – ".join((located.verdict.decision, *located.verdict.reasons)),
         Notes(located.notes),
         Table(["<check", "value", "limit", "<kept"], checks),
         *(_patent_blocks(located, located.patent) if located.patent else ()),
         photo(best, WIDE_PX) if best else None,
-        columns(*([photo(exposure, SMALL_PX)] for exposure in several), css="columns thumbs"),
+        columns(*([photo(exposure, SMALL_PX)] for exposure in shown if exposure is not best), css="columns thumbs"),
     ]
 
 
@@ -162,20 +162,6 @@ def _patent_blocks(located: Located, patent: PatentPose) -> list[Block]:
         Table(["<exposure", "<", "tags", "area px²", "error px", "of the other", "det J 1/mm²"], rows),
         f"patent: {ASSUMED}",
     ]
-
-
-def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposure | None:
-    """Returns the exposure with most of the layout's tags, of these the one with least σ of corners and edges, or
-    None."""
-    rows = layout.rows()
-
-    def rank(exposure: Exposure) -> tuple[int, float]:
-        in_layout = [tag in rows for tag in exposure.tags.tags]
-        corners = np.trace(exposure.tags.covariance_px2, axis1=2, axis2=3)
-        variance = (corners + exposure.tags.edge_sigma_px()[:, None] ** 2)[in_layout]
-        return sum(in_layout), -float(np.median(variance)) if any(in_layout) else 0.0
-
-    return max(exposures, key=rank, default=None)
 
 
 def _picture(
@@ -341,8 +327,6 @@ class AdjustedPart(Part):
 
 class CalibratedTags(Part):
     tags: list[tuple[str, int]]
-    corners_mm: Corners
-    sigma_mm: Annotated[Corners, OfMethod]
 
 
 class CalibratedLayoutFile(ResultFile):
@@ -359,7 +343,7 @@ class CalibratedLayoutFile(ResultFile):
         "board is along its rows than across, `stretch`, and its `shear`, relative; `sigma_px` and `tag_sigma_px` as "
         "in the layout file"
     )
-    layout: CalibratedTags = Field(description="`tags`: dictionary and id; `corners_mm`, `sigma_mm`")
+    layout: CalibratedTags = Field(description="`tags`: dictionary and id; `--out` has the corners")
     counts: Rows = Field(description="number of images that show each tag")
     published: Corners = Field(description="corners before the adjustment")
     deviation_mm: Annotated[list[Finite], BeforeValidator(list)] = Field(

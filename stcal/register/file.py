@@ -61,15 +61,27 @@ class CubesPart(Part):
     errors: list[list[ErrorFigures | None]]
 
 
+class NamePart(Part):
+    name: str
+
+
+class WeightingPart(Part):
+    sigma_mm: float | None
+
+
+class IdentifiedPart(Part):
+    rank: int
+    names: list[str]
+    undetermined: list[str]
+    weighting: WeightingPart
+
+
 class RobotPart(Part):
     """Base and kinematics, solved in addition to the transform."""
 
-    name: str
+    robot: NamePart
     b_from_base: Pose
-    rank: int
-    parameters: int
-    undetermined: list[str]
-    sigma_mm: float | None
+    identified: IdentifiedPart
     off_mm: float
     better: bool
     folds: int
@@ -135,8 +147,8 @@ class RegistrationFile(ResultFile):
     )
     robot: RobotPart | None = Field(
         None,
-        description="with `--robot`: `name`; `b_from_base` of the identified robot; `rank`, `parameters`, "
-        "`undetermined`, `sigma_mm` as of `identify`; `off_mm`: RMS of a off the robot file's positions after a rigid "
+        description="with `--robot`: `robot`, its `name`; `b_from_base` of the identified robot; `identified`: `rank`, "
+        "`names`, `undetermined`, `weighting` as of `identify`; `off_mm`: RMS of a off the robot file's positions after a rigid "
         "fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, `kinematics_mm` of each row held "
         "out, `wild`: outliers of both; without these, errors of `transform` and `kinematics`",
     )

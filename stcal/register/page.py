@@ -10,7 +10,7 @@ from stcal.register.liu2017 import Liu2017Options, SampleSize
 from stcal.register.result import ErrorFigures
 from stcal.register.workspace import MARGIN, Cubes, Field, Findings
 from stcal.report.document import Block, Document, Section, Table, alarms, legend, page_only, plot
-from stcal.report.svg import COLOURS, DASH, INK, YELLOW_RED, Axes, Box, Drawing, limits, round_below, ticks
+from stcal.report.svg import COLOURS, DASH, INK, YELLOW_RED, Axes, Box, Drawing, round_below
 from stcal.report.text import NONE, number
 
 FEW_ROWS = 24
@@ -281,28 +281,5 @@ def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> Sec
         f"{options.limit_mm:g} mm of what the sample says. A sample is acceptable with more than "
         f"{100 * options.share:g} %; samples whose 3×3 part is not orthogonal are not used"
     )
-    figure = plot(
-        lambda: sample_size_figure(sizes, options.share),
-        "Share of inliers against the size of the sample: best and median",
-    )
     heads = ["points", "best (%)", "median (%)", "orthogonal", "acceptable"]
-    return Section("Size of the sample", [told, figure, Table(heads, rows)])
-
-
-def sample_size_figure(sizes: list[SampleSize], share: float) -> Drawing:
-    """Returns a figure of the best and median share of inliers by size of the sample. The requested share is dashed."""
-    drawing = Drawing(6.4, 2.9)
-    points = [each.points for each in sizes]
-    axes = Axes(drawing, drawing.panels(top=24)[0], limits(points), (0, 102))
-    axes.frame("points of a sample", "inliers of the other points, %", "y", ticks(*axes.x, len(points)))
-    key = {}
-    for name, values, colour in (
-        ("best", [100 * each.best for each in sizes], COLOURS[0]),
-        ("median", [100 * each.median for each in sizes], COLOURS[4]),
-    ):
-        axes.lines([(points, values)], colour, 1.3)
-        axes.marks(points, values, "dot", 3, colour)
-        key[name] = "dot", colour
-    axes.level(100 * share, dash=DASH)
-    drawing.key((axes.box[0], 10), key)
-    return drawing
+    return Section("Size of the sample", [told, Table(heads, rows)])

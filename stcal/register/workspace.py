@@ -114,7 +114,11 @@ def residual_field(
     mean variances are used."""
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     model = MODELS[registration.model]
-    variance = _relative_variances(len(a), weights, covariances)
+    precision = noise_of(len(a), weights, covariances).precision
+    if precision is None:
+        variance = np.ones(len(a))
+    else:
+        variance = 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
     used = registration.inliers.copy()
     followers = np.zeros(0, int)
     for _ in range(ROUNDS):
@@ -122,21 +126,13 @@ def residual_field(
         if model.redundancy(len(rows)) < 2 * model.parameters:
             return None
         likelihood = _Likelihood.of(model, registration.b_from_a, a[rows], b[rows], variance[rows])
-        field = _field(likelihood, rows, followers)
+        field = likelihood.field(rows, followers)
         added = _followers(field, a, b - registration.b_from_a @ a, variance, used)
         if not len(added):
             return field
         used[added] = True
         followers = np.sort(np.concatenate([followers, added]))
     return field
-
-
-def _relative_variances(n: int, weights, covariances) -> np.ndarray:
-    """Returns the variances of the noise (n,) relative to a point of mean σ."""
-    precision = noise_of(n, weights, covariances).precision
-    if precision is None:
-        return np.ones(n)
-    return 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
 
 
 def _few(rows: np.ndarray) -> np.ndarray:
@@ -205,12 +201,20 @@ class _Likelihood:
         motions = _motions(model, transform, xyz_a, xyz_a) / root[:, None, None]
         return cls(model, transform, xyz_a, variance, y, motions, cdist(xyz_a, xyz_a))
 
-    def best(self) -> tuple[float, float, float, float]:
-        """Returns the best length and ratio, −2 log L there, and −2 log L without f."""
+    def field(self, rows: np.ndarray, taken: np.ndarray) -> Field:
+        """Returns the field of the best length and ratio."""
         nearest = KDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
         low, high = max(np.median(nearest), 1e-6 * self.distance.max()), 2 * self.distance.max()
         length, _ = _least(lambda length: self._at_length(length)[1], np.geomspace(low, high, LENGTHS), 0.02)
-        return length, *self._at_length(length)
+        ratio, value, without = self._at_length(length)
+        root = np.sqrt(self.variance)[:, None]
+        y, motions = self.y * root, self.motions * root[:, :, None]
+        inverse = np.linalg.inv(ratio * _matern(self.distance / length) + np.diag(self.variance))
+        kriged = _Kriged.of(inverse, y, motions)
+        corrected, sigma_ratio = kriged.left_out()
+        plain, _ = _Kriged.of(np.diag(1 / self.variance), y, motions).left_out()
+        p_value = float(chdtrc(2, max(without - value, 0.0)))
+        return Field(length, p_value, rows, taken, plain, corrected, sigma_ratio, self, ratio, kriged)
 
     def _at_length(self, length: float) -> tuple[float, float, float]:
         """Returns the best ratio, −2 log L there, and −2 log L without f."""
@@ -275,18 +279,6 @@ class _Kriged:
         error = np.linalg.solve(block, self.left[:, :, None])[:, :, 0]
         ratio = np.sqrt((error * self.left).sum() / (3 * len(error) * self.variance))
         return np.linalg.norm(error, axis=1), float(ratio)
-
-
-def _field(found: _Likelihood, rows: np.ndarray, taken: np.ndarray) -> Field:
-    length, ratio, value, without = found.best()
-    root = np.sqrt(found.variance)[:, None]
-    y, motions = found.y * root, found.motions * root[:, :, None]
-    inverse = np.linalg.inv(ratio * _matern(found.distance / length) + np.diag(found.variance))
-    kriged = _Kriged.of(inverse, y, motions)
-    corrected, sigma_ratio = kriged.left_out()
-    plain, _ = _Kriged.of(np.diag(1 / found.variance), y, motions).left_out()
-    p_value = float(chdtrc(2, max(without - value, 0.0)))
-    return Field(length, p_value, rows, taken, plain, corrected, sigma_ratio, found, ratio, kriged)
 
 
 SHARES = (0.25, 0.5, 0.75, 1.0)

@@ -75,34 +75,9 @@ class RegisteredRobot(Brief):
     off_mm: float
 
     @property
-    def name(self) -> str:
-        """Name of the robot."""
-        return self.robot.name
-
-    @property
     def b_from_base(self) -> Rigid:
         """The identified robot's base in frame b, mm."""
         return self.identified.robot.world_from_base
-
-    @property
-    def rank(self) -> int:
-        """Number of parameters that the points determine."""
-        return self.identified.rank
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters of axes, base and tool."""
-        return len(self.identified.names)
-
-    @property
-    def undetermined(self) -> Sequence[str]:
-        """Names of parameters that the points leave open."""
-        return self.identified.undetermined
-
-    @property
-    def sigma_mm(self) -> float | None:
-        """σ of a coordinate, estimated by the identification."""
-        return self.identified.weighting.sigma_mm
 
     @property
     def transform(self) -> ErrorFigures:
@@ -244,15 +219,16 @@ def positions(robot: Robot, data: Measurements) -> np.ndarray:
 def comparison_section(beside: RegisteredRobot) -> document.Section:
     """Returns the comparison as a section of the report."""
     outliers = f", without {beside.wild.sum()} outliers of both" if beside.wild.any() else ""
+    identified, open_ones = beside.identified, beside.identified.undetermined
     told = (
-        f"robot {beside.name}: {beside.rank} of {beside.parameters} parameters of axes, base and tool determined, "
+        f"robot {beside.robot.name}: {identified.rank} of {len(identified.names)} parameters of axes, base and tool determined, "
         "solved together from the joint values and the positions in b; the same rows are held out of both ways"
         f"{outliers}"
     )
     ways = [(f"{beside.model} transform", beside.transform), ("base and kinematics together", beside.kinematics)]
     notes = []
-    if beside.undetermined:
-        shown = ", ".join(beside.undetermined[:FIRST_NAMES]) + (", …" * (len(beside.undetermined) > FIRST_NAMES))
+    if open_ones:
+        shown = ", ".join(open_ones[:FIRST_NAMES]) + ", …" * (len(open_ones) > FIRST_NAMES)
         notes.append(
             f"the points leave open: {shown}; b_from_base and the tool may be off along these; vary the orientation "
             "more"

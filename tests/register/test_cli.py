@@ -116,7 +116,7 @@ def test_base_and_kinematics_together(run, tmp_path, robot_pairs):
     code, printed, err = run(pairs, *arguments, "--identified", identified)
     assert (code, err) == (0, "")
     content = json.loads(out.read_text())["robot"]
-    assert content["rank"] == content["parameters"] == 27
+    assert content["identified"]["rank"] == len(content["identified"]["names"]) == 27
     assert content["better"] is True
     assert content["off_mm"] < 1e-4  # what six digits in the file leave
     assert np.flatnonzero(content["wild"]).tolist() == [4, 20, 33]
@@ -152,7 +152,7 @@ def test_loads_at_the_flange_are_known_to_an_elastic_robot(run, tmp_path):
     assert (code, err) == (0, "")
     content = json.loads(out.read_text())["robot"]
     assert content["off_mm"] < 1e-3
-    assert content["sigma_mm"] == pytest.approx(0.03, rel=0.3)
+    assert content["identified"]["weighting"]["sigma_mm"] == pytest.approx(0.03, rel=0.3)
 
 
 def test_joint_values_are_needed_for_a_robot(run, tmp_path, robot_pairs):
