@@ -233,14 +233,14 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
         )
     corners = np.full((len(ids), 4, 2), np.nan)
     for row, tag in enumerate(data.tag):
-        place = tag.corners(where)
-        if place is not None:
-            if np.linalg.det(np.diff(place[:3], axis=0)) <= 0:
-                raise InputError(
-                    "E-TAG-CORNERS",
-                    f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
-                )
-            corners[row] = place
+        if (place := tag.corners(where)) is None:
+            continue
+        corners[row] = place
+        if np.linalg.det(np.diff(corners[row, :3], axis=0)) <= 0:
+            raise InputError(
+                "E-TAG-CORNERS",
+                f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
+            )
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
     return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)

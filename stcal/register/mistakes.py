@@ -12,7 +12,7 @@ from scipy.special import bdtrc, chdtrc, gammaln, ndtr
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError, StcalError
 from stcal.explain import Candidate, explain
-from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
+from stcal.geometry.rigid import Affine, Rigid, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register.models import MODELS, Model, Transform, jacobian, parts, unit_covariance, whitened
 from stcal.register.pairs import Problem, some_of
@@ -184,23 +184,23 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
 
 def _said(problem: Problem, transform: Transform, sigma_mm: float) -> str:
     """Returns a text on the ratio of lengths in b to those in a, the likely cause, and the remedy."""
-    covariance = sigma_mm**2 * unit_covariance(problem.model, transform, problem.xyz_a, problem.noise.precision)
-    if isinstance(transform, Similarity):
-        scale, sigma = transform.scale, transform.scale * float(np.sqrt(covariance[6, 6]))
-        off, digits = scale - 1, max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
-        cause = "a length standard, a board or an instrument of another scale"
-        if abs(off) < THERMAL:
-            cause = f"{1e6 * abs(off):.0f} ppm, of temperature (steel 11.5, aluminium 23 ppm/K) or a length standard"
+    if isinstance(transform, Affine):
+        scales = np.linalg.svd(transform.linear, compute_uv=False)
         return (
-            f"lengths in b are {scale:.{digits}f} ± {sigma:.{digits}f} times those in a: {cause}; correct one "
-            "of the files, or use --model similarity"
+            f"lengths in b are {', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of "
+            "one instrument is scaled or not square to the others, or an arm bends; correct it, or use --model affine "
+            "within these points"
         )
-    assert isinstance(transform, Affine)
-    scales = np.linalg.svd(transform.linear, compute_uv=False)
+    covariance = sigma_mm**2 * unit_covariance(problem.model, transform, problem.xyz_a, problem.noise.precision)
+    scale = float(np.cbrt(np.linalg.det(parts(transform)[0])))
+    sigma = scale * float(np.sqrt(covariance[6, 6]))
+    digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
+    cause = "a length standard, a board or an instrument of another scale"
+    if abs(scale - 1) < THERMAL:
+        cause = f"{1e6 * abs(scale - 1):.0f} ppm, of temperature (steel 11.5, aluminium 23 ppm/K) or a length standard"
     return (
-        f"lengths in b are {', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one "
-        "instrument is scaled or not square to the others, or an arm bends; correct it, or use --model affine within "
-        "these points"
+        f"lengths in b are {scale:.{digits}f} ± {sigma:.{digits}f} times those in a: {cause}; correct one of the "
+        "files, or use --model similarity"
     )
 
 

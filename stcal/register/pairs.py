@@ -105,25 +105,22 @@ def read_pairs(
         table = read_table(path, WHAT)
     xyz_a, xyz_b = table.points("a"), table.points("b")
     _no_pair_twice(table, np.hstack([xyz_a, xyz_b]))
-    given = [
-        name
-        for name, there in (
-            ("weight", "weight" in table),
-            ("sigma", table.has("sigma", LENGTHS)),
-            ("cov_…", any(name in table for name in COVARIANCE)),
-        )
-        if there
-    ]
-    if len(given) > 1:
+    given = {
+        "weight": "weight" in table,
+        "sigma": table.has("sigma", LENGTHS),
+        "cov_…": any(name in table for name in COVARIANCE),
+    }
+    kinds = [name for name, there in given.items() if there]
+    if len(kinds) > 1:
         raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT", f"{table.where}: columns {' and '.join(given)}; only one of {KINDS} needed"
+            "E-TABLE-COLUMNS-CONFLICT", f"{table.where}: columns {' and '.join(kinds)}; only one of {KINDS} needed"
         )
     weights = covariances = None
-    if given == ["weight"]:
+    if kinds == ["weight"]:
         weights = _positive(table, "weight", table.numbers("weight"))
-    elif given == ["sigma"]:
+    elif kinds == ["sigma"]:
         covariances = _positive(table, "sigma", table.quantity("sigma", LENGTHS)) ** 2
-    elif given:
+    elif kinds:
         covariances = _covariances(table)
     return Pairs(table.where, table.lines, xyz_a, xyz_b, weights, covariances, notes)
 
@@ -261,16 +258,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
             "E-ARRAY-SHAPE", f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed"
         )
     matrices = given.ndim == 3
-    _require_positive(given, name)
-    if name == "weights":
-        return PointNoise(given * np.mean(1 / given))
-    variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if matrices else given))
-    return PointNoise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))
-
-
-def _require_positive(given: np.ndarray, name: str) -> None:
-    """Refuses weights or variances (n,), or covariances (n, 3, 3), that are not positive."""
-    if given.ndim == 3:
+    if matrices:
         fault = first_fault(given, OF_POINT, definite=True)
         trouble = fault and f"row {fault.row + 1}: {fault.reason}"
     else:
@@ -278,3 +266,7 @@ def _require_positive(given: np.ndarray, name: str) -> None:
         trouble = f"row {bad[0] + 1} has {given[bad[0]]:.3g}, a positive number needed" if len(bad) else None
     if trouble:
         raise InputError("E-REGISTER-WEIGHTS", f"registration: {name}: {trouble}; leave a row out to give it no weight")
+    if name == "weights":
+        return PointNoise(given * np.mean(1 / given))
+    variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if matrices else given))
+    return PointNoise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))

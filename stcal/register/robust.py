@@ -144,7 +144,7 @@ class Consensus:
 
     inliers: np.ndarray
     value: float
-    samples: int
+    samples: int = 0
 
 
 def by_scale(model: Model, count: int, total: float) -> Score:
@@ -195,29 +195,24 @@ def by_threshold(threshold: float) -> Score:
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
     """Returns the best set by :func:`by_scale`, :func:`by_share` or :func:`by_threshold` of random samples, or None."""
     count, size = len(problem), problem.model.sample
-    drawn, needed, best = 0, 1.0, None
-    every = None
     if comb(count, size) <= EXHAUSTIVE:
-        every = np.array(list(combinations(range(count), size)))
+        return _best_of(problem, score, np.array(list(combinations(range(count), size))), None)
+    drawn, needed, best = 0, 1.0, None
     while drawn < needed:
-        samples = every if every is not None else _random_samples(count, size, rng)
+        samples = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
+        samples = samples[(np.diff(samples, axis=1) > 0).all(1)]
         drawn += len(samples)
-        found = _best_of(problem, score, samples)
-        if found is not None and (best is None or found.value < best.value):
-            best = found
-        if every is not None:
-            break
+        best = _best_of(problem, score, samples, best)
         share = max(best.inliers.mean() if best is not None else 0, LEAST_SHARE)
         clean = min(share, 1 - 1e-9) ** size
         needed = min(CLEAN_PER_WIDE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
-    return None if best is None else Consensus(best.inliers, best.value, 0 if every is not None else drawn)
+    return best and replace(best, samples=drawn)
 
 
-def _best_of(problem: Problem, score: Score, samples: np.ndarray) -> Consensus | None:
-    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
-    square = _squares_of_many(linear, translation, problem)
+def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensus | None) -> Consensus | None:
+    """Returns the best of the refined samples and of ``best``."""
+    square = _squares_of_many(*hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples]), problem)
     value, cut = score(square)
-    best = None
     for i in np.argsort(value, kind="stable")[:REFINED]:
         found = _concentrated(problem, score, square[i] <= cut[i])
         if found is not None and (best is None or found.value < best.value):
@@ -232,15 +227,14 @@ def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consen
         if inliers.sum() < problem.model.sample:
             break
         try:
-            transform = problem[inliers].fit()
+            square = problem.squares(problem[inliers].fit())
         except (DegenerateError, ConvergenceError):
             break
-        square = problem.squares(transform)
         value, cut = score(square[None])
         if best is not None and value[0] >= best.value:
             break
         inliers = square <= cut[0]
-        best = Consensus(inliers, float(value[0]), 0)
+        best = Consensus(inliers, float(value[0]))
     return best
 
 
@@ -255,12 +249,6 @@ def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Probl
         return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
     plain = np.einsum("sin,sin->sn", residual, residual)
     return plain if precision is None else plain * precision
-
-
-def _random_samples(count: int, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns random indices (s, size), all different within each sample."""
-    drawn = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
-    return drawn[(np.diff(drawn, axis=1) > 0).all(1)]
 
 
 SUBSET = 500
@@ -344,22 +332,17 @@ def _consensus(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, 
         samples += consensus.samples if consensus is not None else 0
         if consensus is None or consensus.value > np.log(FALSE_ALARMS):
             break
-        _check_trust(model, consensus)
+        agree = int(consensus.inliers.sum())
+        if model.redundancy(agree) < LEAST_REDUNDANCY:
+            raise DegenerateError(
+                "E-REGISTER-DISAGREE",
+                f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform, at least "
+                f"{-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more points",
+            )
         rows = rows[consensus.inliers]
     mask = np.zeros(len(problem), bool)
     mask[rows] = True
     return mask, samples
-
-
-def _check_trust(model: Model, found: Consensus) -> None:
-    agree = int(found.inliers.sum())
-    if model.redundancy(agree) < LEAST_REDUNDANCY:
-        raise DegenerateError(
-            "E-REGISTER-DISAGREE",
-            f"registration: only {agree} of {len(found.inliers)} point pairs agree on one {model.name} transform, at "
-            f"least {-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more "
-            "points",
-        )
 
 
 def _too_few_agree(model: Model, count: int, threshold: float | None) -> DegenerateError:
@@ -442,17 +425,14 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     if not len(k):
         return 0.0
     order = np.sort(np.linalg.norm(share.residuals(fitted.transform), axis=1))
-    sides = np.ptp(_along_axes(share.xyz_b[fitted.inliers[rows]]), axis=0) if extent is None else extent
-    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(sides, 1e-300)).prod(1)
+    if extent is None:
+        centred = share.xyz_b[fitted.inliers[rows]]
+        centred = centred - centred.mean(0)
+        extent = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0)
+    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(np.asarray(extent), 1e-300)).prod(1)
     choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
     value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
-
-
-def _along_axes(points: np.ndarray) -> np.ndarray:
-    """Returns the points along their own principal axes."""
-    centred = points - points.mean(0)
-    return centred @ np.linalg.eigh(centred.T @ centred)[1]
 
 
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:

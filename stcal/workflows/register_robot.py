@@ -180,18 +180,17 @@ def register_with_robot(
 
 def _measurements(pairs: Pairs, joints: Measurements | Table | str | Path, robot: Robot) -> Measurements:
     if isinstance(joints, Measurements):
+        q, targets, conditions = joints.q, joints.targets, joints.conditions
         if len(joints) != len(pairs):
             return joints
-        return Measurements(
-            pairs.where, pairs.lines, joints.q, joints.targets, pairs.xyz_b, conditions=joints.conditions
-        )
-    table = read_table(joints, WHAT)
-    try:
-        q = joint_values(table, robot)
-    except InputError as error:
-        raise InputError(error.code, f"{error} (--robot needs the joint values of each point)") from error
-    conditions = read_conditions(table, joints=len(robot.rows))
-    return Measurements(pairs.where, pairs.lines, q, targets_of(table), pairs.xyz_b, conditions=conditions)
+    else:
+        table = read_table(joints, WHAT)
+        try:
+            q = joint_values(table, robot)
+        except InputError as error:
+            raise InputError(error.code, f"{error} (--robot needs the joint values of each point)") from error
+        targets, conditions = targets_of(table), read_conditions(table, joints=len(robot.rows))
+    return Measurements(pairs.where, pairs.lines, q, targets, pairs.xyz_b, conditions=conditions)
 
 
 def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
@@ -221,9 +220,9 @@ def comparison_section(beside: RegisteredRobot) -> document.Section:
     outliers = f", without {beside.wild.sum()} outliers of both" if beside.wild.any() else ""
     identified, open_ones = beside.identified, beside.identified.undetermined
     told = (
-        f"robot {beside.robot.name}: {identified.rank} of {len(identified.names)} parameters of axes, base and tool determined, "
-        "solved together from the joint values and the positions in b; the same rows are held out of both ways"
-        f"{outliers}"
+        f"robot {beside.robot.name}: {identified.rank} of {len(identified.names)} parameters of axes, base and tool "
+        "determined, solved together from the joint values and the positions in b; the same rows are held out of both "
+        f"ways{outliers}"
     )
     ways = [(f"{beside.model} transform", beside.transform), ("base and kinematics together", beside.kinematics)]
     notes = []
