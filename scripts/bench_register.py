@@ -57,7 +57,7 @@ def parts_once(path: Path) -> tuple[dict[str, float], int]:
     timed("numpy.loadtxt", lambda: np.loadtxt(path, delimiter=",", skiprows=1))
     pairs = timed("reading", lambda: read_pairs(path))
     found = timed("registration", lambda: register(pairs.xyz_a, pairs.xyz_b, lines=pairs.lines))
-    every = timed("field and cubes", lambda: findings("pairs", pairs.lines, pairs.xyz_a, pairs.xyz_b, found))
+    every = timed("field and cubes", lambda: findings(pairs, found))
     timed("tables", registration_report(every).text)
     timed("JSON", lambda: json_text(RegistrationFile.model_validate(every)))
     timed("page", registration_report(every).page)

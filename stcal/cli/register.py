@@ -87,9 +87,7 @@ def register(
         allow_ambiguous=allow_ambiguous,
         lines=pairs.lines,
     )
-    registration = findings(
-        pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances
-    )
+    registration = findings(pairs, result)
     content, sections, failed = RegistrationFile.model_validate(registration), [], None
     if report and liu2017:
         limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)

@@ -149,6 +149,6 @@ class RegistrationFile(ResultFile):
         None,
         description="with `--robot`: `robot`, its `name`; `b_from_base` of the identified robot; `identified`: `rank`, "
         "`names`, `undetermined`, `weighting` as of `identify`; `off_mm`: RMS of a off the robot file's positions "
-        "after a rigid fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, `kinematics_mm` of each "
-        "row held out, `wild`: outliers of both; without these, errors of `transform` and `kinematics`",
+        "after a rigid fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, `kinematics_mm` of "
+        "each row held out, `wild`: outliers of both; without these, errors of `transform` and `kinematics`",
     )

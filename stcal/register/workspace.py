@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
@@ -15,7 +14,7 @@ from stcal.errors import StcalError
 from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
 from stcal.register.models import MODELS, Model, Transform, jacobian
-from stcal.register.pairs import Problem, noise_of
+from stcal.register.pairs import Pairs, Problem, noise_of
 from stcal.register.result import ErrorFigures, Registration, held_out
 
 MOST_POINTS = 500
@@ -29,8 +28,6 @@ WILD = 0.01
 ROUNDS = 5
 GRID, MARGIN = 7, 0.25
 """Number of places along each side of the grid of the field, and its margin beyond the box of the points."""
-_LAPACK = ("sytrd", "sytrd_lwork", "ormqr", "pttrf", "pttrs")
-_sytrd, _sytrd_lwork, _ormqr, _pttrf, _pttrs = get_lapack_funcs(_LAPACK, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,18 +100,10 @@ class Field:
         return value, kriged.variance * covariance
 
 
-def residual_field(
-    registration: Registration,
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
-) -> Field | None:
+def residual_field(registration: Registration, problem: Problem) -> Field | None:
     """Returns the systematic part of the residuals of inliers and outliers that follow it, or None; of covariances only
     mean variances are used."""
-    a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
-    model = MODELS[registration.model]
-    precision = noise_of(len(a), weights, covariances).precision
+    a, b, model, precision = problem.xyz_a, problem.xyz_b, problem.model, problem.noise.precision
     if precision is None:
         variance = np.ones(len(a))
     else:
@@ -158,16 +147,6 @@ def _matern(distance: np.ndarray) -> np.ndarray:
     """Returns Matérn's 5/2 function of distances over the length."""
     scaled = np.sqrt(5) * distance
     return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
-
-
-def _tridiagonal(matrix: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns T's diagonal and off-diagonal, and Qᵀ ``columns`` (m, k), of a symmetric matrix Q T Qᵀ: a quarter of the
-    time of eigenvectors."""
-    m, k = columns.shape
-    work = int(_sytrd_lwork(m, lower=1)[0])
-    reflectors, diagonal, beside, scale, _ = _sytrd(matrix, lower=1, lwork=work)
-    lower, _, _ = _ormqr("L", "T", reflectors[1:, :-1], scale, columns[1:], lwork=64 * k)
-    return diagonal, beside, np.asfortranarray(np.vstack([columns[:1], lower]))
 
 
 def _motions(model: Model, transform: Transform, xyz_a: np.ndarray, about: np.ndarray) -> np.ndarray:
@@ -221,13 +200,13 @@ class _Likelihood:
         root = np.sqrt(self.variance)
         m, _, p = self.motions.shape
         columns = np.concatenate([self.motions, self.y[:, :, None]], axis=2).reshape(m, -1)
-        diagonal, beside, turned = _tridiagonal(_matern(self.distance / length) / root[:, None] / root, columns)
-        rows = np.ascontiguousarray(turned).reshape(3 * m, p + 1).T
+        values, vectors = np.linalg.eigh(_matern(self.distance / length) / root[:, None] / root)
+        turned = vectors.T @ columns
+        rows = turned.reshape(3 * m, p + 1).T
 
         def twice(ratio: float) -> float:
-            spread, factor, _ = _pttrf(1 + ratio * diagonal, ratio * beside)
-            solved = np.ascontiguousarray(_pttrs(spread, factor, turned)[0])
-            both = rows @ solved.reshape(3 * m, p + 1)
+            spread = 1 + ratio * values
+            both = rows @ (turned / spread[:, None]).reshape(3 * m, p + 1)
             a, g = both[:p, :p], both[:p, p]
             rest = both[p, p] - g @ np.linalg.solve(a, g)
             return (3 * m - p) * np.log(max(rest, 1e-300)) + 3 * np.log(spread).sum() + np.linalg.slogdet(a)[1]
@@ -305,25 +284,13 @@ class Cubes:
 
 
 def cubes(
-    registration: Registration,
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    taken_back: np.ndarray | None = None,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
-    folds: int = 6,
+    registration: Registration, every: Problem, taken_back: np.ndarray | None = None, folds: int = 6
 ) -> Cubes | None:
-    """Fits the registration's model in cubes about the middle of its inliers and ``taken_back``, (m,) outliers; None
-    for too few points. Other arguments as in :func:`stcal.register.register`."""
+    """Fits the model in cubes about the middle of the inliers and ``taken_back``, (m,) outliers; None for too few
+    points."""
     used = registration.inliers.copy()
     if taken_back is not None:
         used[taken_back] = True
-    every = Problem(
-        MODELS[registration.model],
-        np.asarray(xyz_a, float),
-        np.asarray(xyz_b, float),
-        noise_of(len(xyz_a), weights, covariances),
-    )
     problem = every[np.flatnonzero(used)]
     a = problem.xyz_a
     middle = (a.min(0) + a.max(0)) / 2
@@ -393,18 +360,11 @@ class Findings(Registration):
 
 
 @one_thread()
-def findings(
-    where: str,
-    lines: Sequence[int],
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    registration: Registration,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
-) -> Findings:
-    """Returns a registration with its residual field and cubes. Arguments as in :func:`stcal.register.pipeline`."""
-    field = residual_field(registration, xyz_a, xyz_b, weights, covariances)
-    back = None if field is None else field.taken_back
-    reach = cubes(registration, xyz_a, xyz_b, back, weights, covariances)
+def findings(pairs: Pairs, registration: Registration) -> Findings:
+    """Returns a registration of these pairs with its residual field and cubes."""
+    noise = noise_of(len(pairs), pairs.weights, pairs.covariances)
+    problem = Problem(MODELS[registration.model], pairs.xyz_a, pairs.xyz_b, noise)
+    field = residual_field(registration, problem)
+    reach = cubes(registration, problem, None if field is None else field.taken_back)
     found = {each.name: getattr(registration, each.name) for each in fields(registration)}
-    return Findings(**found, pairs=where, lines=lines, xyz_a=xyz_a, field=field, cubes=reach)
+    return Findings(**found, pairs=pairs.where, lines=pairs.lines, xyz_a=pairs.xyz_a, field=field, cubes=reach)

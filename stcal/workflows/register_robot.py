@@ -143,8 +143,7 @@ def register_with_robot(
         The identification reaches no minimum.
     """
     if not isinstance(registration, Findings):
-        known = pairs.weights, pairs.covariances
-        registration = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, registration, *known)
+        registration = findings(pairs, registration)
     found, data = registration, _measurements(pairs, joints, robot)
     if not len(found) == len(data) == len(pairs):
         raise InputError(

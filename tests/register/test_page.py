@@ -9,7 +9,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
-from stcal.register import register
+from stcal.register import Pairs, register
 from stcal.register.file import RegistrationFile
 from stcal.register.page import FEW_ROWS, registration_report
 from stcal.register.workspace import GRID, findings
@@ -27,7 +27,7 @@ def found_of(n=40, model="rigid", wild=WILD, where="pairs <a&b>.csv", bend=0.0, 
     for i in wild:
         b[i] += [5.0 + i, 0, 0]
     result = register(a, b, model=model, method=method, **options)
-    return findings(where, range(2, n + 2), a, b, result)
+    return findings(Pairs(where, range(2, n + 2), a, b), result)
 
 
 def test_text_tells_transform_outliers_and_reach():
@@ -52,7 +52,7 @@ def test_rows_that_do_not_correspond_are_no_noise():
     a = rng.uniform(-1000, 1000, (40, 3))
     b = 0.5 * a + rng.normal(0, 200, a.shape)
     text = registration_report(
-        findings("x", range(40), a, b, register(a, b, model="rigid", method="least-squares"))
+        findings(Pairs("x", range(40), a, b), register(a, b, model="rigid", method="least-squares"))
     ).text()
     assert "no systematic residuals" not in text
     assert "do not use this transform" in text
@@ -125,6 +125,6 @@ def test_sigma_of_the_transform_by_place():
         result = register(a, b, method="least-squares", folds=0)
         seen.append(result.b_from_a @ place)
         if trial < 5:
-            stated.append(findings("x", range(20), a, b, result).sigma_mm_at(place))
+            stated.append(findings(Pairs("x", range(20), a, b), result).sigma_mm_at(place))
     # 100 trials know a σ to 7 %; the own σ of five are good to 9 % / √5
     np.testing.assert_allclose(np.std(seen, axis=0), np.sqrt(np.mean(np.square(stated), axis=0)), rtol=0.25)
