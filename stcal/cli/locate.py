@@ -177,26 +177,11 @@ def run(
 
     chain = None
     if hand_eye or registration or robot_poses or offset:
-        chain = goal_chain(
-            hand_eye,
-            registration,
-            robot_poses=robot_poses,
-            offset=offset,
-            key=key,
-            quaternions=quaternions,
-        )
+        given = {"robot_poses": robot_poses, "offset": offset, "key": key, "quaternions": quaternions}
+        chain = goal_chain(hand_eye, registration, **given)
     target, model = load_layout(layout), read_camera(camera)
-    limits = VerdictOptions(
-        min_tags,
-        min_spread_px,
-        min_foreshortening,
-        max_p,
-        flip_odds,
-        sigma_margin,
-        equal_deg,
-        max_sigma_deg,
-        max_sigma_mm,
-    )
+    least = min_tags, min_spread_px, min_foreshortening
+    limits = VerdictOptions(*least, max_p, flip_odds, sigma_margin, equal_deg, max_sigma_deg, max_sigma_mm)
     patent = PatentOptions(s_dis, j_lim, e_lim_px, e_ratio)
     with images_or_frames(exposures) as folder:
         places = [exposures] if folder == exposures else sorted(folder.iterdir())

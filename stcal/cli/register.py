@@ -75,12 +75,14 @@ def register(
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
     allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics show it
-    options = {"model": model, "method": method, "threshold_mm": threshold, "seed": seed}
-    options |= {"liu2017_options": liu2017} if liu2017 else {}
     result = registered(
         pairs.xyz_a,
         pairs.xyz_b,
-        **options,
+        model=model,
+        method=method,
+        threshold_mm=threshold,
+        seed=seed,
+        liu2017_options=liu2017,
         weights=pairs.weights,
         covariances=pairs.covariances,
         folds=folds,

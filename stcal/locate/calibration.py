@@ -436,8 +436,7 @@ def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
 
 
 def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -> list[ImageCorners]:
-    """Chooses in each image the numbering of a symmetric board that places tags as elsewhere, those with most in common
-    first."""
+    """Chooses in each image the numbering of a symmetric board that places tags as elsewhere."""
     turned, place_of_tag, left = list(images), {}, list(range(len(images)))
     while left:
         i = max(left, key=lambda i: (sum(row in place_of_tag for row in images[i].rows), len(images[i].rows), -i))

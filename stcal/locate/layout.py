@@ -206,8 +206,7 @@ def square(size_mm: float) -> np.ndarray:
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square of any size to its
-    corners."""
+    """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square to its corners."""
     nominal = square(1.0)
     middle = corners.mean(0)
     along = np.sum((corners - middle) * nominal)

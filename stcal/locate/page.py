@@ -226,7 +226,6 @@ Coordinates = Annotated[np.ndarray, Shape((None, 2))]
 
 class MergedPart(Part):
     rows: Rows
-    counts: list[int]
     share: float
     shifts: list[Shift]
 
@@ -273,7 +272,7 @@ class SceneRow(Part):
     notes: list[str] = Field(description="what was left out, and other notes")
     exposures: list[ExposureRow] = Field(description="`name` of each readable image, number of `tags` in it")
     merged: MergedPart | None = Field(
-        description="of all exposures: `rows` of the tags seen, their `counts` in each exposure, `share` of the "
+        description="of all exposures: `rows` of the tags seen, `share` of the "
         "corners' stated variance that differs between exposures, `shifts`: between two `exposures`, `tags` in common, "
         "median `shift_px` of their middles, and `sigma_px`"
     )

@@ -162,8 +162,7 @@ PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs o
 def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
-    """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by the layout as it
-    is."""
+    """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by it as it is."""
     if len(detected) < LEAST_TAGS:
         return None
     side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()

@@ -61,10 +61,6 @@ class CubesPart(Part):
     errors: list[list[ErrorFigures | None]]
 
 
-class NamePart(Part):
-    name: str
-
-
 class WeightingPart(Part):
     sigma_mm: float | None
 
@@ -79,7 +75,6 @@ class IdentifiedPart(Part):
 class RobotPart(Part):
     """Base and kinematics, solved in addition to the transform."""
 
-    robot: NamePart
     b_from_base: Pose
     identified: IdentifiedPart
     off_mm: float
@@ -147,7 +142,7 @@ class RegistrationFile(ResultFile):
     )
     robot: RobotPart | None = Field(
         None,
-        description="with `--robot`: `robot`, its `name`; `b_from_base` of the identified robot; `identified`: `rank`, "
+        description="with `--robot`: `b_from_base` of the identified robot; `identified`: `rank`, "
         "`names`, `undetermined`, `weighting` as of `identify`; `off_mm`: RMS of a off the robot file's positions "
         "after a rigid fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, `kinematics_mm` of "
         "each row held out, `wild`: outliers of both; without these, errors of `transform` and `kinematics`",

@@ -72,16 +72,8 @@ class Liu2017Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Liu2017Result:
-    """Result of the method.
-
-    Parameters
-    ----------
-    b_from_a : affine
-    sample : (N,) rows of the best sample
-    inliers : (n,) points within the limit, including those of the sample
-    acceptable : number of acceptable samples
-    shares : (tries,) share of inliers outside each sample, NaN if the sample was screened out
-    """
+    """``sample`` : (N,) rows of the best one; ``inliers`` : (n,) points within the limit, those of the sample too;
+    ``acceptable`` : number of samples; ``shares`` : (tries,) of inliers outside each sample, NaN if screened out."""
 
     b_from_a: Affine
     sample: np.ndarray

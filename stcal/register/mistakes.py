@@ -97,8 +97,8 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
         for k, axis in enumerate("xyz")
     ]
     candidates += [
-        Candidate(f"a{one} and a{two} with each other", lambda one=one, two=two: np.eye(3)[_swapped(one, two)])
-        for one, two in ("xy", "yz", "xz")
+        Candidate(f"a{'xyz'[i]} and a{'xyz'[j]} with each other", lambda order=order: np.eye(3)[order])
+        for i, j, order in ((0, 1, [1, 0, 2]), (1, 2, [0, 2, 1]), (0, 2, [2, 1, 0]))
     ]
     found = explain(candidates, lambda mend: Rotation.from_matrix(reflection @ mend).magnitude(), NAMED_BELOW_RAD)
     advice = "change the sign of one axis of a or of b"
@@ -110,10 +110,6 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
         f"registration: one of the frames is left-handed: mirrored, {agree} of {count} point pairs fit {times:.3g} "
         f"times better; {advice}",
     )
-
-
-def _swapped(one: str, two: str) -> list[int]:
-    return ["xyz".index({one: two, two: one}.get(axis, axis)) for axis in "xyz"]
 
 
 def outlier_notes(result: Registration, problem: Problem) -> Iterator[str]:
@@ -213,8 +209,7 @@ BY_NEIGHBOURS = 1e-4
 
 
 def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
-    """Returns whether residuals (n, 3) correlate with those of their nearest neighbours beyond chance: the sum of
-    products r · r' has the variance Σ (r · r')²."""
+    """Returns whether residuals (n, 3) correlate with those of their nearest neighbours beyond chance."""
     rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
     xyz, r = xyz_a[rows], residuals[rows]
     if len(xyz) < FEWEST_NEIGHBOURS:
@@ -222,7 +217,7 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
     nearest = np.asarray(KDTree(xyz).query(xyz, k=2)[1])[:, 1]
     pairs = np.column_stack([np.arange(len(xyz)), nearest])
     one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
-    product = np.einsum("ni,ni->n", r[one], r[two])
+    product = np.einsum("ni,ni->n", r[one], r[two])  # the variance of their sum is the sum of their squares
     return bool(ndtr(-product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
 
 
@@ -275,16 +270,14 @@ MAX_ROUNDS = 30
 FEW = 16
 """Largest number of points for which square sums replace determinants (see above)."""
 SPHERICAL = 0.1
-"""Significance level of anisotropic noise. It detects half of the sets of 16 points whose noise is three times as
-large along one axis; in the other sets the effect is too weak to mislead."""
+"""Significance level of anisotropic noise: half of the sets of 16 points with three times the noise along one axis."""
 TOGETHER = 0.01
 """Probability that scattered groups seem to lie together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groups:
-    """``transforms`` : of the larger group and the other; ``in_space`` : whether the place determines the group: a bent
-    frame."""
+    """``transforms`` : of the larger group and the other; ``in_space`` : the place determines the group."""
 
     transforms: tuple[Transform, Transform]
     in_space: bool
@@ -384,8 +377,7 @@ NARROWEST = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shifted:
-    """``rows`` : (m,) of the smaller group of ``count`` points; ``by_mm`` : (3,) its shift, frame b; ``together`` : in
-    space."""
+    """``rows`` : (m,) of the smaller group of ``count`` points; ``by_mm`` : (3,) its shift, frame b."""
 
     rows: np.ndarray
     count: int
@@ -424,8 +416,7 @@ Parted = tuple[float, np.ndarray, float]
 
 
 def _clear(unit: np.ndarray, axes: np.ndarray) -> Parted | None:
-    """Divides residuals (n, 3) of unit scatter into two groups, or None by chance; ``axes`` : principal, longest
-    last."""
+    """Divides residuals (n, 3) of unit scatter into two groups, or None; ``axes`` : principal, longest last."""
     best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found[0])
     across = unit - (unit @ best[1])[:, None] * best[1]
     rest = max(_parted(across, axis)[0] for axis in _by_kurtosis(across).T[1:])

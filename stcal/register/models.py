@@ -23,9 +23,6 @@ from stcal.geometry.rigid import (
 
 Transform = Rigid | Similarity | Affine
 
-EXACT = 1e-11
-"""Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
-
 
 @dataclass(frozen=True, slots=True)
 class Model:
@@ -88,11 +85,6 @@ def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.nd
         return np.einsum("ni,nij,nj->n", residuals, precision, residuals)
     plain = np.einsum("ni,ni->n", residuals, residuals)
     return plain if precision is None else plain * precision
-
-
-def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
-    """Returns the rounding error of residuals, mm. It is robust against wrong points of any size."""
-    return EXACT * float(max(np.median(np.maximum.reduce(np.abs(xyz.T))) for xyz in (xyz_a, xyz_b)))
 
 
 def unit_covariance(

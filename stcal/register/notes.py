@@ -111,31 +111,23 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
     first = int(radius.argmax())
     second = int(np.linalg.norm(np.cross(centred, centred[first]), axis=1).argmax())
     apart = np.linalg.norm(centred[:, None] - centred, axis=2)
-    fits = (
-        (np.abs(radius - radius[first]) < 2 * tolerance_mm)[:, None]
-        & (np.abs(radius - radius[second]) < 2 * tolerance_mm)
-        & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
-    )
+    near_first, near_second = (np.abs(radius - radius[i]) < 2 * tolerance_mm for i in (first, second))
+    fits = near_first[:, None] & near_second & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
     tree = KDTree(centred)
     least, best = np.inf, None
     for i, j in np.argwhere(fits):
         if (i, j) == (first, second):
             continue
         turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
-        # from two points, then from all: the first two carry their own noise
-        turn = best_rotations(centred[_nearest(tree, centred @ turn.T)].T @ centred)[0]
-        to = _nearest(tree, centred @ turn.T)
-        turn = best_rotations(centred[to].T @ centred)[0]
+        to = np.arange(n)
+        for _ in range(2):  # from two points, then from all: the first two carry their own noise
+            to = np.asarray(tree.query(centred @ turn.T)[1])
+            turn = best_rotations(centred[to].T @ centred)[0]
         misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
         is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
         if is_one and misfit <= 2 * tolerance_mm and misfit < least:
             least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
     return best
-
-
-def _nearest(tree: KDTree, xyz: np.ndarray) -> np.ndarray:
-    """Returns the indices (n,) of the tree's points nearest to points (n, 3)."""
-    return np.asarray(tree.query(xyz)[1])
 
 
 LOW_REDUNDANCY = 6

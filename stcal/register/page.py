@@ -5,12 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Similarity
 from stcal.register.liu2017 import Liu2017Options, SampleSize
 from stcal.register.result import ErrorFigures
-from stcal.register.workspace import MARGIN, Cubes, Field, Findings
+from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import Block, Document, Section, Table, alarms, legend, page_only, plot
-from stcal.report.svg import COLOURS, DASH, INK, YELLOW_RED, Axes, Box, Drawing, round_below
+from stcal.report.svg import COLOURS, Axes, Drawing, round_below
 from stcal.report.text import NONE, number
 
 FEW_ROWS = 24
@@ -149,17 +150,13 @@ def _where_it_holds(found: Findings) -> list[Block]:
     blocks: list[Block] = []
     if field is not None:
         blocks.append(_field_sentence(found, field))
-        width = np.ptp(found.xyz_a[field.rows], axis=0)
-        if width.min() >= 1e-3 * width.max():  # else planes through the points' middle show nothing
-            blocks.append(
-                plot(
-                    lambda: field_figure(found, field),
-                    "systematic error over the workspace",
-                    "Systematic error to expect of the transform (RMS: of what the residuals show and of what they "
-                    "leave open), in planes through the middle of the points, frame a. Dots: the points within an "
-                    "eighth of the plane; dashed: the box of all",
-                )
+        blocks.append(
+            plot(
+                lambda: field_figure(found, field),
+                "systematic error over the workspace",
+                "Systematic error to expect of the transform at places in and around the points, enlarged, frame b",
             )
+        )
     if reach is not None:
         middle = " ".join(f"{v:.1f}" for v in reach.middle)
         explained = (
@@ -202,7 +199,6 @@ ARROW_SHARE, FEW = 0.12, 80
 """Length of the inliers' RMS residual as a share of the picture's side; number of points above which it shrinks."""
 LONGEST_SHARE = 0.3
 """Longest arrow of an outlier, as a fraction of the picture's side; longer arrows are cut off."""
-RASTER = 41
 
 
 def space_figure(found: Findings) -> Drawing:
@@ -211,63 +207,35 @@ def space_figure(found: Findings) -> Drawing:
     if len(rows) > MOST_ARROWS:
         bad, good = found.outliers[: MOST_ARROWS // 3], np.flatnonzero(found.inliers)
         rows = np.concatenate([good[np.linspace(0, len(good) - 1, MOST_ARROWS - len(bad)).astype(int)], bad])
-    place, residual, inlier = found.b_from_a @ found.xyz_a[rows], found.residuals[rows], found.inliers[rows]
+    return _views(found.b_from_a @ found.xyz_a[rows], found.residuals[rows], found.inliers[rows])
+
+
+def field_figure(found: Findings, field: Field) -> Drawing:
+    """Returns three views of the grid of the field in frame b with the error to expect there, enlarged."""
+    grid = field.grid
+    places = found.b_from_a @ grid["xyz_a_mm"]
+    return _views(places, grid["error_mm"], np.ones(len(places), bool))
+
+
+def _views(place: np.ndarray, error: np.ndarray, inlier: np.ndarray) -> Drawing:
+    """Returns three views of places (n, 3) with errors (n, 3) as arrows, mm; those of outliers are cut."""
     side = float(np.ptp(place, axis=0).max()) or 1.0
-    crowded = min(1.0, FEW / len(rows)) ** (1 / 3)
-    scale = round_below(ARROW_SHARE * crowded * side / max(found.inlier_errors.rms_mm, 1e-12))
+    crowded = min(1.0, FEW / len(place)) ** (1 / 3)
+    length = np.maximum(np.linalg.norm(error, axis=1), 1e-300)
+    scale = round_below(ARROW_SHARE * crowded * side / max(rms(length[inlier]), 1e-12))
     longest = np.where(inlier, np.inf, LONGEST_SHARE * side)
-    length = np.maximum(scale * np.linalg.norm(residual, axis=1), 1e-300)
-    arrow = scale * residual * np.minimum(1, longest / length)[:, None]
+    arrow = scale * error * np.minimum(1, longest / (scale * length))[:, None]
     middle = (place.min(0) + place.max(0)) / 2
     reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side
     drawing = Drawing(10.2, 3.7)
     for box, (i, j) in zip(drawing.panels(3, left=54, top=14, gap=50), VIEWS, strict=True):
-        axes = _axes(drawing, box, "b", i, j, middle, reach)
-        for kind, colour in ((True, COLOURS[0]), (False, COLOURS[1])):
-            own = inlier == kind
+        axes = Axes.equal(drawing, box, np.array([middle - reach, middle + reach])[:, [i, j]], 0)
+        axes.frame(f"{'xyz'[i]} of b, mm", f"{'xyz'[j]} of b, mm")
+        for own, colour in ((inlier, COLOURS[0]), (~inlier, COLOURS[1])):
             axes.arrows(place[own][:, [i, j]], arrow[own][:, [i, j]], 1.1, colour)
             axes.marks(*place[own][:, [i, j]].T, kind="dot", size=2.5, colour=colour)
     drawing.words((drawing.width - 6, 7), f"{scale:,g} times", anchor="end")
     return drawing
-
-
-def field_figure(found: Findings, field: Field) -> Drawing:
-    """Returns planes through the middle of the points with the expected error."""
-    own = found.xyz_a[field.rows]
-    low, high = own.min(0), own.max(0)
-    middle, reach = (low + high) / 2, (high - low) / 2 * (1 + 2 * MARGIN)
-    planes = []
-    for i, j in VIEWS:
-        u = middle[i] + reach[i] * np.linspace(-1, 1, RASTER)
-        v = middle[j] + reach[j] * np.linspace(-1, 1, RASTER)
-        grid = np.tile(middle, (RASTER * RASTER, 1))
-        grid[:, i], grid[:, j] = (each.ravel() for each in np.meshgrid(u, v))
-        error, covariance = field.at(grid)
-        size = np.sqrt((error**2).sum(1) + np.trace(covariance, axis1=1, axis2=2))
-        planes.append((u, v, size.reshape(RASTER, RASTER)))
-    most = max(float(size.max()) for _, _, size in planes)
-    step = round_below(most / 10)
-    levels = np.arange(np.ceil(most / step * (1 - 1e-9)) + 1) * step
-    drawing = Drawing(10.2, 3.5)
-    boxes = drawing.panels(3, left=54, right=52, gap=50)
-    for box, (i, j), (u, v, size) in zip(boxes, VIEWS, planes, strict=True):
-        axes = _axes(drawing, box, "a", i, j, middle, reach)
-        axes.shade(size, (u[0], v[0], u[-1], v[-1]), 0, levels[-1], YELLOW_RED, len(levels) - 1)
-        third = 3 - i - j
-        near = np.abs(own[:, third] - middle[third]) < (high - low)[third] / 8
-        axes.marks(*own[near][:, [i, j]].T, kind="dot", size=3, colour=INK)
-        corners = (low[i], high[i], high[i], low[i], low[i]), (low[j], low[j], high[j], high[j], low[j])
-        axes.lines([corners], INK, 0.7, dash=DASH)
-    right, top, bottom = drawing.width - 38, boxes[0][1], boxes[0][3]
-    drawing.scale((right, top + 14, right + 8, bottom), 0, levels[-1], "mm", YELLOW_RED)
-    return drawing
-
-
-def _axes(drawing: Drawing, box: Box, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarray) -> Axes:
-    """Returns axes of equal scale that hold ``middle`` ± ``reach``."""
-    axes = Axes.equal(drawing, box, np.array([middle - reach, middle + reach])[:, [i, j]], 0)
-    axes.frame(f"{'xyz'[i]} of {frame}, mm", f"{'xyz'[j]} of {frame}, mm")
-    return axes
 
 
 def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> Section:

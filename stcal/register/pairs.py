@@ -12,7 +12,7 @@ from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, requi
 from stcal.io.covariance import OF_POINT, first_fault
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table
-from stcal.register.models import Model, Transform, fit, rounding_mm, squares, whitened
+from stcal.register.models import Model, Transform, fit, squares, whitened
 
 WHAT = "point pairs"
 AXES = OF_POINT.names
@@ -180,6 +180,8 @@ class PointNoise:
         return self if self.precision is None else PointNoise(self.precision[rows], self.sigma_mm)
 
 
+EXACT = 1e-11
+"""Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
 SHOWN = 5
 """Number of rows that a message names."""
 
@@ -240,8 +242,8 @@ class Problem:
         return whitened(self.residuals(b_from_a), self.noise.precision)
 
     def rounding_mm(self) -> float:
-        """Returns the part of residuals that rounding may cause, mm."""
-        return rounding_mm(self.xyz_a, self.xyz_b)
+        """Returns the rounding error of residuals, mm. It is robust against wrong points of any size."""
+        return EXACT * float(max(np.median(np.abs(xyz).max(1)) for xyz in (self.xyz_a, self.xyz_b)))
 
 
 def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> PointNoise:

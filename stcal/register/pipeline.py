@@ -6,9 +6,11 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments
+from stcal.geometry.rigid import best_rotations
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register.liu2017 import Liu2017Options, liu2017
@@ -39,7 +41,6 @@ from stcal.register.robust import (
     settled,
     shifted_too,
     sigma_within,
-    turn_between,
 )
 
 METHODS = ("robust", "least-squares", "liu2017")
@@ -210,10 +211,7 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
 
 
 def _least_squares(problem: Problem) -> Fitted:
-    transform = problem.fit()
-    total = problem.squares(transform).sum()
-    sigma = sigma_within(float(total), problem.model, len(problem), np.inf)
-    return Fitted(transform, np.ones(len(problem), bool), sigma, np.inf)
+    return replace(_as_assigned(problem, np.ones(len(problem), bool), None), threshold=np.inf)
 
 
 def _liu2017(problem: Problem, options: Liu2017Options, seed: int) -> Fitted:
@@ -284,5 +282,6 @@ def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, thres
 
 def _alternative(fitted: Fitted, other: Fitted, a: np.ndarray) -> Alternative:
     apart = np.sqrt(np.mean(((fitted.transform @ a - other.transform @ a) ** 2).sum(1)))
-    turn = turn_between(fitted.transform, other.transform)
+    one, two = (best_rotations(parts(each.transform)[0])[0] for each in (fitted, other))
+    turn = float(Rotation.from_matrix(one @ two.T).magnitude())
     return Alternative(other.transform, np.flatnonzero(other.inliers), float(apart), turn)

@@ -30,9 +30,8 @@ from scipy.optimize import root_scalar
 from scipy.special import chdtr, chdtrc, chdtri, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.robust import ratio_limit
-from stcal.register.models import Model, Transform, hypotheses, leverages, parts, unit_covariance
+from stcal.register.models import Model, Transform, hypotheses, leverages, unit_covariance
 from stcal.register.pairs import Problem
 
 CONTRADICTED_AT = 0.01
@@ -43,15 +42,11 @@ WIDE = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """``matrix`` : (p, p) of :func:`~stcal.register.models.unit_covariance`'s parameters; ``scaled`` : by residuals,
-    not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
+    """``scaled`` : by residuals, not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
 
-    matrix: Array
+    matrix: np.ndarray
     scaled: bool
     redundancy: float
-
-    def __post_init__(self):
-        freeze(self, "matrix", (None, None), "covariance")
 
 
 def kept_share(cut: float) -> float:
@@ -139,8 +134,7 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all possible ones were
-    tried."""
+    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all were tried."""
 
     inliers: np.ndarray
     value: float
@@ -276,16 +270,8 @@ wrong and all in one other motion, the true ones are 40 : 60 of the wrong."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A transform with the points that agree on it.
-
-    Parameters
-    ----------
-    transform : b_from_a
-    inliers : (n,) bool array
-    sigma : σ per axis, mm of a point of mean σ
-    threshold : largest distance of inliers, mm of a point of mean σ; infinite if no residual was cut off
-    samples : number of random samples; 0 if none or all possible ones were tried
-    """
+    """A transform with the ``inliers`` (n,) that agree on it; ``sigma`` per axis and ``threshold``, which may be
+    infinite, in mm of a point of mean σ; ``samples`` : random ones, 0 if all possible ones were tried."""
 
     transform: Transform
     inliers: np.ndarray
@@ -356,8 +342,7 @@ def _too_few_agree(model: Model, count: int, threshold: float | None) -> Degener
 
 
 def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
-    """Updates fit, σ and inliers in turn until the set stays the same; of a cycle, the largest is returned. Raises
-    DegenerateError: too few points agree."""
+    """Updates fit, σ and inliers in turn until the set stays the same; of a cycle, the largest is returned."""
     model = problem.model
     fit_of_set: dict[bytes, Fitted] = {}
     floor = problem.rounding_mm()
@@ -436,8 +421,7 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
 
 
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """Returns the transform on which outliers agree within the threshold enlarged for σ's uncertainty, beyond chance,
-    or None."""
+    """Returns the transform on which outliers agree beyond chance, within the threshold and σ's uncertainty."""
     model = problem.model
     outside = np.flatnonzero(~fitted.inliers)
     if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
@@ -466,10 +450,3 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
     mask = np.zeros(len(problem), bool)
     mask[outside[near]] = True
     return Fitted(transform, mask, fitted.sigma, threshold, consensus.samples)
-
-
-def turn_between(one: Transform, two: Transform) -> float:
-    """Returns the angle between the rotations of two rigid or similarity transforms, rad."""
-    (a, _), (b, _) = parts(one), parts(two)
-    cosine = (np.trace(a @ b.T) / np.cbrt(np.linalg.det(a) * np.linalg.det(b)) - 1) / 2
-    return float(np.arccos(np.clip(cosine, -1, 1)))

@@ -101,8 +101,7 @@ class Field:
 
 
 def residual_field(registration: Registration, problem: Problem) -> Field | None:
-    """Returns the systematic part of the residuals of inliers and outliers that follow it, or None; of covariances only
-    mean variances are used."""
+    """Returns the systematic part of the residuals, or None; of covariances only mean variances are used."""
     a, b, model, precision = problem.xyz_a, problem.xyz_b, problem.model, problem.noise.precision
     if precision is None:
         variance = np.ones(len(a))
@@ -251,8 +250,7 @@ class _Kriged:
         return cls(inverse, of_y, of_motions, spread, beta, left, variance)
 
     def left_out(self) -> tuple[np.ndarray, float]:
-        """Returns each point's error (m,) by the model of the others, and the RMS ratio to σ (Dubrule 1983, in blocks
-        of 3)."""
+        """Returns each point's error (m,) by the model of the others, and the RMS ratio to σ (Dubrule 1983)."""
         block = np.diag(self.inverse)[:, None, None] * np.eye(3)
         block = block - self.of_motions @ self.spread @ np.swapaxes(self.of_motions, 1, 2)
         error = np.linalg.solve(block, self.left[:, :, None])[:, :, 0]
@@ -270,9 +268,8 @@ DIGITS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubes:
-    """Errors by region of fit and of use. ``middle`` : (3,) of the cubes, mm, axes of frame a; ``sides_mm`` : (k,)
-    increasing; ``errors[i][j]`` : of the fit in cube i at points in cube j that are not in cube j − 1, held out in
-    turn, or None."""
+    """``middle`` : (3,) of the cubes, mm, axes of frame a; ``errors[i][j]`` : of the fit in cube i at points in cube j
+    that are not in cube j − 1, held out in turn, or None."""
 
     middle: Array
     sides_mm: Array
@@ -286,8 +283,7 @@ class Cubes:
 def cubes(
     registration: Registration, every: Problem, taken_back: np.ndarray | None = None, folds: int = 6
 ) -> Cubes | None:
-    """Fits the model in cubes about the middle of the inliers and ``taken_back``, (m,) outliers; None for too few
-    points."""
+    """Fits the model in cubes about the middle of the inliers and ``taken_back``; None for too few points."""
     used = registration.inliers.copy()
     if taken_back is not None:
         used[taken_back] = True

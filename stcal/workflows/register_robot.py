@@ -152,7 +152,7 @@ def register_with_robot(
             "many of each needed",
         )
     options = {"model": found.model, "method": found.method, "threshold_mm": threshold_mm, "seed": found.seed}
-    options |= {"liu2017_options": liu2017_options} if liu2017_options else {}
+    options["liu2017_options"] = liu2017_options
     settings = IdentifyOptions("position", folds=0, seed=found.seed, partial=True)
     good = found.inliers.copy()
     if registration.field is not None:
