@@ -264,7 +264,7 @@ class PatentPart(Part):
 
 
 class SceneRow(Part):
-    name: str
+    name: str = Field(description="of the scene")
     verdict: VerdictPart = Field(
         description="`decision`, `reasons`, and `checks`: `name`, `value` (null: no other pose), `at_least`, "
         "`at_most`, `unit`, `passed`"
@@ -301,7 +301,7 @@ class LocatedFile(ResultFile):
     unit: Literal["mm"] = Field(description="of all lengths")
     layout: str = Field(description="the layout's name")
     tags: list[tuple[str, int]] = Field(description="dictionary and id of the layout's tags")
-    scenes: list[SceneRow] = Field(description="`name`, `verdict`, `notes`, and")
+    scenes: list[SceneRow] = Field(description="one object each")
     goals: GoalsPart | None = Field(
         description="with `--hand-eye` or `--registration`: `base_from_goal` and its `covariance` of accepted scenes"
     )

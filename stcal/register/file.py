@@ -13,6 +13,7 @@ DIGITS = 9
 """Decimals of residuals, mm: there may be a million."""
 Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
 """Rows of the file of points, from 0."""
+FIGURES = "`points`, `mean_mm`, `rms_mm`, `max_mm`"
 Marks = Annotated[list[bool], BeforeValidator(lambda marks: np.asarray(marks, bool).tolist())]
 Rounded = Annotated[Points, BeforeValidator(lambda values: np.round(values, DIGITS))]
 TransformMatrix = Annotated[
@@ -109,11 +110,9 @@ class RegistrationFile(ResultFile):
     sigma_factor: float | None = Field(description="by how much residuals exceed the σ given with the data")
     scaled: bool = Field(description="whether the covariance rests on the residuals")
     threshold_mm: float | None = Field(description="inliers are nearer than this; null by least squares")
-    inlier_errors: ErrorFigures = Field(
-        description="lengths of the inliers' residuals: `points`, `mean_mm`, `rms_mm`, `max_mm`, as all errors below"
-    )
+    inlier_errors: ErrorFigures = Field(description=f"lengths of the inliers' residuals: {FIGURES}")
     held_out: HeldOutPart | None = Field(
-        description="`folds`; `rows` and `error_mm` of each point tried; errors `of_inliers` and `of_all`"
+        description=f"`folds`; `rows` and `error_mm` of each point tried; {FIGURES} `of_inliers` and `of_all`"
     )
     ambiguous: bool = Field(description="whether `alternative` is about as good")
     alternative: AlternativePart | None = Field(
@@ -129,21 +128,23 @@ class RegistrationFile(ResultFile):
     field: FieldPart | None = Field(
         description="systematic residuals over the workspace, null with too few points: `seen` (chance below 1 %), "
         "`p_value`; `size_mm` RMS length, `length_mm` over which they change, `noise_mm` σ per axis beside them; "
-        "`rows` used (at most 500), `taken_back` rows of outliers that follow the field of the others; errors of "
-        "points by the transform, `plain`, and by transform and field, `corrected`, fitted to the others, and "
+        "`rows` used (at most 500), `taken_back` rows of outliers that follow the field of the others; "
+        f"{FIGURES} of errors of points by the transform, `plain`, and by transform and field, `corrected`, "
+        "fitted to the others, and "
         "`sigma_ratio`, RMS of the latter over their σ; `grid`: `xyz_a_mm` in frame a (7³ places over the box of the "
         "points and a quarter beyond), `error_mm` to expect of b − b_from_a a there, frame b, and its `sigma_mm` per "
         "axis"
     )
     cubes: CubesPart | None = Field(
-        description="null with too few points: `middle` in a and `sides_mm` of cubes along the axes of a; "
-        "`errors[i][j]` of the fit in cube i at the points of cube j that are not in cube j − 1; those that the fit "
-        "used are held out in turn"
+        description="null with too few points: `middle` in a and `sides_mm` of cubes along the axes of a; in row i and "
+        f"column j of `errors`: {FIGURES} of the fit in cube i at the points of cube j that are not in cube j − 1; "
+        "points that the fit used are held out in turn"
     )
     robot: RobotPart | None = Field(
         None,
-        description="with `--robot`: `b_from_base` of the identified robot; `identified`: `rank`, "
-        "`names`, `undetermined`, `weighting` as of `identify`; `off_mm`: RMS of a off the robot file's positions "
-        "after a rigid fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, `kinematics_mm` of "
-        "each row held out, `wild`: outliers of both; without these, errors of `transform` and `kinematics`",
+        description="with `--robot`: `b_from_base` of the identified robot; `identified`: `rank`, `names`, "
+        "`undetermined`, and `weighting` with `sigma_mm`, as of `identify`; `off_mm`: RMS of a off the robot file's "
+        "positions after a rigid fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, "
+        "`kinematics_mm` of each row held out, `wild`: outliers of both; without these, errors of `transform` and "
+        f"`kinematics`: {FIGURES}",
     )
