@@ -19,19 +19,12 @@ EQUAL = 4.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """A change along the order of the rows.
+    """A jump of the rows from ``row`` on, or a drift of all rows in proportion to their place in the order.
 
-    Parameters
-    ----------
-    kind : {"jump", "drift"}; whether the rows from ``row`` on are moved, or all rows in proportion to their place in
-        the order
-    row : first row after a jump; 0 for a drift
-    first, last : range of rows that may be the first one after the jump
-    motion : (c,) jump, or drift from the first to the last row, in units of the motions given
-    moves : (r,) share of the motion in each row: 0 and 1, or 0 to 1
-    share : share of the squared residuals that it explains
-    log_p : logarithm of the probability of such a change by chance, wherever it is in the order
-    good : (r,) mask of the rows that are no gross errors
+    ``first``, ``last`` : range of rows that may be the first one after the jump; ``motion`` : (c,) jump, or drift from
+    the first to the last row, in units of the motions given; ``moves`` : (r,) share of the motion in each row;
+    ``share`` : of the squared residuals that it explains; ``log_p`` : logarithm of the probability of such a change by
+    chance, wherever it is in the order; ``good`` : (r,) rows that are no gross errors.
     """
 
     kind: Literal["jump", "drift"]
@@ -72,44 +65,31 @@ def changes_along(
     known: dict[bytes, np.ndarray] = {}
 
     def basis_of(good: np.ndarray) -> np.ndarray:
+        """Returns an orthonormal basis (N, k') of what the parameters explain in the good rows."""
         key = good.tobytes()
         if key not in known:
-            known[key] = _basis(_flat(explained[good]))
+            columns = _flat(explained[good])
+            size = np.linalg.norm(columns, axis=0)
+            u, s, _ = np.linalg.svd(columns[:, size > 0] / size[size > 0], full_matrices=False)
+            known[key] = u[:, s > 1e-9 * s[:1].max(initial=0.0)]
         return known[key]
 
     def change(motions: np.ndarray) -> Change | None:
-        good = np.ones(len(errors), bool)
+        good, width = np.ones(len(errors), bool), errors.shape[1]
         for _ in range(ROUNDS):
             found = _best(errors, basis_of(good), motions, good)
             if found is None:
                 return None
             stay = errors - found.moves[:, None] * (motions @ found.motion)
-            left = np.linalg.norm(stay - _refitted(stay, explained, good), axis=1)
-            limit = GROSS_SIGMAS * _sigma(left[good], errors.shape[1]) * np.sqrt(errors.shape[1])
-            before, good = good, left <= limit
+            step = np.linalg.lstsq(_flat(explained[good]), stay[good].ravel(), rcond=1e-12)[0]
+            left = np.linalg.norm(stay - explained @ step, axis=1)
+            sigma = np.median(left[good]) / np.sqrt(max(width - 2 / 3, 0.45))  # of one coordinate
+            before, good = good, left <= GROSS_SIGMAS * sigma * np.sqrt(width)
             if (good == before).all() or good.mean() < 0.5:
                 break
         return found
 
     return tuple(change(motions) for motions in families)
-
-
-def _basis(explained: np.ndarray) -> np.ndarray:
-    """Returns an orthonormal basis (N, k') of the columns (N, k)."""
-    size = np.linalg.norm(explained, axis=0)
-    u, s, _ = np.linalg.svd(explained[:, size > 0] / size[size > 0], full_matrices=False)
-    return u[:, s > 1e-9 * s[:1].max(initial=0.0)]
-
-
-def _sigma(lengths: np.ndarray, width: int) -> float:
-    """Returns σ of one coordinate from the median length of residuals of ``width`` coordinates."""
-    return float(np.median(lengths)) / np.sqrt(max(width - 2 / 3, 0.45))
-
-
-def _refitted(errors: np.ndarray, explained: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """Returns the part (r, w) of residuals that the parameters explain, as fitted to the good rows."""
-    step = np.linalg.lstsq(_flat(explained[good]), errors[good].ravel(), rcond=1e-12)[0]
-    return explained @ step
 
 
 def _flat(values: np.ndarray) -> np.ndarray:

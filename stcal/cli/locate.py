@@ -85,7 +85,7 @@ def calibrate(
     from stcal.io.cameras.read import read_camera
     from stcal.locate.calibration import calibrate as calibrated
     from stcal.locate.layout import layout_toml, load_plan, require_layout_written
-    from stcal.locate.page import calibrated_file, calibrated_text, warnings
+    from stcal.locate.page import CalibratedLayoutFile, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
@@ -98,7 +98,7 @@ def calibrate(
     print_each("warning", warnings(result, plan.tags))
     write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
     require_layout_written(out, result.layout)
-    write_if(json_file, lambda: calibrated_file(result))
+    write_if(json_file, lambda: CalibratedLayoutFile.model_validate(result))
 
 
 @app.command()
@@ -177,26 +177,11 @@ def run(
 
     chain = None
     if hand_eye or registration or robot_poses or offset:
-        chain = goal_chain(
-            hand_eye,
-            registration,
-            robot_poses=robot_poses,
-            offset=offset,
-            key=key,
-            quaternions=quaternions,
-        )
+        given = {"robot_poses": robot_poses, "offset": offset, "key": key, "quaternions": quaternions}
+        chain = goal_chain(hand_eye, registration, **given)
     target, model = load_layout(layout), read_camera(camera)
-    limits = VerdictOptions(
-        min_tags,
-        min_spread_px,
-        min_foreshortening,
-        max_p,
-        flip_odds,
-        sigma_margin,
-        equal_deg,
-        max_sigma_deg,
-        max_sigma_mm,
-    )
+    least = min_tags, min_spread_px, min_foreshortening
+    limits = VerdictOptions(*least, max_p, flip_odds, sigma_margin, equal_deg, max_sigma_deg, max_sigma_mm)
     patent = PatentOptions(s_dis, j_lim, e_lim_px, e_ratio)
     with images_or_frames(exposures) as folder:
         places = [exposures] if folder == exposures else sorted(folder.iterdir())
@@ -204,15 +189,15 @@ def run(
         if chain:
             chain.require_poses([scene.name for scene in scenes])
         results = list(located(scenes, target, model, LocateOptions(method, limits, patent, moved_px, workers)))
-        doubts = goals(results, chain).notes if chain else ()
-        document = run_report(results, scenes, target, model, chain)
+        in_base = goals(results, chain) if chain else None
+        document = run_report(results, scenes, target, model, in_base)
         say(document.text())
-        print_each("warning", doubts)
+        print_each("warning", in_base.notes if in_base else ())
         print_each("not used", (each for scene in scenes for each in scene.skipped))
         write_if(out, lambda: poses_csv(results, chain))
         if out and (poses := [uncertain(each).rigid for each in accepted(results)]):
             require_pose_table_written(out, {"": Poses.of(poses)})
-        write_if(json_file, lambda: LocatedFile.of(results, target, chain))
+        write_if(json_file, lambda: LocatedFile.of(results, target, in_base))
         write_if(report, document.page)
     if not accepted(results):
         say(verdict := f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")

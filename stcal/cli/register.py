@@ -57,7 +57,7 @@ def register(
 ) -> None:
     """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
-    from stcal.register.file import RegistrationFile, require_registration_written
+    from stcal.register.file import RegistrationFile, RobotPart
     from stcal.register.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.page import registration_report, sample_size_section
     from stcal.register.pairs import read_pairs
@@ -75,29 +75,29 @@ def register(
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
     allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics show it
-    options = {"model": model, "method": method, "threshold_mm": threshold, "seed": seed}
-    options |= {"liu2017_options": liu2017} if liu2017 else {}
     result = registered(
         pairs.xyz_a,
         pairs.xyz_b,
-        **options,
+        model=model,
+        method=method,
+        threshold_mm=threshold,
+        seed=seed,
+        liu2017_options=liu2017,
         weights=pairs.weights,
         covariances=pairs.covariances,
         folds=folds,
         allow_ambiguous=allow_ambiguous,
         lines=pairs.lines,
     )
-    registration = findings(
-        pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances
-    )
-    content, sections, failed = RegistrationFile.of(registration), [], None
+    registration = findings(pairs, result)
+    content, sections, failed = RegistrationFile.model_validate(registration), [], None
     if report and liu2017:
         limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
         sections.append(sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
     if robot_file:
         from stcal.robot.identification.result import require_identified_written
         from stcal.robot.kinematics.file import load_robot, robot_toml
-        from stcal.workflows.register_robot import comparison_section, register_with_robot, robot_part
+        from stcal.workflows.register_robot import comparison_section, register_with_robot
 
         try:
             beside = register_with_robot(
@@ -109,7 +109,7 @@ def register(
                 liu2017_options=liu2017,
                 folds=folds,
             )
-            content = content.model_copy(update={"robot": robot_part(beside)})
+            content = content.model_copy(update={"robot": RobotPart.model_validate(beside)})
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {shared.name_of(source)}: {beside.identified.rank} parameters."]
@@ -121,8 +121,6 @@ def register(
     say(document.text())
     print_each(f"warning: {pairs.where}", result.notes)
     write_if(out, lambda: content)
-    if out:
-        require_registration_written(out, registration)
     write_if(report, document.page)
     if failed is not None:
         raise failed

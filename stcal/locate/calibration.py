@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import block_diag, null_space
 from scipy.optimize import root_scalar
 
 from stcal.adjust.blocks import Huber, Vector
@@ -19,10 +19,11 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import PoseStack, block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, align_rigid
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.geometry.variances import sigma_factor
-from stcal.locate.layout import LayoutPlan, TargetLayout, obj_from_plane
+from stcal.locate.estimate import normalised
+from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
 
 MAX_STEPS = 60
@@ -38,7 +39,6 @@ TOGETHER = np.tile(np.eye(2), (4, 1))
 APART = null_space(TOGETHER.T)
 """Basis (8, 6) of all other displacements of a tag's corners."""
 NEAR_PX = 0.005
-NEAR_DEPTH = 1e-9
 TINY_MM2 = 1e-12
 """Variance of a mode of the print at an amplitude of 0, for an inverse."""
 
@@ -62,15 +62,6 @@ class ImageCorners:
     seen: np.ndarray
     noise: np.ndarray
     focal_px: float
-
-    def numbered(self, rows: np.ndarray) -> "ImageCorners":
-        """Returns the image with other row numbers of the tags."""
-        return replace(self, rows=rows)
-
-    def turned(self, board_from_board: Rigid) -> "ImageCorners":
-        """Returns the image with the board numbered as after one of its symmetries."""
-        inverse = board_from_board.inverse()
-        return replace(self, pose=self.pose @ inverse, board_xyz=board_from_board @ self.board_xyz)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,23 +111,16 @@ class _Rows:
 
     def off(self, poses: PoseStack, xyz: np.ndarray) -> np.ndarray:
         """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board."""
-        return (self._projected(poses, xyz)[2] - self.seen).reshape(len(xyz), -1)
+        return (self._projected(poses, xyz)[0] - self.seen).reshape(len(xyz), -1)
 
     def slopes(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns its derivatives by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
-        turned, depth, uv = self._projected(poses, xyz)
-        by_point = np.zeros((*uv.shape, 3))
-        by_point[..., 0, 0] = by_point[..., 1, 1] = 1
-        by_point[..., 2] = -uv
-        by_point /= depth[..., None, None]
-        by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+        _, by_point, by_pose = self._projected(poses, xyz)
         return by_pose.reshape(len(xyz), -1, 6), by_point @ poses.rotation[self.image][:, None]
 
     def _projected(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         turned = xyz @ np.swapaxes(poses.rotation[self.image], 1, 2)
-        placed = turned + poses.translation[self.image][:, None]
-        depth = np.where(np.abs(placed[..., 2]) > NEAR_DEPTH, placed[..., 2], NEAR_DEPTH)
-        return turned, depth, placed[..., :2] / depth[..., None]
+        return normalised(turned, turned + poses.translation[self.image][:, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,6 +323,8 @@ class CalibratedLayout(Brief):
         Images that were not used, and why.
     """
 
+    format: ClassVar = "stcal layout calibration 1"
+    unit: ClassVar = "mm"
     layout: TargetLayout
     published: np.ndarray
     board_from_obj: Rigid
@@ -391,14 +377,15 @@ def calibrate(
     images, left_out = [], []
     for name, view, detected in zip(names, views, tags, strict=True):
         listed = [k for k, tag in enumerate(detected.tags) if tag in rows]
-        if view is None or len(view) < MIN_BOARD_POINTS or not listed:
-            left_out.append(f"{name}: {'no tag of the layout' if listed == [] else 'the board is not seen'}")
-            continue
         repeated = [tag for _, tag in (t for t in detected.repeated if t in rows)]
-        if repeated:
+        if not listed:
+            left_out.append(f"{name}: no tag of the layout")
+        elif view is None or len(view) < MIN_BOARD_POINTS:
+            left_out.append(f"{name}: the board is not seen")
+        elif repeated:
             left_out.append(f"{name}: tag {repeated[0]} is seen twice")
-            continue
-        images.append(_image(name, view, detected, listed, rows, camera))
+        else:
+            images.append(_image(name, view, detected, listed, rows, camera))
     if len(images) < MIN_IMAGES:
         raise DegenerateError(
             "E-LAYOUT-FEW-IMAGES",
@@ -414,7 +401,7 @@ def calibrate(
             f"layout: tag {plan.tags[plan.origin][1]}, which holds the origin, is in none of {len(images)} images; "
             "show it, or name another origin in the layout file",
         )
-    images = [image.numbered(np.searchsorted(seen_rows, image.rows)) for image in images]
+    images = [replace(image, rows=np.searchsorted(seen_rows, image.rows)) for image in images]
     start = _median_corners(images, len(seen_rows))
     adjusted = adjust(images, start)
     return _collected(plan, images, seen_rows, start, adjusted, left_out)
@@ -424,29 +411,22 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
     """Returns board and tags of one image in normalised coordinates, and the pose of the board."""
     board_seen = camera.normalised_from_pixel(view.xy_px)
     xy = view.xyz_board[:, :2]
-    pose = refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen)
-    pixels = found.corners_px[own].reshape(-1, 2)
-    ideal = camera.normalised_from_pixel(pixels)
     board_px2 = np.tile(np.eye(2), (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
     seen_from_px = np.linalg.inv(camera.pixel_jacobian(board_seen))
+    # A tag's corners err as measured, and by the edges' common shift.
+    direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
+    shift = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
     return ImageCorners(
         name,
-        pose,
+        refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen),
         view.xyz_board,
         board_seen,
         seen_from_px @ board_px2 @ np.swapaxes(seen_from_px, 1, 2),
         np.array([rows[found.tags[k]] for k in own]),
-        ideal,
-        _tag_covariances(found, own),
+        camera.normalised_from_pixel(found.corners_px[own].reshape(-1, 2)),
+        shift + np.asarray(found.joint_px2)[own],
         float(camera.focal.mean()),
     )
-
-
-def _tag_covariances(found: Tags, own: list[int]) -> np.ndarray:
-    """Returns the covariance of each tag's corners, (k, 8, 8) px²: as measured, and of the edges' common shift."""
-    direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
-    shift = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
-    return shift + np.asarray(found.joint_px2)[own]
 
 
 def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
@@ -456,14 +436,15 @@ def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
 
 
 def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -> list[ImageCorners]:
-    """Chooses in each image the numbering of a symmetric board that places tags as elsewhere, those with most in common
-    first."""
+    """Chooses in each image the numbering of a symmetric board that places tags as elsewhere."""
     turned, place_of_tag, left = list(images), {}, list(range(len(images)))
     while left:
         i = max(left, key=lambda i: (sum(row in place_of_tag for row in images[i].rows), len(images[i].rows), -i))
         left.remove(i)
         image = images[i]
-        choices = [image, *(image.turned(symmetry) for symmetry in symmetries)]
+        choices = [image]
+        for turn in symmetries:
+            choices.append(replace(image, pose=image.pose @ turn.inverse(), board_xyz=turn @ image.board_xyz))
         places = [plane_points(choice.pose, choice.seen).reshape(-1, 4, 2) for choice in choices]
         common = [k for k, row in enumerate(image.rows) if row in place_of_tag]
         if common:
@@ -508,16 +489,14 @@ def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out
         adjusted.tag_sigma_px,
         plan.unusual_size,
     )
-    obj_from_board = Rigid(np.block([[turn, np.zeros((2, 1))], [np.zeros((1, 2)), 1.0]]), np.append(shift, 0.0))
-    first_turn, first_shift = obj_from_plane(start[origin])
-    counts = np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows))
+    obj_from_board = Rigid(np.asarray(block_diag(turn, 1.0)), np.append(shift, 0.0))
     return CalibratedLayout(
         layout,
-        start @ first_turn.T + first_shift,
+        in_obj(start, origin),
         obj_from_board.inverse(),
         adjusted,
         tuple(image.name for image in images),
-        counts,
+        np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows)),
         tuple(row for row in range(len(plan.tags)) if row not in tag_rows),
         _deviation(plan.corners_mm[tag_rows], layout.corners_mm),
         tuple(left_out),
@@ -548,10 +527,8 @@ def _deviation(nominal: np.ndarray, corners: np.ndarray) -> np.ndarray:
     placed = np.isfinite(nominal).all((1, 2))
     deviation = np.full(len(nominal), np.nan)
     if placed.any():
-        a, b = corners[placed].reshape(-1, 2), nominal[placed].reshape(-1, 2)
-        u, _, vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
-        turn = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
-        distance = np.linalg.norm((b - b.mean(0)) @ turn.T + a.mean(0) - a, axis=1)
+        a, b = (np.pad(each[placed].reshape(-1, 2), ((0, 0), (0, 1))) for each in (corners, nominal))
+        distance = np.linalg.norm(align_rigid(a, b) @ b - a, axis=1)
         deviation[placed] = distance.reshape(-1, 4).max(1)
     return deviation
 

@@ -4,15 +4,17 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, require_arguments
+from stcal.explain import Candidate, explain
+from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
-from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
+from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, checked, read_result
 from stcal.io.poses.rotations import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
 from stcal.locate.pipeline import Located
@@ -36,42 +38,8 @@ class RegistrationRead(Part):
     format: Literal["stcal registration 1"] = "stcal registration 1"
     model: str
     method: str
-    b_from_a: Matrix4
+    b_from_a: Annotated[Matrix4, BeforeValidator(lambda given: given.matrix() if hasattr(given, "matrix") else given)]
     covariance: Matrix
-
-
-@runtime_checkable
-class HandEyeResult(Protocol):
-    """What is used of :class:`stcal.handeye.HandEye`."""
-
-    @property
-    def transforms(self) -> Mapping[str, Rigid]: ...
-
-    @property
-    def covariance(self) -> np.ndarray | None: ...
-
-
-class WithMatrix(Protocol):
-    """A transform of any kind."""
-
-    def matrix(self) -> np.ndarray: ...
-
-
-@runtime_checkable
-class RegistrationResult(Protocol):
-    """What is used of :class:`stcal.register.Registration`: a is the camera's frame, b the robot's base."""
-
-    @property
-    def model(self) -> str: ...
-
-    @property
-    def method(self) -> str: ...
-
-    @property
-    def b_from_a(self) -> WithMatrix: ...
-
-    @property
-    def covariance(self) -> np.ndarray: ...
 
 
 class OffsetFile(Part):
@@ -116,80 +84,60 @@ class GoalChain(Brief):
 
         Raises InputError: the robot has no pose for this scene.
         """
+        self.require_poses([scene])
         chain = self.mount @ camera_from_obj @ UncertainRigid.exact(self.offset)
-        if not self.moving:
-            return chain
-        if scene not in self.flange:
-            raise InputError(
-                "E-ROBOT-POSES-SCENE", f"robot poses: none of scene {scene}; add a row, or remove its exposures"
-            )
-        return self.flange[scene] @ chain
-
-    def without_pose(self, scenes: Sequence[str]) -> list[str]:
-        """Returns the scenes without a robot pose."""
-        return [scene for scene in scenes if self.moving and scene not in self.flange]
+        return self.flange[scene] @ chain if self.moving else chain
 
     def require_poses(self, scenes: Sequence[str]) -> None:
         """Refuses scenes without a robot pose, by InputError."""
-        if missing := self.without_pose(scenes):
+        if self.moving and (missing := [scene for scene in scenes if scene not in self.flange]):
             raise InputError(
                 "E-ROBOT-POSES-SCENE",
                 f"{self.poses_source}: none of scene {missing[0]}; add a row, or remove the scene",
             )
 
 
-def _mounted(
-    hand_eye: HandEyeResult | Rigid | str | Path, robot_poses: Mapping[str, Rigid] | str | Path | None
-) -> tuple[str, UncertainRigid]:
+def _mounted(hand_eye: object, robot_poses: object) -> tuple[str, UncertainRigid]:
     """Returns name and pose of the camera; robot poses decide which name an unnamed transform has."""
     if isinstance(hand_eye, Rigid):
         return FIXED if robot_poses is None else MOVING, UncertainRigid.exact(hand_eye)
+    where = _named("hand-eye", hand_eye)
     if isinstance(hand_eye, str | Path):
-        mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
-        either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
-        given = {name: Rigid.from_matrix(matrix) for name, matrix in either.items() if matrix is not None}
-        if len(given) != 1:
-            raise InputError(
-                "E-HANDEYE-FILE",
-                f"hand-eye file {hand_eye}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed",
-            )
+        read = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
     else:
-        mounted = hand_eye
-        given = {name: pose for name, pose in hand_eye.transforms.items() if name in (MOVING, FIXED)}
+        transforms = getattr(hand_eye, "transforms", {})
+        read = checked({**transforms, "covariance": getattr(hand_eye, "covariance", None)}, HandEyeRead)
+    either = {MOVING: read.flange_from_camera, FIXED: read.base_from_camera}
+    given = {name: Rigid.from_matrix(matrix) for name, matrix in either.items() if matrix is not None}
+    if len(given) != 1:
+        raise InputError("E-HANDEYE-FILE", f"{where}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed")
     [(name, pose)] = given.items()
-    return name, UncertainRigid(pose, np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance)
+    return name, UncertainRigid(pose, np.zeros((6, 6)) if read.covariance is None else read.covariance)
 
 
-def read_registered(
-    registration: RegistrationResult | str | Path, offset: Rigid | str | Path | None = None
-) -> GoalChain:
-    """Reads the result of ``stcal register`` of a fixed camera (a) and the robot's base (b); raises InputError: not
-    rigid, or a file not as in ``data_layout.md``."""
+def _registered(registration: object) -> UncertainRigid:
+    """Returns base_from_camera by ``stcal register`` of a fixed camera (a) and the robot's base (b); raises InputError:
+    not rigid, or a file not as in ``data_layout.md``."""
     if isinstance(registration, str | Path):
         advice = "give the file of stcal register --out"
         read = read_result(registration, RegistrationRead, "registration file", advice)
-        source, where, matrix = "registration file", f"registration file {registration}", read.b_from_a
     else:
-        read, source, where = registration, "registration", "registration"
-        matrix = registration.b_from_a.matrix()
-    linear = matrix[:3, :3]
+        read = RegistrationRead.model_validate(registration)
+    linear = read.b_from_a[:3, :3]
     residual = float(np.abs(linear.T @ linear - np.eye(3)).max())
     if read.covariance.shape != (6, 6) or residual > ROTATION_WITHIN or np.linalg.det(linear) < 0:
         kind = read.method if read.method == "liu2017" else read.model
         raise InputError(
             "E-REGISTER-FILE",
-            f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from 1); base_from_camera needs one, "
-            "register with --model rigid",
+            f"{_named('registration', registration)}: b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from "
+            "1); base_from_camera needs one, register with --model rigid",
         )
-    mount = UncertainRigid(Rigid.from_matrix(matrix), read.covariance)
-    return GoalChain(mount, False, {}, _offset(offset), source)
+    return UncertainRigid(Rigid.from_matrix(read.b_from_a), read.covariance)
 
 
-def _offset(offset: Rigid | str | Path | None) -> Rigid:
-    if offset is None or isinstance(offset, Rigid):
-        return offset or Rigid()
-    read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
-    return Rigid.from_matrix(read.obj_from_goal)
+def _named(what: str, given: object) -> str:
+    """Returns the name of an argument for messages, with its file if it is one."""
+    return f"{what} file {given}" if isinstance(given, str | Path) else what
 
 
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "scene") -> dict[str, UncertainRigid]:
@@ -229,81 +177,77 @@ def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str,
     if chain.moving and len(scenes) > 1:
         flange = Poses.of([chain.flange[scene].rigid for scene in scenes])
         _require_standing(chain.mount.rigid, flange, Poses.of([seen[scene].rigid for scene in scenes]))
-    return (*_robot_near(chain), *_camera_near(chain))
-
-
-def _robot_near(chain: GoalChain) -> Iterator[str]:
-    distance = max((float(np.linalg.norm(each.rigid.translation)) for each in chain.flange.values()), default=0.0)
-    if 0 < distance < NEAR_BASE_MM:
-        yield (
-            f"robot poses: the flange is within {distance:.2g} mm of the base's origin in all scenes, more than "
+    notes = []
+    apart = max((float(np.linalg.norm(each.rigid.translation)) for each in chain.flange.values()), default=0.0)
+    if 0 < apart < NEAR_BASE_MM:
+        notes.append(
+            f"robot poses: the flange is within {apart:.2g} mm of the base's origin in all scenes, more than "
             f"{NEAR_BASE_MM:g} mm expected: if lengths are metres, name the columns _m"
         )
-
-
-def _camera_near(chain: GoalChain) -> Iterator[str]:
-    distance = float(np.linalg.norm(chain.mount.rigid.translation))
+    apart = float(np.linalg.norm(chain.mount.rigid.translation))
     frame, least = ("flange", NEAR_FLANGE_MM) if chain.moving else ("base", NEAR_BASE_MM)
-    if 0 < distance < least:
-        yield (
-            f"{chain.source}: the camera is {distance:.2g} mm from the origin of the {frame}, more than {least:g} mm "
+    if 0 < apart < least:
+        notes.append(
+            f"{chain.source}: the camera is {apart:.2g} mm from the origin of the {frame}, more than {least:g} mm "
             "expected: if its lengths are metres, multiply them by 1000"
         )
+    return tuple(notes)
 
 
 def _require_standing(mount: Rigid, flange: Poses, seen: Poses) -> None:
-    variation = _varies(flange @ mount @ seen)
-    allowed = STILL * float(np.median(np.linalg.norm(seen.translation, axis=1))), STILL_RAD
-    if variation[0] < allowed[0] and variation[1] < allowed[1]:
+    still_mm = STILL * float(np.median(np.linalg.norm(seen.translation, axis=1)))
+    mm, rad = _varies(flange @ mount @ seen)
+    if mm < still_mm and rad < STILL_RAD:
         return
-    for reason, robot, camera in _guesses(mount, flange):
-        mm, rad = _varies(robot @ camera @ seen)
-        gain = variation[0] / max(mm, 1e-9) * variation[1] / max(rad, 1e-9)
-        if mm < min(allowed[0], variation[0] / BETTER) and rad < allowed[1] and gain > FAR_BETTER:
-            raise InputError(
-                "E-LOCATE-VARIES",
-                f"robot poses and hand-eye: the target's pose in the base varies by {variation[0]:.3g} mm and "
-                f"{np.degrees(variation[1]):.3g}° (RMS of {len(seen)} scenes), but by {mm:.2g} mm and "
-                f"{np.degrees(rad):.2g}° if {reason}",
-            )
+
+    def variation(robot_and_camera: tuple[Poses, Rigid]) -> float:
+        robot, camera = robot_and_camera
+        left_mm, left_rad = _varies(robot @ camera @ seen)
+        stands = left_mm < min(still_mm, mm / BETTER) and left_rad < STILL_RAD
+        return left_mm * left_rad if stands else np.inf
+
+    found = explain(_mistakes(mount, flange), variation, mm * rad / FAR_BETTER)
+    if found:
+        robot, camera = found[0][0].change()
+        left_mm, left_rad = _varies(robot @ camera @ seen)
+        raise InputError(
+            "E-LOCATE-VARIES",
+            f"robot poses and hand-eye: the target's pose in the base varies by {mm:.3g} mm and "
+            f"{np.degrees(rad):.3g}° (RMS of {len(seen)} scenes), but by {left_mm:.2g} mm and "
+            f"{np.degrees(left_rad):.2g}° if {found[0][0].words}",
+        )
 
 
-def _guesses(mount: Rigid, flange: Poses) -> Iterator[tuple[str, Poses, Rigid]]:
+def _mistakes(mount: Rigid, flange: Poses) -> Iterator[Candidate]:
     """Yields frequent mistakes with their remedy, and base_from_flange and flange_from_camera after the remedy."""
     for reading in READINGS:
-        yield f"the robot's quaternions were {reading.held}; {reading.remedy}", reading.poses(flange), mount
-    yield "the robot's poses were flange_from_base; give base_from_flange", flange.inverse(), mount
-    yield "the hand-eye were camera_from_flange; give flange_from_camera", flange, mount.inverse()
+        words = f"the robot's quaternions were {reading.held}; {reading.remedy}"
+        yield Candidate(words, lambda reading=reading: (reading.poses(flange), mount))
+    words = "the robot's poses were flange_from_base; give base_from_flange"
+    yield Candidate(words, lambda: (flange.inverse(), mount))
+    words = "the hand-eye were camera_from_flange; give flange_from_camera"
+    yield Candidate(words, lambda: (flange, mount.inverse()))
     for unit in UNITS:
-        larger = replace(flange, translation=LENGTHS[unit] * flange.translation)
-        yield f"the robot's lengths were {UNIT_WORDS[unit]}; name the columns _{unit}", larger, mount
-        camera = Rigid(mount.rotation, LENGTHS[unit] * mount.translation)
-        yield f"the hand-eye's lengths were {UNIT_WORDS[unit]}; multiply them by {LENGTHS[unit]:g}", flange, camera
+        by, named = LENGTHS[unit], UNIT_WORDS[unit]
+        words = f"the robot's lengths were {named}; name the columns _{unit}"
+        yield Candidate(words, lambda by=by: (replace(flange, translation=by * flange.translation), mount))
+        words = f"the hand-eye's lengths were {named}; multiply them by {by:g}"
+        yield Candidate(words, lambda by=by: (flange, Rigid(mount.rotation, by * mount.translation)))
 
 
 def _varies(found: Poses) -> tuple[float, float]:
     """Returns the RMS deviations from the mean pose: mm and rad."""
     turns = Rotation.from_matrix(np.array(found.rotation))
-    rad = (turns.mean().inv() * turns).magnitude()
     mm = np.linalg.norm(found.translation - found.translation.mean(axis=0), axis=1)
-    return float(np.sqrt((mm**2).mean())), float(np.sqrt((rad**2).mean()))
-
-
-def camera_from_obj(located: Located) -> Rigid | None:
-    """Returns camera_from_obj by the method that was asked for, or None."""
-    if located.patent is not None:
-        return located.patent.camera_from_obj
-    return None if located.pose is None else located.pose.camera_from_obj
+    return max(rms(mm), 1e-9), max(rms((turns.mean().inv() * turns).magnitude()), 1e-9)
 
 
 def uncertain(located: Located) -> UncertainRigid:
     """Returns camera_from_obj with its covariance, which is zero for the patent's method."""
-    if located.pose is None:
-        pose = camera_from_obj(located)
-        if pose is None:
-            raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
-        return UncertainRigid.exact(pose)
-    return UncertainRigid(located.pose.camera_from_obj, located.pose.covariance)
+    pose = located.camera_from_obj
+    if pose is None:
+        raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
+    return UncertainRigid(pose, np.zeros((6, 6)) if located.pose is None else located.pose.covariance)
 
 
 def accepted(results: Sequence[Located]) -> list[Located]:
@@ -313,8 +257,8 @@ def accepted(results: Sequence[Located]) -> list[Located]:
 
 @require_arguments
 def goal_chain(
-    hand_eye: HandEyeResult | Rigid | str | Path | None = None,
-    registration: RegistrationResult | str | Path | None = None,
+    hand_eye: object | None = None,
+    registration: object | None = None,
     *,
     robot_poses: Mapping[str, Rigid] | str | Path | None = None,
     offset: Rigid | str | Path | None = None,
@@ -357,45 +301,43 @@ def goal_chain(
     if hand_eye is not None and registration is not None:
         raise InputError(
             "E-OPTION-CONFLICT",
-            f"--hand-eye {_named(hand_eye)}, --registration {_named(registration)}: both lead to the base; give one",
+            f"--hand-eye {_named('hand-eye', hand_eye)}, --registration {_named('registration', registration)}: both "
+            "lead to the base; give one",
         )
     if hand_eye is None and robot_poses is not None:
         raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
-    if registration is not None:
-        return read_registered(registration, offset)
-    if hand_eye is None and offset is not None:
+    if hand_eye is None and registration is None and offset is not None:
         raise InputError(
             "E-OPTION-NEEDS",
             "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
         )
-    if hand_eye is None:
+    if hand_eye is None and registration is None:
         raise InputError(
             "E-OPTION-MISSING", "goals: --hand-eye or --registration needed, which lead to the robot's base"
         )
-    name, mount = _mounted(hand_eye, robot_poses)
-    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
-    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
+    if hand_eye is None:
+        name, mount, source = FIXED, _registered(registration), _named("registration", registration)
+    else:
+        (name, mount), source = _mounted(hand_eye, robot_poses), _named("hand-eye", hand_eye)
     moving = name == MOVING
     if moving and robot_poses is None:
         raise InputError(
             "E-OPTION-MISSING",
-            f"{where}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
+            f"{source}: the camera is on the flange; robot poses of the scenes (--robot-poses) needed",
         )
     if not moving and robot_poses is not None:
         raise InputError(
-            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
+            "E-OPTION-NEEDS", f"{source}: the camera is fixed and needs no robot poses; leave --robot-poses out"
         )
-    if robot_poses is None:
-        return GoalChain(mount, moving, {}, _offset(offset), source)
+    if isinstance(offset, str | Path):
+        read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
+        offset = Rigid.from_matrix(read.obj_from_goal)
     if isinstance(robot_poses, str | Path):
-        flange = read_robot_poses(robot_poses, quaternions, key)
-        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
-    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
-    return GoalChain(mount, moving, exact, _offset(offset), source)
-
-
-def _named(given: object) -> str:
-    return str(given) if isinstance(given, str | Path) else type(given).__name__
+        flange, poses_source = read_robot_poses(robot_poses, quaternions, key), f"robot poses {robot_poses}"
+    else:
+        flange = {scene: UncertainRigid.exact(pose) for scene, pose in (robot_poses or {}).items()}
+        poses_source = "robot poses"
+    return GoalChain(mount, moving, flange, offset or Rigid(), source, poses_source)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

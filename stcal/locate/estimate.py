@@ -2,6 +2,7 @@
 Corners of several exposures are merged, and it is tested whether the scene stood still."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -41,6 +42,8 @@ from stcal.locate.layout import TargetLayout
 
 SETTLED = 1e-5
 """Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
+NEAR_DEPTH = 1e-9
+"""Depth that stands for a smaller one, mm."""
 WEIGH_STEPS, WEIGHED = 60, 1e-6
 """Largest number of steps, and the least decrease of χ²: a step of less than σ/1000 is the last. Errors that many
 corners share, such as those of the intrinsics, can move a pose by many σ due to single corners."""
@@ -80,7 +83,6 @@ class ProjectedCorners:
     """``residual`` : (h, n, 2) of h poses, measured minus projected; ``by_pose`` : (h, n, 2, 6), ``by_corner`` : (h, n,
     2, 2) negative derivatives; ``before`` : (h,) all corners in front of the camera."""
 
-    poses: Poses | PoseStack
     residual: np.ndarray
     by_pose: np.ndarray
     by_corner: np.ndarray
@@ -91,15 +93,19 @@ def project(problem: PlanarProblem, poses: Poses | PoseStack) -> ProjectedCorner
     """Returns the residuals of h poses, and their derivatives."""
     turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
     xyz = turned + poses.translation[:, None]
-    depth = xyz[..., 2]
-    before = (depth > 0).all(1)
-    depth = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    uv = xyz[..., :2] / depth[..., None]
-    by_point = np.zeros((*uv.shape, 3))
-    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
-    by_point[..., 2] = -uv / depth[..., None]
-    by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
-    return ProjectedCorners(poses, problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], before)
+    uv, by_point, by_pose = normalised(turned, xyz)
+    return ProjectedCorners(
+        problem.seen - uv, by_pose, by_point @ poses.rotation[:, None, :, :2], (xyz[..., 2] > 0).all(1)
+    )
+
+
+def normalised(turned: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the image (..., 2) of points ``xyz`` in the camera's frame, and its derivatives by them, (..., 2, 3), and
+    by a pose, (..., 2, 6), that turned them to ``turned`` before its translation."""
+    depth = np.where(np.abs(xyz[..., 2]) > NEAR_DEPTH, xyz[..., 2], NEAR_DEPTH)[..., None]
+    uv = xyz[..., :2] / depth
+    by_point = np.concatenate([np.broadcast_to(np.eye(2), (*uv.shape, 2)), -uv[..., None]], axis=-1) / depth[..., None]
+    return uv, by_point, np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
 
 
 def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
@@ -111,17 +117,16 @@ def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
     )
     shared = problem.common @ problem.prior @ np.swapaxes(problem.common, 1, 2)
     full = noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
-    return partial(_descend, problem, np.linalg.inv(np.linalg.cholesky(full)))
+    whiten = np.linalg.inv(np.linalg.cholesky(full))
 
+    def descend(poses: PoseStack, huber: float) -> Minima:
+        def evaluate(poses: PoseStack) -> Normal:
+            view = project(problem, poses)
+            return Normal.of((whiten @ view.residual[..., None])[..., 0], whiten @ view.by_pose, view.before, huber)
 
-def _descend(problem: PlanarProblem, whiten: np.ndarray, poses: PoseStack, huber: float) -> Minima:
-    """Returns the minima next to h poses, with Huber's loss on residuals that are whitened by ``whiten`` (n, 2, 2)."""
+        return least_squares.descend(evaluate, poses, SETTLED)
 
-    def evaluate(poses: PoseStack) -> Normal:
-        view = project(problem, poses)
-        return Normal.of((whiten @ view.residual[..., None])[..., 0], whiten @ view.by_pose, view.before, huber)
-
-    return least_squares.descend(evaluate, poses, SETTLED)
+    return descend
 
 
 def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Weighed:
@@ -321,15 +326,11 @@ def problem_of(
     px_by_seen = camera.pixel_jacobian(ideal)
     seen_by_px = np.linalg.inv(px_by_seen)
     k, tag = len(detected), np.arange(len(detected))
-    by_edges, by_tag = np.zeros((k, 4, 2, k)), np.zeros((k, 4, 2, k, 2))  # px, by shifts of edges and of whole tags
-    by_edges[tag, :, :, tag] = corners_by_edges(detected.corners_px)
-    by_tag[tag, :, :, tag] = np.eye(2)
-    common = np.concatenate(
-        [seen_by_px @ by_edges.reshape(4 * k, 2, k), seen_by_px @ by_tag.reshape(4 * k, 2, 2 * k)], axis=2
-    )
-    common_covariance = np.diag(
-        np.append(detected.edge_sigma_px**2, np.full(2 * len(detected), layout.tag_sigma_px**2))
-    )
+    by_shift = np.zeros((k, 4, 2, 3, k))  # px, by the shift of a tag's edges, and of a whole tag along x and y
+    by_shift[tag, :, :, 0, tag] = corners_by_edges(detected.corners_px)
+    by_shift[tag, :, :, 1:, tag] = np.eye(2)
+    common = seen_by_px @ by_shift.reshape(4 * k, 2, 3 * k)
+    common_covariance = np.diag([*detected.edge_sigma_px**2, *np.full(2 * k, layout.tag_sigma_px**2)])
     if prior is not None:
         by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         common = np.concatenate([common, by_camera], axis=2)
@@ -346,11 +347,14 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
     """Returns the pose that fits most corners, among those from all corners together and from each tag alone."""
     tags = [slice(4 * k, 4 * k + 4) for k in range(len(problem.xy) // 4)]
     for sets in ([slice(None)], tags):
-        poses = _poses(problem, sets)
-        if poses is None:
+        poses = []
+        for corners in sets:
+            with suppress(DegenerateError):
+                poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
+        if not poses:
             continue
-        view = project(problem, poses)
-        distance = np.linalg.norm((problem.px_by_seen @ view.residual[..., None])[..., 0], axis=2)
+        view = project(problem, Poses.of(poses))
+        distance = np.linalg.norm(problem.in_px(view.residual), axis=2)
         score = np.where(view.before, np.log1p((distance / START_PX) ** 2).sum(1), np.inf)
         best = int(score.argmin())
         # If all corners agree with one pose, none is wrong, and poses of single tags are not needed.
@@ -361,33 +365,16 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
     )
 
 
-def _poses(problem: PlanarProblem, sets: list[slice]) -> Poses | None:
-    """Returns both poses of each set of corners, or None if no set gives a pose."""
-    poses = []
-    for corners in sets:
-        try:
-            poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
-        except DegenerateError:
-            continue
-    return Poses.of(poses) if poses else None
-
-
 def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: tuple[int, ...]) -> ObjPose:
     """Chooses the better minimum, and returns it with the other one as the second solution."""
-    weights = weights_of(found.length)
-    if len(weights) == 1:
-        return _collected(problem, weighed(problem, found.poses, weights[0]), weights[0], rows, outliers)
-    # Both minima use the same weights, the smaller of the two. Otherwise an outlier of one minimum could decide.
-    pair = [weighed(problem, found.poses[[i]], weights.min(0)) for i in range(2)]
-    delta = float(pair[1].chi2[0] - pair[0].chi2[0])
-    better = int(delta < 0)
+    weights, better, delta, second = weights_of(found.length), 0, np.inf, None
+    if len(weights) > 1:
+        # Both minima use the same weights, the smaller of the two. Otherwise an outlier of one minimum could decide.
+        pair = [weighed(problem, found.poses[[i]], weights.min(0)) for i in range(2)]
+        delta = float(pair[1].chi2[0] - pair[0].chi2[0])
+        better = int(delta < 0)
+        delta, second = abs(delta), pair[1 - better].poses.rigid(0)
     best = weighed(problem, found.poses[[better]], weights[better])
-    pose = _collected(problem, best, weights[better], rows, outliers)
-    return replace(pose, delta_chi2=abs(delta), second=pair[1 - better].poses.rigid(0))
-
-
-def _collected(problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows, outliers: tuple[int, ...]) -> ObjPose:
-    """Returns the pose of one minimum, without a second solution."""
     pose = best.poses.rigid(0)
     middle = pose @ np.append(problem.xy.mean(0), 0.0)
     offset = problem.in_px(problem.seen - problem.seen.mean(0))
@@ -398,11 +385,13 @@ def _collected(problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows,
         rows=rows,
         outliers=outliers,
         residuals_px=problem.in_px(best.residual[0]),
-        weights=weights,
+        weights=weights[better],
         chi2=float(best.chi2[0]),
         redundancy=2 * len(problem.xy) - 6,
         foreshortening=float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle)),
         extent_px=float(np.ptp(offset @ np.linalg.svd(offset, full_matrices=False)[2][1])),
+        delta_chi2=delta,
+        second=second,
     )
 
 
@@ -445,15 +434,27 @@ class Merged:
     repeated: tuple[tuple[str, int], ...]
     unknown: tuple[tuple[str, int], ...]
 
+    @property
+    def rows(self) -> np.ndarray:
+        return self.seen.rows
+
 
 def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] = ()) -> Merged:
     """Returns weighted means of the corners over the exposures, with their covariance. The part of their errors that
     exposures share (print, lens, sampling), by differences against stated σ, does not average out; larger differences
     increase the σ."""
     rows = layout.rows()
-    places = [{rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows} for tags in exposures]
-    used = np.array(sorted({row for place in places for row in place}), int)
-    corners, covariance, joint, edge = _stacked(exposures, places, used)
+    used = np.array(sorted({rows[tag] for tags in exposures for tag in tags.tags if tag in rows}), int)
+    # corners, NaN if unseen; covariances of each and of a tag's four, px²; σ of the edges' common shift
+    shape = len(exposures), len(used)
+    corners, edge = np.full((*shape, 4, 2), np.nan), np.zeros(shape)
+    covariance, joint = np.tile(np.eye(2), (*shape, 4, 1, 1)), np.tile(np.eye(8), (*shape, 1, 1))
+    for e, tags in enumerate(exposures):
+        place = {rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows}
+        seen = [k for k, row in enumerate(used) if row in place]
+        own = [place[used[k]] for k in seen]
+        corners[e, seen], covariance[e, seen] = tags.corners_px[own], tags.covariance_px2[own]
+        joint[e, seen], edge[e, seen] = np.asarray(tags.joint_px2)[own], tags.edge_sigma_px()[own]
     visible = np.isfinite(corners[..., 0, 0])
     # At a right angle, a corner shifts by √2 times the shift of its edges.
     variance = np.trace(covariance, axis1=-2, axis2=-1) + 2 * edge[..., None] ** 2
@@ -466,45 +467,22 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     independent = np.einsum("enij,enlj->nil", root, root)
     common = np.einsum("enij,fnlj->nil", root, root)
     merged = growth * (differing * independent + (1 - differing) * common) + layout.sigma_px**2 * np.eye(8)
-    names = names or [str(k + 1) for k in range(len(exposures))]
-    repeated = {tag for tags in exposures for tag in tags.repeated if tag in rows}
-    unknown = {tag for tags in exposures for tag in tags.tags if tag not in rows}
     return Merged(
         SeenTags(used, mean, merged, (weight_share.mean(2) * edge).sum(0)),
         tuple(int(n) for n in visible.sum(1)),
         share,
-        _shifts(corners, covariance, visible, names),
-        tuple(sorted(repeated)),
-        tuple(sorted(unknown)),
+        _shifts(corners, covariance, visible, names or [str(k + 1) for k in range(len(exposures))]),
+        tuple(sorted({tag for tags in exposures for tag in tags.repeated if tag in rows})),
+        tuple(sorted({tag for tags in exposures for tag in tags.tags if tag not in rows})),
     )
-
-
-def _stacked(exposures, places, used: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns corners (e, n, 4, 2), covariances of each and of a tag's four, σ of edges' common shift (e, n); NaN, 1
-    px², 0 if unseen."""
-    corners = np.full((len(exposures), len(used), 4, 2), np.nan)
-    edge = np.zeros(corners.shape[:2])
-    covariance = np.tile(np.eye(2), (len(exposures), len(used), 4, 1, 1))
-    joint = np.tile(np.eye(8), (len(exposures), len(used), 1, 1))
-    for e, (tags, place) in enumerate(zip(exposures, places, strict=True)):
-        visible = [k for k, row in enumerate(used) if row in place]
-        columns = [place[used[k]] for k in visible]
-        corners[e, visible] = tags.corners_px[columns]
-        covariance[e, visible] = tags.covariance_px2[columns]
-        joint[e, visible] = tags.joint_px2[columns]
-        edge[e, visible] = tags.edge_sigma_px()[columns]
-    return corners, covariance, joint, edge
 
 
 def _differing_share(corners, covariance, mean, there) -> float:
     """Returns the share of stated variance in differences between exposures, beside common shifts of a tag's edges."""
     difference = np.where(there[..., None, None], corners - mean, 0)
     direction = corners_by_edges(mean)
-    difference -= (
-        (difference * direction).sum((2, 3), keepdims=True)
-        / (direction * direction).sum((1, 2))[:, None, None]
-        * direction
-    )
+    along = (difference * direction).sum((2, 3)) / (direction * direction).sum((1, 2))
+    difference -= along[..., None, None] * direction
     square = np.einsum("enki,enkij,enkj->enk", difference, np.linalg.inv(covariance), difference)
     repeated = there.sum(0) > 1
     # Bounds the influence of a tag that one exposure gets wrong.
@@ -520,8 +498,7 @@ def _shifts(corners, covariance, there, names) -> tuple[Shift, ...]:
     variance = np.trace(covariance, axis1=-2, axis2=-1).mean(2) / 4
     shifts = []
     for place, e in enumerate(order):
-        others = [(int((there[e] & there[f]).sum()), f) for f in order[:place]]
-        common, f = max(others, default=(0, -1))
+        common, f = max(((int((there[e] & there[f]).sum()), f) for f in order[:place]), default=(0, -1))
         if common:
             both = there[e] & there[f]
             length = np.linalg.norm(middle[e, both] - middle[f, both], axis=1)

@@ -52,28 +52,13 @@ class Exposure:
     size: tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
-class Unreadable:
-    """An image that cannot be read; ``trouble`` says why."""
-
-    name: str
-    trouble: str
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneTags:
-    """The exposures of one scene."""
+    """The readable exposures of one scene; ``unreadable`` : why others could not be read."""
 
     name: str
-    exposures: tuple[Exposure | Unreadable, ...]
-
-    def readable(self) -> list[Exposure]:
-        """Returns the exposures whose image could be read."""
-        return [exposure for exposure in self.exposures if isinstance(exposure, Exposure)]
-
-    def unreadable(self) -> list[Unreadable]:
-        """Returns the exposures whose image could not be read."""
-        return [exposure for exposure in self.exposures if isinstance(exposure, Unreadable)]
+    exposures: tuple[Exposure, ...]
+    unreadable: tuple[str, ...] = ()
 
 
 CAPTURED = "capture.json"
@@ -150,26 +135,21 @@ def read_scenes(scenes: Sequence[SceneFiles], layout: TargetLayout, workers: int
     dictionaries = layout.dictionaries()
     with ThreadPoolExecutor(workers) as pool:
         for scene in scenes:
-            # Decoding stays in this thread, because it captures what the decoders write to standard error.
-            pending = [_begin(file, dictionaries, pool) for file in scene.files]
-            yield SceneTags(scene.name, tuple(finish() for finish in pending))
+            pending, unreadable = [], []
+            for file in scene.files:
+                # Decoding stays in this thread, because it captures what the decoders write to standard error.
+                try:
+                    image = grey_8bit(decode(file.read(), file.name))
+                except (InputError, OSError) as error:
+                    unreadable.append(" ".join(str(error).split()))
+                else:
+                    pending.append(pool.submit(detect, image, file.name, dictionaries))
+            yield SceneTags(scene.name, tuple(each.result() for each in pending), tuple(unreadable))
 
 
 def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposure:
     """Finds the tags of a decoded image."""
     return Exposure(name, find_tags(image, dictionaries), (image.shape[1], image.shape[0]))
-
-
-def _begin(
-    file: ImageFile, dictionaries: Sequence[str], pool: ThreadPoolExecutor
-) -> Callable[[], Exposure | Unreadable]:
-    """Starts the search for tags, and returns a function that waits for its result."""
-    try:
-        image = grey_8bit(decode(file.read(), file.name))
-    except (InputError, OSError) as error:
-        trouble = Unreadable(file.name, " ".join(str(error).split()))
-        return lambda: trouble
-    return pool.submit(detect, image, file.name, dictionaries).result
 
 
 class CapturedRow(Part):

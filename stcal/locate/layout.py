@@ -102,7 +102,7 @@ class TargetLayout(Brief):
     @classmethod
     def of(cls, layout: TagLayout, name: str = "") -> "TargetLayout":
         """Returns tags with known places as a target. The middle of the first tag is the origin of {obj}."""
-        corners = _in_obj(layout.corners_mm, 0)
+        corners = in_obj(layout.corners_mm, 0)
         covariance = layout.sigma_mm**2 * np.eye(corners.size)
         return cls(name, layout.tags, corners, covariance, 0, unusual_size=layout.unusual_size)
 
@@ -169,7 +169,7 @@ def load_layout(path: str | Path) -> TargetLayout:
         )
     corners, stated = plan.corners_mm, data.covariance()
     if stated is None:
-        corners = _in_obj(corners, plan.origin)
+        corners = in_obj(corners, plan.origin)
         covariance = data.sigma_mm**2 * np.eye(corners.size)
     else:  # without the negative eigenvalues that rounding makes of zeros
         value, vector = np.linalg.eigh(stated)
@@ -206,8 +206,7 @@ def square(size_mm: float) -> np.ndarray:
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square of any size to its
-    corners."""
+    """Returns rotation (2, 2) and translation (2,) into the middle of a tag, by fitting a square to its corners."""
     nominal = square(1.0)
     middle = corners.mean(0)
     along = np.sum((corners - middle) * nominal)
@@ -233,19 +232,20 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
         )
     corners = np.full((len(ids), 4, 2), np.nan)
     for row, tag in enumerate(data.tag):
-        place = tag.corners(where)
-        if place is not None:
-            if np.linalg.det(np.diff(place[:3], axis=0)) <= 0:
-                raise InputError(
-                    "E-TAG-CORNERS",
-                    f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
-                )
-            corners[row] = place
+        if (place := tag.corners(where)) is None:
+            continue
+        corners[row] = place
+        if np.linalg.det(np.diff(corners[row, :3], axis=0)) <= 0:
+            raise InputError(
+                "E-TAG-CORNERS",
+                f"{where}: tag {tag.id}: corners go round the wrong way; top left, top right, … needed",
+            )
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
     tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
     return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)
 
 
-def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
+def in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
+    """Returns corners (n, 4, 2) in the plane in the frame of the tag in row ``origin``."""
     turn, shift = obj_from_plane(corners[origin])
     return corners @ turn.T + shift

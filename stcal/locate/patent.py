@@ -169,45 +169,32 @@ def locate_as_patent(
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     most = most_tags(corners)
     chosen = largest_area(corners, most, options.area_share)
-    results = {i: PatentExposure(i, len(of_layout)) for i, of_layout in enumerate(listed)}
+    results = [PatentExposure(i, len(of_layout)) for i, of_layout in enumerate(listed)]
     for i in most:
         results[i] = replace(results[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
+    best: PatentPose | None = None
     for i in chosen:
         xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in listed[i]]].reshape(-1, 2)
         pixels = corners[i].reshape(-1, 2)
         try:
-            plane_poses = solve(xy, camera.normalised_from_pixel(pixels))
+            found = solve(xy, camera.normalised_from_pixel(pixels))
         except DegenerateError:
             continue
         (low, first), (high, second) = sorted(
-            ((reprojection_rms(pose, xy, pixels, camera), pose) for pose in plane_poses.poses), key=lambda each: each[0]
+            ((reprojection_rms(pose, xy, pixels, camera), pose) for pose in found.poses), key=lambda each: each[0]
         )
-        results[i] = replace(results[i], poses=(first, second), errors_px=(low, high), det_j=plane_poses.determinant)
-    solved = [
-        (result.errors_px, result.poses, result.det_j, i)
-        for i, result in results.items()
-        if result.errors_px is not None and result.poses is not None and result.det_j is not None
-    ]
-    if not solved:
+        results[i] = replace(results[i], poses=(first, second), errors_px=(low, high), det_j=found.determinant)
+        if best is None or low < best.errors_px[0]:
+            same = same_pose(first, second)
+            verdict = gate(found.determinant, low, high / max(low, TINY_PX), same, options)
+            pair, count = (first, second, (low, high)), len(listed[i])
+            best = PatentPose(i, tuple(chosen), *pair, found.determinant, count, verdict, same=same)
+    if best is None:
         raise DegenerateError(
             "E-LOCATE-NO-POSE",
             f"{where}: no pose explains the tags' corners in any exposure; check layout and camera file",
         )
-    errors, (first, second), det_j, i = min(solved, key=lambda solution: solution[0][0])
-    same = same_pose(first, second)
-    verdict = gate(det_j, errors[0], errors[1] / max(errors[0], TINY_PX), same, options)
-    return PatentPose(
-        exposure=i,
-        candidates=tuple(chosen),
-        camera_from_obj=first,
-        second=second,
-        errors_px=errors,
-        det_j=det_j,
-        tags=len(listed[i]),
-        verdict=verdict,
-        exposures=tuple(results.values()),
-        same=same,
-    )
+    return replace(best, exposures=tuple(results))
 
 
 def gate(det_j: float, error_px: float, error_ratio: float, same: bool, options: PatentOptions) -> Verdict:

@@ -13,11 +13,12 @@ from stcal.boards.tags import seen_otherwise
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
 from stcal.io.images import decode, grey_8bit, grey_of, size_fault
-from stcal.locate.estimate import Merged, ObjPose, Shift, locate, merge
-from stcal.locate.exposures import SceneFiles, SceneTags, detect, read_scenes
+from stcal.locate.estimate import Merged, ObjPose, locate, merge
+from stcal.locate.exposures import Exposure, SceneFiles, SceneTags, detect, read_scenes
 from stcal.locate.layout import TargetLayout
 from stcal.locate.patent import PatentOptions, PatentPose, locate_as_patent
 from stcal.locate.verdict import Verdict, VerdictOptions, judge, likely_mistake
@@ -90,6 +91,17 @@ class Located(Brief):
     def name(self) -> str:
         """Name of the scene."""
         return self.tags.name
+
+    @property
+    def exposures(self) -> tuple[Exposure, ...]:
+        """Readable exposures of the scene."""
+        return self.tags.exposures
+
+    @property
+    def camera_from_obj(self) -> Rigid | None:
+        """Pose of the target by the method that was asked for, mm; None if there is none."""
+        found = self.patent or self.pose
+        return found and found.camera_from_obj
 
 
 @require_arguments
@@ -173,140 +185,111 @@ def locate_scene(
 ) -> Located:
     """Locates the target in one scene and judges the pose."""
     options = options or LocateOptions()
-    notes = [f"left out: {exposure.trouble}" for exposure in scene.unreadable()]
-    used = scene.readable()
-    troubles = _size_troubles(scene, camera)
-    if troubles:
-        return Located(scene, None, None, _rejected(troubles), tuple(notes))
+    used, notes = scene.exposures, [f"left out: {trouble}" for trouble in scene.unreadable]
+
+    def rejected(merged: Merged | None, *reasons: str) -> Located:
+        return Located(scene, merged, None, Verdict("reject", (), reasons), tuple(notes))
+
+    if trouble := _size_trouble(scene, camera):
+        return rejected(None, trouble)
     merged = merge([exposure.tags for exposure in used], layout, [exposure.name for exposure in used])
-    notes += _notes(merged) + [
+    if merged.unknown:
+        notes.append(f"tags in view that the layout does not have: {_first_ids(merged.unknown)}")
+    notes += [
         f"{each.name}: motion during the exposure blurs edges by {each.tags.smear_px:.1f} px, which σ contain; "
         "camera and target at rest, or a shorter exposure"
         for each in used
         if each.tags.smear_px
     ]
-    troubles = _scene_troubles(merged, options)
-    if troubles:
-        return Located(scene, merged, None, _rejected(troubles), tuple(notes))
-    size = used[0].size
+    if trouble := _scene_trouble(merged, options):
+        return rejected(merged, trouble)
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
+
+    def mistakes(pose: ObjPose | None) -> list[str]:
+        try:
+            mistake = likely_mistake(merged.seen, layout, camera.sized(*used[0].size), prior, pose)
+        except StcalError:  # it is the camera's fault
+            return []
+        return [f"all tags would fit if {mistake}; correct the layout file"] if mistake else []
+
     try:
+        sized = camera.sized(*used[0].size)
         corners = merged.seen.corners_px
-        straight = corners - shift_by_curves(corners, camera.sized(*size))
+        straight = corners - shift_by_curves(corners, sized)
         merged = replace(merged, seen=replace(merged.seen, corners_px=straight))
         if options.method == "patent":
-            patent_pose = locate_as_patent(
-                [e.tags for e in used], layout, camera.sized(*size), options.patent, scene.name
-            )
-            return Located(scene, merged, None, patent_pose.verdict, tuple(notes), patent_pose)
-        pose = locate(merged.seen, layout, camera.sized(*size), prior, scene.name)
+            found = locate_as_patent([e.tags for e in used], layout, sized, options.patent, scene.name)
+            return Located(scene, merged, None, found.verdict, tuple(notes), found)
+        pose = locate(merged.seen, layout, sized, prior, scene.name)
     except StcalError as error:
-        reasons = [str(error).removeprefix(f"{scene.name}: "), *_mistakes(merged, layout, camera, size, prior, None)]
-        return Located(scene, merged, None, _rejected(reasons), tuple(notes))
-    mistakes = []
+        return rejected(merged, str(error).removeprefix(f"{scene.name}: "), *mistakes(None))
     if pose.outliers:
-        names = ", ".join(str(layout.tags[row][1]) for row in pose.outliers)
-        notes.append(f"tags that contradict the others, left out: {names}")
-        mistakes = _mistakes(merged, layout, camera, size, prior, pose)
+        notes.append(
+            f"tags that contradict the others, left out: {', '.join(str(layout.tags[r][1]) for r in pose.outliers)}"
+        )
+    explained = mistakes(pose) if pose.outliers else []
     pose, verdict = judge(pose, options.verdict)
-    if mistakes or verdict.decision == "reject":
-        mistakes = mistakes or _mistakes(merged, layout, camera, size, prior, pose)
-        verdict = replace(verdict, decision="reject" if mistakes else verdict.decision)
-        verdict = replace(verdict, reasons=(*verdict.reasons, *mistakes))
+    if verdict.decision == "reject":
+        explained = explained or mistakes(pose)
+    if explained:
+        verdict = replace(verdict, decision="reject", reasons=(*verdict.reasons, *explained))
     return Located(scene, merged, pose, verdict, tuple(notes))
 
 
-def _size_troubles(scene: SceneTags, camera: CameraModel) -> list[str]:
-    used = scene.readable()
+def _first_ids(tags: Sequence[tuple[str, int]]) -> str:
+    return ", ".join(str(tag) for _, tag in tags[:5]) + (", …" if len(tags) > 5 else "")
+
+
+def _size_trouble(scene: SceneTags, camera: CameraModel) -> str | None:
+    used = scene.exposures
     if not used:
-        return ["no readable image; 1 needed"]
+        return "no readable image; 1 needed"
     sizes = {exposure.size: exposure.name for exposure in reversed(used)}
     if len(sizes) > 1:
         shown = ", ".join(f"{name} {size[0]}×{size[1]}" for size, name in sorted(sizes.items()))
-        return [f"exposures of different sizes ({shown} px); one size needed, as the camera file's"]
+        return f"exposures of different sizes ({shown} px); one size needed, as the camera file's"
     width, height = used[0].size
     if (camera.width or width, camera.height or height) != (width, height):
-        return [
+        return (
             f"images of {width}×{height} px, the camera file is of {camera.width}×{camera.height} px; "
             "give the camera that took them"
-        ]
-    return []
+        )
+    return None
 
 
-def _scene_troubles(merged: Merged, options: LocateOptions) -> list[str]:
+def _scene_trouble(merged: Merged, options: LocateOptions) -> str | None:
     if merged.repeated:
         names = ", ".join(str(tag) for _, tag in merged.repeated)
-        return [f"tags seen twice: {names}; every id once in view needed; cover the copy"]
+        return f"tags seen twice: {names}; every id once in view needed; cover the copy"
     if not len(merged.seen):
-        return ["no tag of the layout; 1 needed"]
-    shifts_beyond_limit = [shift for shift in merged.shifts if moved(shift, options)]
+        return "no tag of the layout; 1 needed"
+    moved = [each for each in merged.shifts if each.shift_px > max(options.moved_px, MOVED_SIGMAS * each.sigma_px)]
+    if not moved:
+        return None
+    shift = max(moved, key=lambda shift: shift.shift_px)
+    further_pairs = f" (and between {len(moved) - 1} more pairs)" if len(moved) > 1 else ""
     return (
-        [_moved_text(max(shifts_beyond_limit, key=lambda shift: shift.shift_px), len(shifts_beyond_limit) - 1)]
-        if shifts_beyond_limit
-        else []
+        f"the scene moved between {shift.exposures[0]} and {shift.exposures[1]}: {shift.tags} tags by "
+        f"{shift.shift_px:.2f} px{further_pairs}; take the exposures with camera and target at rest"
     )
-
-
-def moved(shift: Shift, options: LocateOptions) -> bool:
-    """True if the scene moved between two exposures."""
-    return shift.shift_px > max(options.moved_px, MOVED_SIGMAS * shift.sigma_px)
-
-
-def _moved_text(shift: Shift, others: int) -> str:
-    first, second = shift.exposures
-    further_pairs = f" (and between {others} more pairs)" if others else ""
-    return (
-        f"the scene moved between {first} and {second}: {shift.tags} tags by {shift.shift_px:.2f} px{further_pairs}; "
-        "take the exposures with camera and target at rest"
-    )
-
-
-def _notes(merged: Merged) -> list[str]:
-    if not merged.unknown:
-        return []
-    names = ", ".join(str(tag) for _, tag in merged.unknown[:5]) + (", …" if len(merged.unknown) > 5 else "")
-    return [f"tags in view that the layout does not have: {names}"]
-
-
-def _mistakes(
-    merged: Merged,
-    layout: TargetLayout,
-    camera: CameraModel,
-    size: tuple[int, int],
-    prior: CameraPrior | None,
-    pose: ObjPose | None,
-) -> list[str]:
-    """Returns the likely mistake in the layout as a reason of a verdict, or no reason."""
-    try:
-        mistake = likely_mistake(merged.seen, layout, camera.sized(*size), prior, pose)
-    except StcalError:  # it is the camera's fault
-        return []
-    return [f"all tags would fit if {mistake}; correct the layout file"] if mistake else []
-
-
-def _rejected(reasons: Sequence[str]) -> Verdict:
-    return Verdict("reject", (), tuple(reasons))
 
 
 def _named(located: Located, layout: TargetLayout, image: Callable[[], np.ndarray]) -> Located:
-    """Returns the result; if no tag is seen, with the reason. ``image`` : returns one of the scene's grey images."""
-    if located.merged is None or sum(located.merged.counts):
+    """Returns the result; if no tag is seen, with the reason: tags in view may be of another dictionary. ``image`` :
+    returns one of the scene's grey images."""
+    merged = located.merged
+    if merged is None or sum(merged.counts):
         return located
-    return replace(located, verdict=_rejected([_why_no_tag(located, located.merged, image(), layout)]))
+    if merged.unknown:
+        names = _first_ids(merged.unknown)
+        reason = f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
+    else:
+        reason = f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed"
+        if shown := seen_otherwise(image(), layout.rows(), "the layout file"):
+            reason = f"{reason}, and {located.exposures[0].name} shows {shown}"
+    return replace(located, verdict=Verdict("reject", (), (reason,)))
 
 
 def _first_image(tags: SceneTags, files: SceneFiles) -> np.ndarray:
-    used = {exposure.name for exposure in tags.readable()}
-    file = next(file for file in files.files if file.name in used)
+    file = next(file for file in files.files if file.name == tags.exposures[0].name)
     return decode(file.read(), file.name)
-
-
-def _why_no_tag(located: Located, merged: Merged, image: np.ndarray, layout: TargetLayout) -> str:
-    """Returns why no tag of the layout is seen; the tags in view may be of another dictionary."""
-    dictionaries = layout.dictionaries()
-    if merged.unknown:
-        names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
-        return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
-    reason = f"no tag of {', '.join(dictionaries)}; 1 of the layout needed"
-    shown = seen_otherwise(image, layout.rows(), "the layout file")
-    return f"{reason}, and {located.tags.readable()[0].name} shows {shown}" if shown else reason

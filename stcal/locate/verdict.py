@@ -1,14 +1,14 @@
 """Verdict on a pose, each value with its limit, and accept, ambiguous or reject; and the mistake in a layout that would
 explain why it fits badly."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from scipy.stats import chi2 as chi_square
 
-from stcal.errors import InputError, StcalError
+from stcal.errors import InputError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import deciding_delta
@@ -130,17 +130,14 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
     ]
     if options.max_sigma_mm is not None:
         checks.append(PoseCheck("sigma of position", pose.sigma_mm(), at_most=options.max_sigma_mm, unit=" mm"))
-    failed = [check.text() for check in checks if not check.passed]
+    failed = tuple(check.text() for check in checks if not check.passed)
     needed_delta = deciding_delta(options.flip_odds, options.sigma_margin, pose.chi2_per_redundancy())
-    ambiguity = PoseCheck("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta)
-    clear = ambiguity.passed or apart_deg <= options.equal_deg
-    checks.append(ambiguity)
+    checks.append(PoseCheck("delta chi2 of the other pose", pose.delta_chi2, at_least=needed_delta))
     if failed:
-        return pose, Verdict("reject", tuple(checks), tuple(failed))
-    if clear:
+        return pose, Verdict("reject", tuple(checks), failed)
+    if checks[-1].passed or apart_deg <= options.equal_deg:
         return pose, Verdict("accept", tuple(checks), ())
-    reason = f"two poses {apart_deg:.1f}° apart: {ambiguity.text()}"
-    return pose, Verdict("ambiguous", tuple(checks), (reason,))
+    return pose, Verdict("ambiguous", tuple(checks), (f"two poses {apart_deg:.1f}° apart: {checks[-1].text()}",))
 
 
 LEAST_TAGS = 2
@@ -165,24 +162,21 @@ PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs o
 def likely_mistake(
     detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
-    """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by the layout as it
-    is."""
+    """Returns the mistake in a layout whose correction makes all tags fit, or None; ``pose`` : by it as it is."""
     if len(detected) < LEAST_TAGS:
         return None
     side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()
     allowed = FITS * float(side)
     if pose is not None:
         allowed = min(allowed, _misfit_px(detected, layout, camera, pose) / BETTER)
-    fitting = []
-    for reason, variant in _variants(layout):
-        try:
-            misfit = _misfit_px(detected, variant, camera, locate(detected, variant, camera, prior))
-        except StcalError:  # this layout does not fit either
-            continue
-        if misfit < allowed:
-            fitting.append((misfit, reason))
-    best = min((misfit for misfit, _ in fitting), default=0.0)
-    return next((reason for misfit, reason in fitting if misfit <= ALIKE * best), None)
+
+    def misfit(corners_mm: np.ndarray) -> float:
+        variant = replace(layout, corners_mm=corners_mm)
+        return _misfit_px(detected, variant, camera, locate(detected, variant, camera, prior))
+
+    candidates = _mistakes(layout.corners_mm)
+    found = [candidate for candidate, _ in explain(candidates, misfit, allowed, ALIKE)]
+    return next((each.words for each in candidates if each in found), None)
 
 
 def _misfit_px(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: ObjPose) -> float:
@@ -195,16 +189,14 @@ def _misfit_px(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: O
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def _variants(layout: TargetLayout) -> Iterator[tuple[str, TargetLayout]]:
-    """Yields each mistake with the layout as it would be without it."""
-    corners = layout.corners_mm
-    for turns, reason in TURNS.items():
-        yield reason, replace(layout, corners_mm=np.roll(corners, -turns, axis=1))
+def _mistakes(corners: np.ndarray) -> list[Candidate]:
+    """Returns each mistake with the corners as they would be without it, the simplest first."""
     down = np.array([1.0, -1.0])
     # A mirrored tag has its upper corners where the lower ones were.
     mirrored = (corners * down)[:, [3, 2, 1, 0]]
     middles = corners.mean(axis=1, keepdims=True)
     moved = corners - middles + middles * down
-    for reason, other in ((MIRRORED, mirrored), (PLACES_MIRRORED, moved)):
-        yield reason, replace(layout, corners_mm=other)
-        yield f"{reason} and {TURNS[2]}", replace(layout, corners_mm=np.roll(other, 2, axis=1))
+    found = [(words, np.roll(corners, -turns, axis=1)) for turns, words in TURNS.items()]
+    for words, other in ((MIRRORED, mirrored), (PLACES_MIRRORED, moved)):
+        found += [(words, other), (f"{words} and {TURNS[2]}", np.roll(other, 2, axis=1))]
+    return [Candidate(words, lambda other=other: other) for words, other in found]

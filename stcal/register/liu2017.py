@@ -58,33 +58,22 @@ class Liu2017Options:
 
     def __post_init__(self):
         require_fields(self, "liu2017")
-        if self.sample < 4:
-            raise InputError(
-                "E-LIU-OPTIONS", f"liu2017: samples of {self.sample} points, 4 or more needed for twelve parameters"
-            )
-        if not 0 < self.share <= 1:
-            raise InputError(
-                "E-LIU-OPTIONS", f"liu2017: share {self.share:g} of inliers; more than 0 and at most 1 needed"
-            )
-        for name in ("limit_mm", "orthogonal_within", "tries"):
-            if not getattr(self, name) > 0:
-                raise InputError(
-                    "E-LIU-OPTIONS", f"liu2017: {name} is {getattr(self, name):g}; a positive number needed"
-                )
+        needed = {
+            "sample": (self.sample >= 4, "4 or more points for twelve parameters"),
+            "share": (0 < self.share <= 1, "more than 0 and at most 1"),
+        }
+        needed |= {
+            name: (getattr(self, name) > 0, "a positive number") for name in ("limit_mm", "orthogonal_within", "tries")
+        }
+        for name, (fits, words) in needed.items():
+            if not fits:
+                raise InputError("E-LIU-OPTIONS", f"liu2017: {name} is {getattr(self, name):g}; {words} needed")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Liu2017Result:
-    """Result of the method.
-
-    Parameters
-    ----------
-    b_from_a : affine
-    sample : (N,) rows of the best sample
-    inliers : (n,) points within the limit, including those of the sample
-    acceptable : number of acceptable samples
-    shares : (tries,) share of inliers outside each sample, NaN if the sample was screened out
-    """
+    """``sample`` : (N,) rows of the best one; ``inliers`` : (n,) points within the limit, those of the sample too;
+    ``acceptable`` : number of samples; ``shares`` : (tries,) of inliers outside each sample, NaN if screened out."""
 
     b_from_a: Affine
     sample: np.ndarray
@@ -110,15 +99,14 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
         )
     best, least, acceptable = None, np.inf, 0
     shares = np.full(options.tries, np.nan)
-    for i, (sample, b_from_a, error, outside) in _orthogonal_samples(xyz_a, xyz_b, options, seed):
-        near = error < options.limit_mm
-        shares[i] = near[outside].mean()
-        if shares[i] <= options.share:
-            continue
-        acceptable += 1
-        variance = float(error[outside & near].var())
-        if variance < least:
-            least, best = variance, (b_from_a, np.sort(sample), near)
+    for i, sample, b_from_a, error in _orthogonal_samples(xyz_a, xyz_b, options, seed):
+        near, others = error < options.limit_mm, np.delete(error, sample)
+        inside = others[others < options.limit_mm]
+        shares[i] = len(inside) / len(others)
+        if shares[i] > options.share:
+            acceptable += 1
+            if inside.var() < least:
+                least, best = inside.var(), (b_from_a, np.sort(sample), near)
     if best is None:
         tried = shares[np.isfinite(shares)]
         most = f"at most {100 * tried.max():.0f} %" if len(tried) else "none had an orthogonal 3×3 part"
@@ -132,16 +120,13 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
 
 
 def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int):
-    """Yields the tries whose 3×3 part is orthogonal enough: number, sample, transform, errors (n,), mask outside the
-    sample."""
+    """Yields the tries whose 3×3 part is orthogonal enough: number, sample, transform, and errors (n,)."""
     rng, count = np.random.default_rng(seed), len(xyz_a)
     for i in range(options.tries):
         sample = rng.choice(count, options.sample, replace=False)
         b_from_a = affine_least_squares(xyz_a[sample], xyz_b[sample])
         if np.abs(b_from_a.linear.T @ b_from_a.linear - np.eye(3)).max() <= options.orthogonal_within:
-            outside = np.ones(count, bool)
-            outside[sample] = False
-            yield i, (sample, b_from_a, np.linalg.norm(xyz_b - b_from_a @ xyz_a, axis=1), outside)
+            yield i, sample, b_from_a, np.linalg.norm(xyz_b - b_from_a @ xyz_a, axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,12 +149,8 @@ def sample_sizes(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, 
     for points in SIZES:
         if points < len(xyz_a):
             swept = replace(options, sample=points, tries=min(options.tries, SWEEP_TRIES))
-            shares = np.array(
-                [
-                    (error < swept.limit_mm)[outside].mean()
-                    for _, (_, _, error, outside) in _orthogonal_samples(xyz_a, xyz_b, swept, seed)
-                ]
-            )
+            samples = _orthogonal_samples(xyz_a, xyz_b, swept, seed)
+            shares = np.array([(np.delete(error, own) < swept.limit_mm).mean() for _, own, _, error in samples])
             best, median = (float(shares.max()), float(np.median(shares))) if len(shares) else (np.nan, np.nan)
             sizes.append(SampleSize(points, best, median, len(shares), int((shares > swept.share).sum()), swept.tries))
     return sizes

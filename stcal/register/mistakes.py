@@ -1,8 +1,9 @@
 """Mistakes that the data show: units, mirrored axes, exchanged rows, scale, correlated residuals of neighbours, and two
 groups of points that were shifted against each other."""
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -10,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc, chdtrc, gammaln, ndtr
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError, StcalError
-from stcal.geometry.rigid import Affine, Rigid, Similarity, best_rotations
+from stcal.explain import Candidate, explain
+from stcal.geometry.rigid import Affine, Rigid, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register.models import MODELS, Model, Transform, jacobian, parts, unit_covariance, whitened
-from stcal.register.pairs import Problem
+from stcal.register.pairs import Problem, some_of
 from stcal.register.result import Registration
 from stcal.register.robust import BY_CHANCE, FALSE_ALARMS, by_share, chernoff, search
 from stcal.row_order import Change, change_along
@@ -31,10 +33,21 @@ MIRROR_CHANCE = 1e-4
 """Probability of calling right frames mirrored if the points had thickness only by noise."""
 NAMED_BELOW_RAD = np.radians(15)
 """Largest remaining turn of the frames with which a change of sign or exchange of axes is named as the likely cause."""
-SHOWN = 5
-"""Number of rows that a note names."""
 LOOKED_AT = 10_000
 """Largest number of outliers that are examined. More would show the same mistakes."""
+
+
+def mistaken_unit(ratio: float) -> str | None:
+    """Returns the unit that a ratio of lengths in b to those in a suggests, in words, or None."""
+    candidates = [
+        Candidate(
+            f"is {side} in {name} (columns {', '.join(f'{side}{x}_{suffix}' for x in 'xyz')})?", partial(float, by)
+        )
+        for factor, (name, suffix) in UNITS.items()
+        for side, by in (("a", factor), ("b", 1 / factor))
+    ]
+    found = explain(candidates, lambda by: abs(ratio / by - 1), UNIT_WITHIN)
+    return found[0][0].words if found else None
 
 
 def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
@@ -46,15 +59,13 @@ def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
     if not apart.any():
         return
     ratio = float(np.median(in_b[apart] / in_a[apart]))
-    for factor, (name, suffix) in UNITS.items():
-        for by, small, large in ((factor, "a", "b"), (1 / factor, "b", "a")):
-            if abs(ratio / by - 1) < UNIT_WITHIN:
-                raise InputError(
-                    "E-REGISTER-UNITS",
-                    f"registration: distances in {large} are {max(ratio, 1 / ratio):.4g} times those in {small} "
-                    f"(median); is {small} in {name} (columns {small}x_{suffix}, {small}y_{suffix}, "
-                    f"{small}z_{suffix})?",
-                )
+    if words := mistaken_unit(ratio):
+        small, large = "ab" if ratio > 1 else "ba"
+        times = max(ratio, 1 / ratio)
+        raise InputError(
+            "E-REGISTER-UNITS",
+            f"registration: distances in {large} are {times:.4g} times those in {small} (median); {words}",
+        )
 
 
 def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[float, np.ndarray]:
@@ -81,17 +92,19 @@ def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
 
 def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float) -> InputError:
     """Returns the error for mirrored data. ``reflection`` : (3, 3), b from a, determinant −1."""
-    axes = "xyz"
-    mends = {f"the sign of a{axis}": np.diag([-1.0 if axis == other else 1.0 for other in axes]) for axis in axes}
-    for i, j in ((0, 1), (1, 2), (0, 2)):
-        swap = np.eye(3)
-        swap[[i, j]] = swap[[j, i]]
-        mends[f"a{axes[i]} and a{axes[j]} with each other"] = swap
-    turns = {mend: Rotation.from_matrix(reflection @ m).magnitude() for mend, m in mends.items()}
-    least = min(turns, key=turns.__getitem__)
+    candidates = [
+        Candidate(f"the sign of a{axis}", lambda k=k: np.diag(np.where(np.arange(3) == k, -1.0, 1.0)))
+        for k, axis in enumerate("xyz")
+    ]
+    candidates += [
+        Candidate(f"a{'xyz'[i]} and a{'xyz'[j]} with each other", lambda order=order: np.eye(3)[order])
+        for i, j, order in ((0, 1, [1, 0, 2]), (1, 2, [0, 2, 1]), (0, 2, [2, 1, 0]))
+    ]
+    found = explain(candidates, lambda mend: Rotation.from_matrix(reflection @ mend).magnitude(), NAMED_BELOW_RAD)
     advice = "change the sign of one axis of a or of b"
-    if turns[least] < NAMED_BELOW_RAD:
-        advice = f"change {least}: the frames are then turned by only {np.degrees(turns[least]):.1f}°"
+    if found:
+        (mend, turn), *_ = found
+        advice = f"change {mend.words}: the frames are then turned by only {np.degrees(turn):.1f}°"
     return InputError(
         "E-REGISTER-MIRRORED",
         f"registration: one of the frames is left-handed: mirrored, {agree} of {count} point pairs fit {times:.3g} "
@@ -99,40 +112,28 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
     )
 
 
-def outlier_notes(result: Registration, problem: Problem, name: Callable[[int], str]) -> list[str]:
-    """Returns notes on outliers that a slip explains: exchanged rows, or another unit."""
+def outlier_notes(result: Registration, problem: Problem) -> Iterator[str]:
+    """Yields notes on outliers that a slip explains: exchanged rows, or another unit."""
     rows, reach = np.flatnonzero(~result.inliers)[:LOOKED_AT], result.threshold_mm
     if not len(rows) or reach is None:
-        return []
-    xyz_a, xyz_b, transform = problem.xyz_a, problem.xyz_b, result.b_from_a
-    notes = []
-    mapped = transform @ xyz_a[rows]
-    distance, nearest = (np.asarray(each) for each in KDTree(mapped).query(xyz_b[rows]))
+        return
+    a, b, transform = problem.xyz_a[rows], problem.xyz_b[rows], result.b_from_a
+    mapped = transform @ a
+    distance, nearest = (np.asarray(each) for each in KDTree(mapped).query(b))
     swapped = np.flatnonzero((distance <= reach) & (nearest != np.arange(len(rows))))
     taken = np.minimum(1, 2 * reach / np.maximum(np.ptp(mapped, axis=0), 1e-300)).prod()
     by_chance = bdtrc(len(swapped) - 1, len(rows), 1 - (1 - taken) ** (len(rows) - 1))
     if len(swapped) and by_chance < BY_CHANCE:
-        exchanged = [(int(rows[i]), int(rows[nearest[i]])) for i in swapped[:SHOWN]]
-        shown = ", ".join(f"{name(i)} is the point of {name(j)}" for i, j in exchanged)
-        notes.append(f"rows exchanged: b of {shown}{_more(len(swapped))}; correct the order")
+        names = some_of(swapped, lambda i: f"{problem.name(rows[i])} is the point of {problem.name(rows[nearest[i]])}")
+        yield f"rows exchanged: b of {names}; correct the order"
     linear, translation = parts(transform)
     back = np.linalg.inv(linear)
     for factor in [f for unit in UNITS for f in (unit, 1 / unit)]:
-        tries = {
-            "a": xyz_b[rows] - transform @ (xyz_a[rows] * factor),
-            "b": (xyz_b[rows] * factor - translation) @ back.T - xyz_a[rows],
-        }
-        for side, residual in tries.items():
-            fits = np.flatnonzero(np.linalg.norm(residual, axis=1) <= reach)
+        of_b = (b * factor - translation) @ back.T - a
+        for side, residual in (("a", b - transform @ (a * factor)), ("b", of_b)):
+            fits = rows[np.linalg.norm(residual, axis=1) <= reach]
             if len(fits):
-                shown = ", ".join(name(int(rows[i])) for i in fits[:SHOWN])
-                shown += _more(len(fits))
-                notes.append(f"another unit: {side} of {shown} fits when multiplied by {factor:.6g}; correct it")
-    return notes
-
-
-def _more(count: int) -> str:
-    return f" (and {count - SHOWN} more)" if count > SHOWN else ""
+                yield f"another unit: {side} of {problem.names(fits)} fits when multiplied by {factor:.6g}; correct it"
 
 
 SCALE_BY_CHANCE = 1e-4
@@ -165,7 +166,7 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
             fitted = candidate.fit()
         except StcalError:  # coplanar points have no affine transform
             break
-        before, after = _square(*narrow), _square(candidate, fitted)
+        before, after = (float(p.squares(t).sum()) for p, t in (narrow, (candidate, fitted)))
         extra, redundancy = model.parameters - narrow[0].model.parameters, candidate.redundancy
         rounding = 3 * len(problem) * problem.rounding_mm() ** 2
         gain = (before - after) / extra / max(after / redundancy, rounding / redundancy)
@@ -177,29 +178,25 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
     return best
 
 
-def _square(problem: Problem, transform: Transform) -> float:
-    return float(problem.squares(transform).sum())
-
-
 def _said(problem: Problem, transform: Transform, sigma_mm: float) -> str:
     """Returns a text on the ratio of lengths in b to those in a, the likely cause, and the remedy."""
-    covariance = sigma_mm**2 * unit_covariance(problem.model, transform, problem.xyz_a, problem.noise.precision)
-    if isinstance(transform, Similarity):
-        scale, sigma = transform.scale, transform.scale * float(np.sqrt(covariance[6, 6]))
-        off, digits = scale - 1, max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
-        cause = "a length standard, a board or an instrument of another scale"
-        if abs(off) < THERMAL:
-            cause = f"{1e6 * abs(off):.0f} ppm, of temperature (steel 11.5, aluminium 23 ppm/K) or a length standard"
+    if isinstance(transform, Affine):
+        scales = np.linalg.svd(transform.linear, compute_uv=False)
         return (
-            f"lengths in b are {scale:.{digits}f} ± {sigma:.{digits}f} times those in a: {cause}; correct one "
-            "of the files, or use --model similarity"
+            f"lengths in b are {', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of "
+            "one instrument is scaled or not square to the others, or an arm bends; correct it, or use --model affine "
+            "within these points"
         )
-    assert isinstance(transform, Affine)
-    scales = np.linalg.svd(transform.linear, compute_uv=False)
+    covariance = sigma_mm**2 * unit_covariance(problem.model, transform, problem.xyz_a, problem.noise.precision)
+    scale = float(np.cbrt(np.linalg.det(parts(transform)[0])))
+    sigma = scale * float(np.sqrt(covariance[6, 6]))
+    digits = max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
+    cause = "a length standard, a board or an instrument of another scale"
+    if abs(scale - 1) < THERMAL:
+        cause = f"{1e6 * abs(scale - 1):.0f} ppm, of temperature (steel 11.5, aluminium 23 ppm/K) or a length standard"
     return (
-        f"lengths in b are {', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one "
-        "instrument is scaled or not square to the others, or an arm bends; correct it, or use --model affine within "
-        "these points"
+        f"lengths in b are {scale:.{digits}f} ± {sigma:.{digits}f} times those in a: {cause}; correct one of the "
+        "files, or use --model similarity"
     )
 
 
@@ -212,8 +209,7 @@ BY_NEIGHBOURS = 1e-4
 
 
 def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
-    """Returns whether residuals (n, 3) correlate with those of their nearest neighbours beyond chance: the sum of
-    products r · r' has the variance Σ (r · r')²."""
+    """Returns whether residuals (n, 3) correlate with those of their nearest neighbours beyond chance."""
     rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
     xyz, r = xyz_a[rows], residuals[rows]
     if len(xyz) < FEWEST_NEIGHBOURS:
@@ -221,7 +217,7 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
     nearest = np.asarray(KDTree(xyz).query(xyz, k=2)[1])[:, 1]
     pairs = np.column_stack([np.arange(len(xyz)), nearest])
     one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
-    product = np.einsum("ni,ni->n", r[one], r[two])
+    product = np.einsum("ni,ni->n", r[one], r[two])  # the variance of their sum is the sum of their squares
     return bool(ndtr(-product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
 
 
@@ -253,16 +249,17 @@ def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
     return None if all(alike) else change
 
 
-def order_note(change: Change, name: Callable[[int], str]) -> str:
+def order_note(change: Change, problem: Problem) -> str:
     """Returns one line on a change along the order of the rows."""
     size = f"{np.linalg.norm(change.motion[3:]):.3g} mm and {np.degrees(np.linalg.norm(change.motion[:3])):.2g}°"
     share = f"{change.share:.0%} of the squared residuals, p {'< 0.001' if change.p < 1e-3 else f'= {change.p:.2g}'}"
     if change.kind == "drift":
         return f"one frame drifts against the other along the rows, by {size} from the first to the last ({share})"
-    likely = f" ({name(change.first)} to {name(change.last)} as likely)" if change.first < change.last else ""
+    first, row, last = (problem.name(row) for row in (change.first, change.row, change.last))
+    likely = f" ({first} to {last} as likely)" if first != last else ""
     return (
-        f"from {name(change.row)} on{likely} an instrument stands elsewhere, by {size} ({share}): register the rows "
-        "before it, and those from it on, separately"
+        f"from {row} on{likely} an instrument stands elsewhere, by {size} ({share}): register the rows before it, and "
+        "those from it on, separately"
     )
 
 
@@ -273,28 +270,17 @@ MAX_ROUNDS = 30
 FEW = 16
 """Largest number of points for which square sums replace determinants (see above)."""
 SPHERICAL = 0.1
-"""Significance level of anisotropic noise. It detects half of the sets of 16 points whose noise is three times as
-large along one axis; in the other sets the effect is too weak to mislead."""
+"""Significance level of anisotropic noise: half of the sets of 16 points with three times the noise along one axis."""
 TOGETHER = 0.01
 """Probability that scattered groups seem to lie together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groups:
-    """``transforms`` : of the larger group and the other; ``in_space`` : whether the place determines the group: a bent
-    frame."""
+    """``transforms`` : of the larger group and the other; ``in_space`` : the place determines the group."""
 
     transforms: tuple[Transform, Transform]
     in_space: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Assignment:
-    """``first`` : (n,) mask of the first of two groups; ``total`` : square sum of both fits."""
-
-    first: np.ndarray
-    transforms: tuple[Transform, Transform]
-    total: float
 
 
 def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
@@ -311,13 +297,11 @@ def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
         return None
     if assigned is None or np.abs(single).max() <= points.rounding_mm():
         return None
-    first, (one, two) = assigned.first, assigned.transforms
+    first, (one, two) = assigned
     parted = np.where(first[:, None], points.whitened(one), points.whitened(two))
     if (n - 1) * np.log(2) + _log_chance(model, single, parted) > np.log(FALSE_ALARMS):
         return None
-    if first.sum() < n / 2:
-        return Groups((two, one), lies_together(points.xyz_a, ~first))
-    return Groups((one, two), lies_together(points.xyz_a, first))
+    return Groups((two, one) if first.sum() < n / 2 else (one, two), lies_together(points.xyz_a, first))
 
 
 def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
@@ -358,31 +342,27 @@ def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
     return bool(bdtrc(same - 1, len(group), share**2 + (1 - share) ** 2) < TOGETHER)
 
 
-def _assigned(problem: Problem, rng: np.random.Generator) -> _Assignment | None:
-    """Returns both groups, or None if one becomes too small."""
+def _assigned(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, tuple[Transform, Transform]] | None:
+    """Returns the mask (n,) of one group, and the transforms of both; None if one becomes too small."""
     model, n = problem.model, len(problem)
     core = search(problem, by_share(model, n), rng)
-    if core is None:
-        return None
-    others = np.flatnonzero(~core.inliers)
-    if len(others) <= model.sample:
-        return None
-    inner = search(problem[others], by_share(model, len(others)), rng)
-    if inner is None:
+    others = np.flatnonzero(~core.inliers) if core else np.zeros(0, int)
+    inner = search(problem[others], by_share(model, len(others)), rng) if len(others) > model.sample else None
+    if core is None or inner is None:
         return None
     first, second = core.inliers, np.isin(np.arange(n), others[inner.inliers])
-    best = None
+    best, least = None, np.inf
     for _ in range(MAX_ROUNDS):
         if min(first.sum(), second.sum()) <= model.sample:
             break
         transforms = problem[first].fit(), problem[second].fit()
         apart = np.array([problem.squares(t) for t in transforms])
         total = apart.min(0).sum()
-        if best is not None and total >= best.total:
+        if total >= least:
             break
         first = apart[0] <= apart[1]
         second = ~first
-        best = _Assignment(first, transforms, total)
+        best, least = (first, transforms), total
     return best
 
 
@@ -397,17 +377,12 @@ NARROWEST = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shifted:
-    """``rows`` : (m,) of the smaller group of ``count`` points; ``by_mm`` : (3,) its shift, frame b; ``together`` : in
-    space."""
+    """``rows`` : (m,) of the smaller group of ``count`` points; ``by_mm`` : (3,) its shift, frame b."""
 
     rows: np.ndarray
     count: int
     by_mm: np.ndarray
     together: bool
-
-    def off_mm(self) -> np.ndarray:
-        """Returns the deviation (3,) of the transform from that of the smaller group, if the smaller group is right."""
-        return (1 - len(self.rows) / self.count) * self.by_mm
 
 
 def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
@@ -427,7 +402,8 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
     best = _clear(unit, axes)
     if best is None or neighbours_alike(problem.xyz_a, problem.residuals(transform)):
         return None
-    second = (residuals - middle) @ to_unit @ best.axis < best.border
+    _, axis, border = best
+    second = (residuals - middle) @ to_unit @ axis < border
     if second.sum() > count / 2:
         second = ~second
     plain = problem.residuals(transform)
@@ -435,26 +411,20 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
     return Shifted(np.flatnonzero(second), count, by_mm, lies_together(problem.xyz_a, second))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Parted:
-    """``gain`` : of log likelihood by two groups; ``axis`` : of the shift; ``border`` : between them along it."""
-
-    gain: float
-    axis: np.ndarray
-    border: float
+Parted = tuple[float, np.ndarray, float]
+"""Gain of log likelihood by two groups, the axis of their shift, and the border between them along it."""
 
 
-def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
-    """Divides residuals (n, 3) of unit scatter into two groups, or None by chance; ``axes`` : principal, longest
-    last."""
-    best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found.gain)
-    across = unit - (unit @ best.axis)[:, None] * best.axis
-    rest = max(_parted(across, axis).gain for axis in _by_kurtosis(across).T[1:])
-    if best.gain - max(rest, 0.0) > NEEDED:
+def _clear(unit: np.ndarray, axes: np.ndarray) -> Parted | None:
+    """Divides residuals (n, 3) of unit scatter into two groups, or None; ``axes`` : principal, longest last."""
+    best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found[0])
+    across = unit - (unit @ best[1])[:, None] * best[1]
+    rest = max(_parted(across, axis)[0] for axis in _by_kurtosis(across).T[1:])
+    if best[0] - max(rest, 0.0) > NEEDED:
         return best
-    *others, longest = (_parted(unit @ axis[:, None], np.ones(1)) for axis in axes.T)
-    if longest.gain - max(0.0, *(each.gain for each in others)) > ALONG:
-        return replace(longest, axis=longest.axis[0] * axes[:, 2])
+    *others, (gain, sign, border) = (_parted(unit @ axis[:, None], np.ones(1)) for axis in axes.T)
+    if gain - max(0.0, *(each[0] for each in others)) > ALONG:
+        return gain, sign[0] * axes[:, 2], border
     return None
 
 
@@ -463,7 +433,7 @@ def _by_kurtosis(unit: np.ndarray) -> np.ndarray:
     return np.linalg.eigh((unit * (unit**2).sum(1)[:, None]).T @ unit)[1]
 
 
-def _parted(unit: np.ndarray, axis: np.ndarray) -> _Parted:
+def _parted(unit: np.ndarray, axis: np.ndarray) -> Parted:
     """Divides residuals (n, d) of unit scatter into two groups, starting from the median along ``axis``."""
     along = unit @ axis
     first = (along > np.median(along)).astype(float)
@@ -481,4 +451,4 @@ def _parted(unit: np.ndarray, axis: np.ndarray) -> _Parted:
         first = np.exp(one - both)
     gain = float((both + along**2 / 2).sum() - len(unit) / 2 * np.log(narrow))
     border = (high + low) / 2 - narrow / apart * np.log(share / (1 - share))
-    return _Parted(gain, axis, float(border))
+    return gain, axis, float(border)

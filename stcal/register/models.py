@@ -23,11 +23,6 @@ from stcal.geometry.rigid import (
 
 Transform = Rigid | Similarity | Affine
 
-EXACT = 1e-11
-"""Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
-CHUNK = 100_000
-"""Number of points processed at once if a Jacobian of every point is held."""
-
 
 @dataclass(frozen=True, slots=True)
 class Model:
@@ -65,19 +60,22 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     ``precision`` : (n,) weights, or (n, 3, 3) inverse covariances in frame b. Raises DegenerateError: too few points,
     collinear ones, or coplanar ones for the affine model. Raises ConvergenceError: no minimum is reached.
     """
-    weights = precision
-    if precision is not None and precision.ndim == 3:
-        weights = np.trace(precision, axis1=1, axis2=2)
+    weights = precision if precision is None or precision.ndim == 1 else np.trace(precision, axis1=1, axis2=2)
     closed = {"rigid": align_rigid, "similarity": align_similarity, "affine": align_affine}[model.name]
     start = closed(xyz_b, xyz_a, weights)
     if precision is None or weights is None or precision.ndim == 1:
         return start
     origin = weights @ xyz_a / weights.sum()
-    fitted = minimise(
-        start,
-        lambda transform: _about(model, transform, origin, xyz_a, precision, xyz_b),
-        lambda transform, step: _moved(transform, origin, step),
-    )
+
+    def equations(transform: Transform) -> NormalEquations:
+        residual = xyz_b - transform @ xyz_a
+        pull = np.einsum("nr,nk->rk", np.einsum("nrs,ns->nr", precision, residual), _homogeneous(xyz_a - origin))
+        gradient = -_motions(model, transform).T @ pull.ravel()
+        return NormalEquations(
+            float(squares(residual, precision).sum()), _normal(model, transform, xyz_a - origin, precision), gradient
+        )
+
+    fitted = minimise(start, equations, lambda transform, step: _moved(transform, origin, step))
     return fitted.required("registration", "are the covariances true, or some of them huge?").state
 
 
@@ -87,11 +85,6 @@ def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.nd
         return np.einsum("ni,nij,nj->n", residuals, precision, residuals)
     plain = np.einsum("ni,ni->n", residuals, residuals)
     return plain if precision is None else plain * precision
-
-
-def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
-    """Returns the rounding error of residuals, mm. It is robust against wrong points of any size."""
-    return EXACT * float(max(np.median(np.maximum.reduce(np.abs(xyz.T))) for xyz in (xyz_a, xyz_b)))
 
 
 def unit_covariance(
@@ -105,8 +98,11 @@ def unit_covariance(
     ``model`` : model; ``transform`` : b_from_a; ``xyz_a`` : (n, 3) points that were fitted, mm; ``precision`` : (n,)
     precision as in :func:`fit`.
     """
-    origin, normal = _normal(model, transform, xyz_a, precision)
-    to_origin = _to_origin(model, transform, origin)
+    origin = _middle(xyz_a, precision)
+    normal = _normal(model, transform, xyz_a - origin, precision)
+    motions, shift = _motions(model, transform), np.eye(4)
+    shift[:3, 3] = -origin
+    to_origin = np.linalg.pinv(motions) @ np.kron(np.eye(3), shift.T) @ motions
     scale = 1 / np.sqrt(np.diag(normal))
     covariance = np.linalg.inv(normal * scale[:, None] * scale) * scale[:, None] * scale
     return to_origin @ covariance @ to_origin.T
@@ -121,7 +117,8 @@ def leverages(
     for others. An eigenvalue of 1 marks a direction in which no other point checks this one.
     """
     p = None if precision is None else precision[used]
-    origin, normal = _normal(model, transform, xyz_a[used], p)
+    origin = _middle(xyz_a[used], p)
+    normal = _normal(model, transform, xyz_a[used] - origin, p)
     by_step = jacobian(model, transform, xyz_a - origin)
     covariance = by_step @ np.linalg.inv(normal) @ np.swapaxes(by_step, 1, 2)
     if precision is None:
@@ -159,96 +156,55 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
 def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
     """Returns the derivative (n, 3, p) of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of
     a, for points (n, 3) minus that point."""
-    n = len(from_origin)
-    by_step = np.zeros((n, 3, model.parameters))
+    return np.einsum("nk,rkp->nrp", _homogeneous(from_origin), _motions(model, transform).reshape(3, 4, -1))
+
+
+def _homogeneous(xyz: np.ndarray) -> np.ndarray:
+    return np.column_stack([xyz, np.ones(len(xyz))])
+
+
+def _motions(model: Model, transform: Transform) -> np.ndarray:
+    """Returns the derivative (12, p) of the 3×4 matrix, row by row, by the parameters."""
     if model.name == "affine":
-        for row in range(3):
-            by_step[:, row, 4 * row : 4 * row + 3] = from_origin
-            by_step[:, row, 4 * row + 3] = 1
-        return by_step
-    turned = from_origin @ parts(transform)[0].T
-    by_step[:, :, :3] = -skew(turned)
-    by_step[:, :, 3:6] = np.eye(3)
-    if model.name == "similarity":
-        by_step[:, :, 6] = turned
-    return by_step
-
-
-def _normal(
-    model: Model, transform: Transform, xyz_a: np.ndarray, precision: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the origin in a, which is the points' weighted mean, and the normal matrix (p, p) about it."""
-    if precision is None or precision.ndim == 1:
-        weights = np.ones(len(xyz_a)) if precision is None else precision
-        origin = weights @ xyz_a / weights.sum()
-        return origin, _isotropic_normal(model, transform, xyz_a - origin, weights)
-    weights = np.trace(precision, axis1=1, axis2=2)
-    origin = weights @ xyz_a / weights.sum()
-    return origin, _about(model, transform, origin, xyz_a, precision, transform @ xyz_a).normal
-
-
-def _about(
-    model: Model, transform: Transform, origin: np.ndarray, xyz_a: np.ndarray, precision: np.ndarray, xyz_b: np.ndarray
-) -> NormalEquations:
-    """Returns the normal equations of the parameters about a point ``origin`` of a, with inverse covariances."""
-    cost, normal, gradient = 0.0, np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
-    for first in range(0, len(xyz_a), CHUNK):
-        rows = slice(first, first + CHUNK)
-        by_step = jacobian(model, transform, xyz_a[rows] - origin)
-        weighted = np.swapaxes(by_step, 1, 2) @ precision[rows]
-        residual = xyz_b[rows] - transform @ xyz_a[rows]
-        normal += (weighted @ by_step).sum(0)
-        gradient -= (weighted @ residual[:, :, None]).sum((0, 2))
-        cost += float(squares(residual, precision[rows]).sum())
-    return NormalEquations(cost, normal, gradient)
-
-
-def _isotropic_normal(model: Model, transform: Transform, from_origin: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns the normal matrix, computed from the points' second moments instead of one Jacobian for each point."""
-    second, total = (from_origin * weights[:, None]).T @ from_origin, weights.sum()
-    normal = np.zeros((model.parameters,) * 2)
-    if model.name == "affine":
-        for row in range(3):
-            normal[4 * row : 4 * row + 3, 4 * row : 4 * row + 3] = second
-            normal[4 * row + 3, 4 * row + 3] = total
-        return normal
+        return np.eye(12)
     linear = parts(transform)[0]
-    second = linear @ second @ linear.T
-    normal[:3, :3] = np.trace(second) * np.eye(3) - second
-    normal[3:6, 3:6] = total * np.eye(3)
-    if model.name == "similarity":
-        normal[6, 6] = np.trace(second)
-    return normal
+    motions = np.zeros((model.parameters, 3, 4))
+    motions[:3, :, :3] = skew(np.eye(3)) @ linear
+    motions[3:6, :, 3] = np.eye(3)
+    motions[6:, :, :3] = linear
+    return motions.reshape(model.parameters, 12).T
 
 
-def _to_origin(model: Model, transform: Transform, origin: np.ndarray) -> np.ndarray:
-    """Returns the matrix (p, p) from parameters about the point ``origin`` of a to parameters about a's origin."""
-    change = np.eye(model.parameters)
-    if model.name == "affine":
-        for row in range(3):
-            change[4 * row + 3, 4 * row : 4 * row + 3] = -origin
-        return change
-    turned = parts(transform)[0] @ origin
-    change[3:6, :3] = skew(turned)
-    if model.name == "similarity":
-        change[3:6, 6] = -turned
-    return change
+def _middle(xyz_a: np.ndarray, precision: np.ndarray | None) -> np.ndarray:
+    """Returns the weighted mean of points (n, 3), about which their parameters correlate least."""
+    weights = precision if precision is None or precision.ndim == 1 else np.trace(precision, axis1=1, axis2=2)
+    return np.average(xyz_a, axis=0, weights=weights)
+
+
+def _normal(model: Model, transform: Transform, from_origin: np.ndarray, precision: np.ndarray | None) -> np.ndarray:
+    """Returns the normal matrix (p, p) about the origin, from the points' second moments."""
+    places, motions = _homogeneous(from_origin), _motions(model, transform)
+    if precision is not None and precision.ndim == 3:
+        moments = np.einsum("nk,nrs,nl->rksl", places, precision, places)
+    else:
+        weighted = places if precision is None else places * precision[:, None]
+        moments = np.einsum("rs,kl->rksl", np.eye(3), weighted.T @ places)
+    return motions.T @ moments.reshape(12, 12) @ motions
 
 
 def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
     """Returns the transform after a step of the parameters about ``origin``."""
+    there = transform @ origin
     if isinstance(transform, Affine):
         rows = step.reshape(3, 4)
         linear = transform.linear + rows[:, :3]
-        return Affine(linear, transform @ origin + rows[:, 3] - linear @ origin)
-    turn = Rigid.exp([*step[:3], 0, 0, 0]).rotation
-    there = transform @ origin + step[3:6]
-    if isinstance(transform, Rigid):
-        rotation = turn @ transform.rotation
-        return Rigid(rotation, there - rotation @ origin)
-    scale, rotation = transform.scale * (1 + step[6]), turn @ transform.rigid.rotation
+        return Affine(linear, there + rows[:, 3] - linear @ origin)
+    scale, rigid = (1.0, transform) if isinstance(transform, Rigid) else (transform.scale, transform.rigid)
+    scale *= 1 + step[6:].sum()
     if scale <= 0:
         raise DegenerateError(
             "E-REGISTER-SCALE", "registration: the scale is not determined; are the covariances true?"
         )
-    return Similarity(scale, Rigid(rotation, there - scale * rotation @ origin))
+    rotation = Rigid.exp([*step[:3], 0, 0, 0]).rotation @ rigid.rotation
+    moved = Rigid(rotation, there + step[3:6] - scale * rotation @ origin)
+    return moved if isinstance(transform, Rigid) else Similarity(scale, moved)

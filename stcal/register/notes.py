@@ -1,7 +1,6 @@
 """Checks whether the points determine the transform, and notes on what a user should check, one line each."""
 
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -13,18 +12,16 @@ from stcal.geometry.rigid import Affine, Similarity, best_rotations
 from stcal.geometry.robust import ratio_limit
 from stcal.register.liu2017 import ASSUMED
 from stcal.register.mistakes import (
-    SHOWN,
-    UNIT_WITHIN,
-    UNITS,
     Shifted,
     Wider,
+    mistaken_unit,
     moved_meanwhile,
     neighbours_alike,
     order_note,
     outlier_notes,
 )
 from stcal.register.models import Model, squares
-from stcal.register.pairs import Problem
+from stcal.register.pairs import SHOWN, Problem, some_of
 from stcal.register.result import Registration
 from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO
 
@@ -32,8 +29,6 @@ WIDER_THAN = 10.0
 """Least spread √Σd² of points off a line (affine: off a plane), in σ. The turn about it then has σ ≤ 0.1 rad."""
 SYMMETRY_UP_TO = 200
 """Largest number of points checked for symmetry. Larger sets are clouds, not layouts with labels."""
-IN_CYCLE = 6
-"""Number of points of a cycle that a note names."""
 
 
 def spreads(xyz: np.ndarray) -> np.ndarray:
@@ -89,25 +84,18 @@ def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndar
     return rows[np.sqrt(off) < WIDER_THAN * sigma_mm]
 
 
-def check_supports(
-    model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_mm: float, name: Callable[[int], str]
-) -> None:
+def check_supports(problem: Problem, inliers: np.ndarray, sigma_mm: float) -> None:
     """Raises DegenerateError for a set with outliers if :func:`check_extent` refuses it without a single point, since
     any wrong point would have fitted there."""
     rows = np.flatnonzero(inliers)
-    alone = single_supports(model, xyz_a[rows], sigma_mm)
+    alone = single_supports(problem.model, problem.xyz_a[rows], sigma_mm)
     if len(alone):
-        kind, first = "plane" if model.name == "affine" else "line", name(int(rows[alone[0]]))
+        kind = "plane" if problem.model.name == "affine" else "line"
         raise DegenerateError(
             "E-REGISTER-DEGENERATE",
-            f"registration: only {first} keeps the {len(rows)} points that agree off a {kind}, and any "
-            f"wrong point would fit there as well; measure more points off the {kind}",
+            f"registration: only {problem.name(rows[alone[0]])} keeps the {len(rows)} points that agree off a {kind}, "
+            f"and any wrong point would fit there as well; measure more points off the {kind}",
         )
-
-
-def row_name(row: int, lines: Sequence[int] | None) -> str:
-    """Returns a point's name for messages: its line in the file, else its row from 1."""
-    return f"row {row + 1}" if lines is None else f"line {lines[row]}"
 
 
 def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
@@ -123,49 +111,23 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
     first = int(radius.argmax())
     second = int(np.linalg.norm(np.cross(centred, centred[first]), axis=1).argmax())
     apart = np.linalg.norm(centred[:, None] - centred, axis=2)
-    fits = (
-        (np.abs(radius - radius[first]) < 2 * tolerance_mm)[:, None]
-        & (np.abs(radius - radius[second]) < 2 * tolerance_mm)
-        & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
-    )
+    near_first, near_second = (np.abs(radius - radius[i]) < 2 * tolerance_mm for i in (first, second))
+    fits = near_first[:, None] & near_second & (np.abs(apart - apart[first, second]) < 2 * tolerance_mm)
     tree = KDTree(centred)
     least, best = np.inf, None
     for i, j in np.argwhere(fits):
         if (i, j) == (first, second):
             continue
         turn = best_rotations(centred[[i, j]].T @ centred[[first, second]])[0]
-        # from two points, then from all: the first two carry their own noise
-        turn = best_rotations(centred[_nearest(tree, centred @ turn.T)].T @ centred)[0]
-        to = _nearest(tree, centred @ turn.T)
-        turn = best_rotations(centred[to].T @ centred)[0]
+        to = np.arange(n)
+        for _ in range(2):  # from two points, then from all: the first two carry their own noise
+            to = np.asarray(tree.query(centred @ turn.T)[1])
+            turn = best_rotations(centred[to].T @ centred)[0]
         misfit = np.linalg.norm(centred @ turn.T - centred[to], axis=1).max()
         is_one = len(np.unique(to)) == n and (to != np.arange(n)).any()
         if is_one and misfit <= 2 * tolerance_mm and misfit < least:
             least, best = misfit, (float(Rotation.from_matrix(turn).magnitude()), to)
     return best
-
-
-def _nearest(tree: KDTree, xyz: np.ndarray) -> np.ndarray:
-    """Returns the indices (n,) of the tree's points nearest to points (n, 3)."""
-    return np.asarray(tree.query(xyz)[1])
-
-
-def symmetry_note(found: tuple[float, np.ndarray], rows: np.ndarray, name: Callable[[int], str]) -> str:
-    """Returns one line on the turn and the points that it exchanges."""
-    angle, to = found
-    start = int(np.flatnonzero(to != np.arange(len(to)))[0])
-    cycle, at = [start], int(to[start])
-    while at != start:
-        cycle.append(at)
-        at = int(to[at])
-    steps = ", ".join(
-        f"{name(int(rows[i]))} → {name(int(rows[j]))}" for i, j in pairwise([*cycle, start][: IN_CYCLE + 1])
-    )
-    return (
-        f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({steps}"
-        f"{', …' if len(cycle) > IN_CYCLE or (to != np.arange(len(to))).sum() > len(cycle) else ''}); labels exchanged "
-        "like that would fit as well, so check that rows are the same points"
-    )
 
 
 LOW_REDUNDANCY = 6
@@ -178,135 +140,114 @@ TIGHT = 2.5
 """Threshold in σ below which the covariance of few points is too small. 2.5 σ cuts off a tenth of the good points."""
 
 
-def notes_of(
-    result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None, name: Callable[[int], str]
-) -> list[str]:
+def notes_of(result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None) -> tuple[str, ...]:
     """Returns all notes on a registration.
 
-    ``other`` : a wider model that explains the points; ``shifted`` : inliers that are shifted together; ``name`` : of
-    a row, for messages.
+    ``other`` : a wider model that explains the points; ``shifted`` : inliers that are shifted together.
     """
     sigma = result.sigma_mm if other is None else other.sigma_mm
-    return [
-        *_agreement(result, problem, name),
-        *_noise(result, problem, other, shifted, name),
-        *_layout(result, problem, sigma, name),
-        *outlier_notes(result, problem, name),
-    ]
+    return (
+        *_on_agreement(result, problem),
+        *_on_noise(result, problem, other, shifted),
+        *_on_certainty(result, problem[result.inliers] if other is None else other.problem),
+        *_on_layout(result, problem, sigma),
+        *outlier_notes(result, problem),
+    )
 
 
-def _agreement(result: Registration, problem: Problem, name: Callable[[int], str]) -> list[str]:
-    other = result.alternative
-    agree, count = int(result.inliers.sum()), len(result)
-    notes = []
+def _on_agreement(result: Registration, problem: Problem) -> Iterator[str]:
+    other, agree, count = result.alternative, int(result.inliers.sum()), len(result)
     if agree < MAJORITY * count:
-        notes.append(f"only {agree} of {count} point pairs agree; check the others before you trust the transform")
+        yield f"only {agree} of {count} point pairs agree; check the others before you trust the transform"
     if other is not None:
-        shown = _shown(other.rows, name)
         start = "AMBIGUOUS: " if result.ambiguous else ""
-        notes.append(
+        yield (
             f"{start}{len(other.rows)} of the other points agree on another transform, {other.apart_mm:.4g} mm and "
-            f"{np.degrees(other.turn_rad):.3g}° from this one ({shown}); did an instrument move between them?"
+            f"{np.degrees(other.turn_rad):.3g}° from this one ({problem.names(other.rows)}); did an instrument move "
+            "between them?"
         )
     if result.method == "liu2017":
-        notes.append(ASSUMED)
-    if result.method == "least-squares":
-        notes += _far_rows(result, problem, name)
-    return notes
+        yield ASSUMED
+    if result.method == "least-squares":  # rows that the robust method would examine
+        square, redundancy = squares(result.residuals), problem.redundancy
+        bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / count, 3, redundancy)
+        if square.max() > bound:
+            worst = int(square.argmax())
+            yield (
+                f"{(square > bound).sum()} points lie farther off than noise would put them, the farthest "
+                f"{problem.name(worst)} at {np.sqrt(square[worst]):.4g} mm; use the robust method"
+            )
 
 
-def _far_rows(result: Registration, problem: Problem, name: Callable[[int], str]) -> list[str]:
-    """Returns notes on rows that the robust method would examine."""
-    redundancy = problem.redundancy
-    square = squares(result.residuals)
-    bound = square.sum() / redundancy * 3 * ratio_limit(CLEAN_SETS_WITH_OUTLIER / len(problem), 3, redundancy)
-    far = np.flatnonzero(square > bound)
-    if not len(far):
-        return []
-    worst = int(far[square[far].argmax()])
-    return [
-        f"{len(far)} points lie farther off than noise would put them, the farthest {name(worst)} at "
-        f"{np.sqrt(square[worst]):.4g} mm; use the robust method"
-    ]
-
-
-def _noise(
-    result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None, name: Callable[[int], str]
-) -> list[str]:
-    notes = []
+def _on_noise(result: Registration, problem: Problem, other: Wider | None, shifted: Shifted | None) -> Iterator[str]:
     inside, transform = problem[result.inliers], result.b_from_a
     if other is not None:
-        notes.append(other.note)
+        yield other.note
         inside, transform = other.problem, other.transform
     residuals = inside.residuals(transform)
     if np.abs(residuals).max() > inside.rounding_mm() and neighbours_alike(inside.xyz_a, residuals):
-        notes.append(
+        yield (
             "the residuals are not noise: neighbours have similar errors, so that the frames are bent relative to each "
             "other, and a transform is valid only where its points are; see the residual field"
         )
     if other is None and result.method != "liu2017":
         change = moved_meanwhile(problem, transform)
-        notes += [] if change is None else [order_note(change, name)]
+        if change is not None:
+            yield order_note(change, problem)
     if shifted is not None:
-        notes.append(_two_groups(result, shifted, name))
+        by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
+        where = ", and lie together" if shifted.together else ""
+        names = problem.names(np.flatnonzero(result.inliers)[shifted.rows])
+        yield (
+            f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
+            f"{shifted.count - len(shifted.rows)}{where} ({names}): two groups, and the data do not show which is "
+            "right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
+        )
+
+
+def _on_certainty(result: Registration, inside: Problem) -> Iterator[str]:
+    """Yields notes on σ. ``inside`` : the inliers, with a model that explains them."""
     if result.sigma_factor is not None and result.scaled:
-        notes.append(
+        yield (
             f"residuals exceed the σ given {result.sigma_factor:.3g} times, which is beyond chance; the covariance is "
             f"scaled by this factor"
         )
     enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
     if len(inside) <= enough and result.scaled:
-        more = enough + 2 - len(inside)
-        notes.append(f"of {len(inside)} points a wrong one cannot be identified: measure {more} more")
+        yield f"of {len(inside)} points a wrong one cannot be identified: measure {enough + 2 - len(inside)} more"
     if result.redundancy < LOW_REDUNDANCY:
-        notes.append(f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points")
+        yield f"σ rests on {result.redundancy:.0f} degrees of freedom and is a rough guess; measure more points"
     threshold, sigma = result.threshold_mm, result.sigma_mm
     if threshold is not None and threshold < TIGHT * sigma and result.method == "robust":
-        notes.append(
+        yield (
             f"the threshold of {threshold:.4g} mm is only {threshold / sigma:.2g} σ and cuts off good points; leave "
             "it out to have it estimated"
         )
-    return notes
 
 
-def _shown(rows: np.ndarray, name: Callable[[int], str]) -> str:
-    return ", ".join(name(row) for row in rows[:SHOWN].tolist()) + (", …" if len(rows) > SHOWN else "")
-
-
-def _two_groups(result: Registration, shifted: Shifted, name: Callable[[int], str]) -> str:
-    shown = _shown(np.flatnonzero(result.inliers)[shifted.rows], name)
-    by = ", ".join(f"{v:.3g}" for v in shifted.by_mm)
-    where = ", and lie together" if shifted.together else ""
-    return (
-        f"{len(shifted.rows)} rows agree with each other on a shift of ({by}) mm against the other "
-        f"{shifted.count - len(shifted.rows)}{where} ({shown}): two groups, and the data do not show which is "
-        f"right (or noise far from normal); σ of the transform cover both; did an instrument move between them?"
-    )
-
-
-def _layout(result: Registration, problem: Problem, sigma: float, name: Callable[[int], str]) -> list[str]:
-    """Returns notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
-    model, transform, notes = problem.model, result.b_from_a, []
-    rows = np.flatnonzero(result.inliers)
+def _on_layout(result: Registration, problem: Problem, sigma: float) -> Iterator[str]:
+    """Yields notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
+    model, transform, rows = problem.model, result.b_from_a, np.flatnonzero(result.inliers)
     inside = problem.xyz_a[rows]
     if len(rows) <= LEVERAGE_UP_TO and result.method != "liu2017":
-        alone = single_supports(model, inside, sigma)
         kind = "plane" if model.name == "affine" else "line"
-        notes += [
-            f"only {name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
-            for row in rows[alone[:SHOWN]].tolist()
-        ]
+        for row in rows[single_supports(model, inside, sigma)[:SHOWN]]:
+            yield f"only {problem.name(row)} keeps the points off a {kind}, and no other checks it; measure more off it"
     if model.name != "affine" and spreads(inside)[2] < WIDER_THAN * sigma:
-        notes.append("the points lie in a plane: a mirrored frame would not be noticed")
+        yield "the points lie in a plane: a mirrored frame would not be noticed"
     if isinstance(transform, Affine) and np.linalg.det(transform.linear) < 0:
-        notes.append("the transform is a reflection: one of the frames is left-handed")
-    if isinstance(transform, Similarity):
-        scale = transform.scale
-        for factor, (unit, _) in UNITS.items():
-            if abs(max(scale, 1 / scale) / factor - 1) < UNIT_WITHIN:
-                notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {unit}?")
+        yield "the transform is a reflection: one of the frames is left-handed"
+    if isinstance(transform, Similarity) and (unit := mistaken_unit(transform.scale)):
+        yield f"the scale is {transform.scale:.6g}: {unit}"
     extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (problem.xyz_a, problem.xyz_b))
     if 0 < extent < SMALL_MM:
-        notes.append(f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m")
+        yield f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m"
     found = symmetry(inside, 4 * sigma if result.threshold_mm is None else result.threshold_mm)
-    return notes if found is None else [*notes, symmetry_note(found, rows, name)]
+    if found is not None:
+        angle, to = found
+        moved = np.flatnonzero(to != np.arange(len(to)))
+        names = some_of(moved, lambda i: f"{problem.name(rows[i])} → {problem.name(rows[to[i]])}")
+        yield (
+            f"the layout is symmetric: a turn by {np.degrees(angle):.1f}° maps it onto itself ({names}); "
+            "labels exchanged like that would fit as well, so check that rows are the same points"
+        )

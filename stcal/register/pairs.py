@@ -1,8 +1,9 @@
 """Pairs of points of two instruments: their files and their noise."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, requi
 from stcal.io.covariance import OF_POINT, first_fault
 from stcal.io.join import join_tables
 from stcal.io.table import LENGTHS, Table, read_table
-from stcal.register.models import Model, Transform, fit, rounding_mm, squares, whitened
+from stcal.register.models import Model, Transform, fit, squares, whitened
 
 WHAT = "point pairs"
 AXES = OF_POINT.names
@@ -104,25 +105,22 @@ def read_pairs(
         table = read_table(path, WHAT)
     xyz_a, xyz_b = table.points("a"), table.points("b")
     _no_pair_twice(table, np.hstack([xyz_a, xyz_b]))
-    given = [
-        name
-        for name, there in (
-            ("weight", "weight" in table),
-            ("sigma", table.has("sigma", LENGTHS)),
-            ("cov_…", any(name in table for name in COVARIANCE)),
-        )
-        if there
-    ]
-    if len(given) > 1:
+    given = {
+        "weight": "weight" in table,
+        "sigma": table.has("sigma", LENGTHS),
+        "cov_…": any(name in table for name in COVARIANCE),
+    }
+    kinds = [name for name, there in given.items() if there]
+    if len(kinds) > 1:
         raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT", f"{table.where}: columns {' and '.join(given)}; only one of {KINDS} needed"
+            "E-TABLE-COLUMNS-CONFLICT", f"{table.where}: columns {' and '.join(kinds)}; only one of {KINDS} needed"
         )
     weights = covariances = None
-    if given == ["weight"]:
+    if kinds == ["weight"]:
         weights = _positive(table, "weight", table.numbers("weight"))
-    elif given == ["sigma"]:
+    elif kinds == ["sigma"]:
         covariances = _positive(table, "sigma", table.quantity("sigma", LENGTHS)) ** 2
-    elif given:
+    elif kinds:
         covariances = _covariances(table)
     return Pairs(table.where, table.lines, xyz_a, xyz_b, weights, covariances, notes)
 
@@ -182,14 +180,30 @@ class PointNoise:
         return self if self.precision is None else PointNoise(self.precision[rows], self.sigma_mm)
 
 
+EXACT = 1e-11
+"""Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
+SHOWN = 5
+"""Number of rows that a message names."""
+
+
+def some_of(items: Sequence | np.ndarray, say: Callable[[Any], str]) -> str:
+    """Returns the first of some items in words, and the number of others."""
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    return ", ".join(say(item) for item in items[:SHOWN]) + more
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Point pairs (n, 3) mm, neither copied nor checked, as subsets are taken in inner loops, and a model."""
+    """Point pairs (n, 3) mm, neither copied nor checked, as subsets are taken in inner loops, and a model.
+
+    ``lines`` : of a file, by which messages name all points; subsets have none.
+    """
 
     model: Model
     xyz_a: np.ndarray
     xyz_b: np.ndarray
     noise: PointNoise
+    lines: Sequence[int] | None = None
 
     def __len__(self) -> int:
         return len(self.xyz_a)
@@ -197,6 +211,14 @@ class Problem:
     def __getitem__(self, rows: np.ndarray) -> "Problem":
         """Returns the point pairs selected by a mask or by indices."""
         return Problem(self.model, self.xyz_a[rows], self.xyz_b[rows], self.noise[rows])
+
+    def name(self, row: Any) -> str:
+        """Returns a point's name for messages: its line in the file, else its row from 1."""
+        return f"row {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+
+    def names(self, rows: np.ndarray) -> str:
+        """Returns the names of the first of some points, and the number of others."""
+        return some_of(rows, self.name)
 
     @property
     def redundancy(self) -> int:
@@ -220,8 +242,8 @@ class Problem:
         return whitened(self.residuals(b_from_a), self.noise.precision)
 
     def rounding_mm(self) -> float:
-        """Returns the part of residuals that rounding may cause, mm."""
-        return rounding_mm(self.xyz_a, self.xyz_b)
+        """Returns the rounding error of residuals, mm. It is robust against wrong points of any size."""
+        return EXACT * float(max(np.median(np.abs(xyz).max(1)) for xyz in (self.xyz_a, self.xyz_b)))
 
 
 def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> PointNoise:
@@ -238,16 +260,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
             "E-ARRAY-SHAPE", f"registration: {name} of shape {given.shape} for {n} point pairs; one for each needed"
         )
     matrices = given.ndim == 3
-    _require_positive(given, name)
-    if name == "weights":
-        return PointNoise(given * np.mean(1 / given))
-    variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if matrices else given))
-    return PointNoise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))
-
-
-def _require_positive(given: np.ndarray, name: str) -> None:
-    """Refuses weights or variances (n,), or covariances (n, 3, 3), that are not positive."""
-    if given.ndim == 3:
+    if matrices:
         fault = first_fault(given, OF_POINT, definite=True)
         trouble = fault and f"row {fault.row + 1}: {fault.reason}"
     else:
@@ -255,3 +268,7 @@ def _require_positive(given: np.ndarray, name: str) -> None:
         trouble = f"row {bad[0] + 1} has {given[bad[0]]:.3g}, a positive number needed" if len(bad) else None
     if trouble:
         raise InputError("E-REGISTER-WEIGHTS", f"registration: {name}: {trouble}; leave a row out to give it no weight")
+    if name == "weights":
+        return PointNoise(given * np.mean(1 / given))
+    variance = float(np.mean(np.trace(given, axis1=1, axis2=2) / 3 if matrices else given))
+    return PointNoise((np.linalg.inv(given) if matrices else 1 / given) * variance, float(np.sqrt(variance)))

@@ -6,15 +6,15 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments
+from stcal.geometry.rigid import best_rotations
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register.liu2017 import Liu2017Options, liu2017
 from stcal.register.mistakes import (
-    Shifted,
-    Wider,
     check_mirrored,
     check_units,
     mirrored_error,
@@ -26,7 +26,7 @@ from stcal.register.mistakes import (
     wider,
 )
 from stcal.register.models import MODELS, parts, squares
-from stcal.register.notes import by_chance, check_extent, check_supports, notes_of, row_name
+from stcal.register.notes import by_chance, check_extent, check_supports, notes_of
 from stcal.register.pairs import Problem, noise_of
 from stcal.register.result import Alternative, Registration, held_out
 from stcal.register.robust import (
@@ -41,7 +41,6 @@ from stcal.register.robust import (
     settled,
     shifted_too,
     sigma_within,
-    turn_between,
 )
 
 METHODS = ("robust", "least-squares", "liu2017")
@@ -121,34 +120,43 @@ def register(
     ConvergenceError
         If a fit with covariances did not converge.
     """
-    problem = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances)
+    problem = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances, lines)
     if problem.model.name == "rigid":
         check_units(problem.xyz_a, problem.xyz_b, seed)
+    second = None
     if method == "robust":
         again: Callable[[Problem], Fitted] = partial(robust_fit, threshold=threshold_mm, seed=seed)
         fitted, second = _robust(problem, threshold_mm, seed)
     else:
-        published = partial(_liu2017, options=_liu2017_options(liu2017_options, threshold_mm), seed=seed)
-        again = _least_squares if method == "least-squares" else published
-        fitted, second = again(problem), None
-    name = partial(row_name, lines=lines)
-    _check_geometry(problem, method, fitted, name)
+        published = liu2017_options or Liu2017Options()
+        if threshold_mm is not None:
+            published = replace(published, limit_mm=threshold_mm)
+        again = _least_squares if method == "least-squares" else partial(_liu2017, options=published, seed=seed)
+        fitted = again(problem)
+    inside = problem[fitted.inliers]
+    if method != "liu2017":  # the baseline runs as published
+        check_mirrored(inside.model, inside.xyz_a, inside.xyz_b)
+        check_extent(inside.model, inside.xyz_a, fitted.sigma)
+    if method == "robust" and not fitted.inliers.all():
+        check_supports(problem, fitted.inliers, fitted.sigma)
     alternative = None if second is None else _alternative(fitted, second, problem.xyz_a)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
         change = moved_meanwhile(problem, fitted.transform)
-        moved = "" if change is None else f"; {order_note(change, name)}"
+        moved = "" if change is None else f"; {order_note(change, problem)}"
         raise DegenerateError(
             "E-REGISTER-TWO-TRANSFORMS",
             f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
             f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
             f"ambiguous answers{moved}",
         )
-    inside = problem[fitted.inliers]
     covariance = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
-    other, shifted = (None, None) if method == "liu2017" else _beside(inside, fitted)
-    if shifted is not None:
-        covariance = shifted_too(covariance, shifted.off_mm())
+    other = shifted = None
+    if method != "liu2017":
+        other = wider(inside, fitted.transform)
+        shifted = shifted_rows(*((inside, fitted.transform) if other is None else (other.problem, other.transform)))
+    if shifted is not None:  # the transform is off by so much if the smaller group is right
+        covariance = shifted_too(covariance, (1 - len(shifted.rows) / shifted.count) * shifted.by_mm)
     given = problem.noise.sigma_mm
     result = Registration(
         model=problem.model.name,
@@ -168,10 +176,10 @@ def register(
         seed=seed,
         samples=fitted.samples,
     )
-    return replace(result, notes=tuple(notes_of(result, problem, other, shifted, name)))
+    return replace(result, notes=notes_of(result, problem, other, shifted))
 
 
-def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances) -> Problem:
+def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances, lines) -> Problem:
     a, b = (frozen(xyz, None, f"points of {name}", finite=False) for name, xyz in (("a", xyz_a), ("b", xyz_b)))
     if a.ndim != 2 or a.shape[1:] != (3,) or a.shape != b.shape:
         raise InputError(
@@ -199,38 +207,11 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
         raise DegenerateError(
             "E-POINTS-FEW", f"registration: {len(a)} point pairs, {chosen.needed} needed for the {chosen.name} model"
         )
-    return Problem(chosen, a, b, noise_of(len(a), weights, covariances))
-
-
-def _check_geometry(problem: Problem, method: str, fitted: Fitted, name: Callable[[int], str]) -> None:
-    """Refuses mirrored frames, and points that do not determine the model. The baseline runs as published."""
-    if method == "liu2017":
-        return
-    inside = problem[fitted.inliers]
-    check_mirrored(problem.model, inside.xyz_a, inside.xyz_b)
-    check_extent(problem.model, inside.xyz_a, fitted.sigma)
-    if method == "robust" and not fitted.inliers.all():
-        check_supports(problem.model, problem.xyz_a, fitted.inliers, fitted.sigma, name)
-
-
-def _beside(inside: Problem, fitted: Fitted) -> tuple[Wider | None, Shifted | None]:
-    """Returns a wider model that explains the inliers, and the inliers that are shifted together."""
-    other = wider(inside, fitted.transform)
-    if other is None:
-        return None, shifted_rows(inside, fitted.transform)
-    return other, shifted_rows(other.problem, other.transform)
+    return Problem(chosen, a, b, noise_of(len(a), weights, covariances), lines)
 
 
 def _least_squares(problem: Problem) -> Fitted:
-    transform = problem.fit()
-    total = problem.squares(transform).sum()
-    sigma = sigma_within(float(total), problem.model, len(problem), np.inf)
-    return Fitted(transform, np.ones(len(problem), bool), sigma, np.inf)
-
-
-def _liu2017_options(options: Liu2017Options | None, threshold_mm: float | None) -> Liu2017Options:
-    options = options or Liu2017Options()
-    return options if threshold_mm is None else replace(options, limit_mm=threshold_mm)
+    return replace(_as_assigned(problem, np.ones(len(problem), bool), None), threshold=np.inf)
 
 
 def _liu2017(problem: Problem, options: Liu2017Options, seed: int) -> Fitted:
@@ -301,5 +282,6 @@ def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, thres
 
 def _alternative(fitted: Fitted, other: Fitted, a: np.ndarray) -> Alternative:
     apart = np.sqrt(np.mean(((fitted.transform @ a - other.transform @ a) ** 2).sum(1)))
-    turn = turn_between(fitted.transform, other.transform)
+    one, two = (best_rotations(parts(each.transform)[0])[0] for each in (fitted, other))
+    turn = float(Rotation.from_matrix(one @ two.T).magnitude())
     return Alternative(other.transform, np.flatnonzero(other.inliers), float(apart), turn)

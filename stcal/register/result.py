@@ -2,13 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import BeforeValidator, PlainSerializer
 
 from stcal.cross_validation import dealt, held_out_errors
-from stcal.geometry.arrays import Array, Brief, ByValue, freeze
-from stcal.register.models import Transform
+from stcal.geometry.arrays import Array, Brief, ByValue, freeze, rms
+from stcal.register.models import Transform, parts
 from stcal.register.pairs import Problem
+
+Length = Annotated[
+    float,
+    BeforeValidator(lambda value: np.nan if value is None else value),
+    PlainSerializer(lambda value: None if np.isnan(value) else value),
+]
+"""A length in mm, or NaN, which is null in a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,16 +25,16 @@ class ErrorFigures:
     """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points."""
 
     points: int
-    mean_mm: float
-    rms_mm: float
-    max_mm: float
+    mean_mm: Length
+    rms_mm: Length
+    max_mm: Length
 
     @classmethod
     def of(cls, lengths: np.ndarray) -> "ErrorFigures":
         """Returns the figures of lengths (n,), mm."""
         if not len(lengths):
             return cls(0, np.nan, np.nan, np.nan)
-        return cls(len(lengths), float(lengths.mean()), float(np.sqrt((lengths**2).mean())), float(lengths.max()))
+        return cls(len(lengths), float(lengths.mean()), rms(lengths), float(lengths.max()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,6 +163,11 @@ class Registration(Brief):
         """Indices of the outliers, the farthest first."""
         rows = np.flatnonzero(~self.inliers)
         return rows[np.argsort(-np.linalg.norm(self.residuals[rows], axis=1), kind="stable")]
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Ratios (3,) of lengths in b to those in a, along the principal axes of the transform."""
+        return np.linalg.svd(parts(self.b_from_a)[0], compute_uv=False)
 
 
 TRIED = 20_000

@@ -30,9 +30,8 @@ from scipy.optimize import root_scalar
 from scipy.special import chdtr, chdtrc, chdtri, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.robust import ratio_limit
-from stcal.register.models import Model, Transform, hypotheses, leverages, parts, unit_covariance
+from stcal.register.models import Model, Transform, hypotheses, leverages, unit_covariance
 from stcal.register.pairs import Problem
 
 CONTRADICTED_AT = 0.01
@@ -43,15 +42,11 @@ WIDE = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariance:
-    """``matrix`` : (p, p) of :func:`~stcal.register.models.unit_covariance`'s parameters; ``scaled`` : by residuals,
-    not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
+    """``scaled`` : by residuals, not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
 
-    matrix: Array
+    matrix: np.ndarray
     scaled: bool
     redundancy: float
-
-    def __post_init__(self):
-        freeze(self, "matrix", (None, None), "covariance")
 
 
 def kept_share(cut: float) -> float:
@@ -139,12 +134,11 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all possible ones were
-    tried."""
+    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all were tried."""
 
     inliers: np.ndarray
     value: float
-    samples: int
+    samples: int = 0
 
 
 def by_scale(model: Model, count: int, total: float) -> Score:
@@ -195,29 +189,24 @@ def by_threshold(threshold: float) -> Score:
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
     """Returns the best set by :func:`by_scale`, :func:`by_share` or :func:`by_threshold` of random samples, or None."""
     count, size = len(problem), problem.model.sample
-    drawn, needed, best = 0, 1.0, None
-    every = None
     if comb(count, size) <= EXHAUSTIVE:
-        every = np.array(list(combinations(range(count), size)))
+        return _best_of(problem, score, np.array(list(combinations(range(count), size))), None)
+    drawn, needed, best = 0, 1.0, None
     while drawn < needed:
-        samples = every if every is not None else _random_samples(count, size, rng)
+        samples = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
+        samples = samples[(np.diff(samples, axis=1) > 0).all(1)]
         drawn += len(samples)
-        found = _best_of(problem, score, samples)
-        if found is not None and (best is None or found.value < best.value):
-            best = found
-        if every is not None:
-            break
+        best = _best_of(problem, score, samples, best)
         share = max(best.inliers.mean() if best is not None else 0, LEAST_SHARE)
         clean = min(share, 1 - 1e-9) ** size
         needed = min(CLEAN_PER_WIDE * np.log(MISSED) / np.log1p(-clean), MOST_SAMPLES)
-    return None if best is None else Consensus(best.inliers, best.value, 0 if every is not None else drawn)
+    return best and replace(best, samples=drawn)
 
 
-def _best_of(problem: Problem, score: Score, samples: np.ndarray) -> Consensus | None:
-    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
-    square = _squares_of_many(linear, translation, problem)
+def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensus | None) -> Consensus | None:
+    """Returns the best of the refined samples and of ``best``."""
+    square = _squares_of_many(*hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples]), problem)
     value, cut = score(square)
-    best = None
     for i in np.argsort(value, kind="stable")[:REFINED]:
         found = _concentrated(problem, score, square[i] <= cut[i])
         if found is not None and (best is None or found.value < best.value):
@@ -232,15 +221,14 @@ def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consen
         if inliers.sum() < problem.model.sample:
             break
         try:
-            transform = problem[inliers].fit()
+            square = problem.squares(problem[inliers].fit())
         except (DegenerateError, ConvergenceError):
             break
-        square = problem.squares(transform)
         value, cut = score(square[None])
         if best is not None and value[0] >= best.value:
             break
         inliers = square <= cut[0]
-        best = Consensus(inliers, float(value[0]), 0)
+        best = Consensus(inliers, float(value[0]))
     return best
 
 
@@ -255,12 +243,6 @@ def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Probl
         return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
     plain = np.einsum("sin,sin->sn", residual, residual)
     return plain if precision is None else plain * precision
-
-
-def _random_samples(count: int, size: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns random indices (s, size), all different within each sample."""
-    drawn = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
-    return drawn[(np.diff(drawn, axis=1) > 0).all(1)]
 
 
 SUBSET = 500
@@ -288,16 +270,8 @@ wrong and all in one other motion, the true ones are 40 : 60 of the wrong."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A transform with the points that agree on it.
-
-    Parameters
-    ----------
-    transform : b_from_a
-    inliers : (n,) bool array
-    sigma : σ per axis, mm of a point of mean σ
-    threshold : largest distance of inliers, mm of a point of mean σ; infinite if no residual was cut off
-    samples : number of random samples; 0 if none or all possible ones were tried
-    """
+    """A transform with the ``inliers`` (n,) that agree on it; ``sigma`` per axis and ``threshold``, which may be
+    infinite, in mm of a point of mean σ; ``samples`` : random ones, 0 if all possible ones were tried."""
 
     transform: Transform
     inliers: np.ndarray
@@ -344,22 +318,17 @@ def _consensus(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, 
         samples += consensus.samples if consensus is not None else 0
         if consensus is None or consensus.value > np.log(FALSE_ALARMS):
             break
-        _check_trust(model, consensus)
+        agree = int(consensus.inliers.sum())
+        if model.redundancy(agree) < LEAST_REDUNDANCY:
+            raise DegenerateError(
+                "E-REGISTER-DISAGREE",
+                f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform, at least "
+                f"{-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more points",
+            )
         rows = rows[consensus.inliers]
     mask = np.zeros(len(problem), bool)
     mask[rows] = True
     return mask, samples
-
-
-def _check_trust(model: Model, found: Consensus) -> None:
-    agree = int(found.inliers.sum())
-    if model.redundancy(agree) < LEAST_REDUNDANCY:
-        raise DegenerateError(
-            "E-REGISTER-DISAGREE",
-            f"registration: only {agree} of {len(found.inliers)} point pairs agree on one {model.name} transform, at "
-            f"least {-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more "
-            "points",
-        )
 
 
 def _too_few_agree(model: Model, count: int, threshold: float | None) -> DegenerateError:
@@ -373,8 +342,7 @@ def _too_few_agree(model: Model, count: int, threshold: float | None) -> Degener
 
 
 def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
-    """Updates fit, σ and inliers in turn until the set stays the same; of a cycle, the largest is returned. Raises
-    DegenerateError: too few points agree."""
+    """Updates fit, σ and inliers in turn until the set stays the same; of a cycle, the largest is returned."""
     model = problem.model
     fit_of_set: dict[bytes, Fitted] = {}
     floor = problem.rounding_mm()
@@ -442,22 +410,18 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     if not len(k):
         return 0.0
     order = np.sort(np.linalg.norm(share.residuals(fitted.transform), axis=1))
-    sides = np.ptp(_along_axes(share.xyz_b[fitted.inliers[rows]]), axis=0) if extent is None else extent
-    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(sides, 1e-300)).prod(1)
+    if extent is None:
+        centred = share.xyz_b[fitted.inliers[rows]]
+        centred = centred - centred.mean(0)
+        extent = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0)
+    alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(np.asarray(extent), 1e-300)).prod(1)
     choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
     value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
 
 
-def _along_axes(points: np.ndarray) -> np.ndarray:
-    """Returns the points along their own principal axes."""
-    centred = points - points.mean(0)
-    return centred @ np.linalg.eigh(centred.T @ centred)[1]
-
-
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """Returns the transform on which outliers agree within the threshold enlarged for σ's uncertainty, beyond chance,
-    or None."""
+    """Returns the transform on which outliers agree beyond chance, within the threshold and σ's uncertainty."""
     model = problem.model
     outside = np.flatnonzero(~fitted.inliers)
     if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
@@ -486,10 +450,3 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
     mask = np.zeros(len(problem), bool)
     mask[outside[near]] = True
     return Fitted(transform, mask, fitted.sigma, threshold, consensus.samples)
-
-
-def turn_between(one: Transform, two: Transform) -> float:
-    """Returns the angle between the rotations of two rigid or similarity transforms, rad."""
-    (a, _), (b, _) = parts(one), parts(two)
-    cosine = (np.trace(a @ b.T) / np.cbrt(np.linalg.det(a) * np.linalg.det(b)) - 1) / 2
-    return float(np.arccos(np.clip(cosine, -1, 1)))

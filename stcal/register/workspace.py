@@ -1,10 +1,10 @@
 """Range of validity of a registration: systematic residuals over the workspace, and errors around cubes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 from scipy.optimize import minimize_scalar
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
@@ -14,7 +14,7 @@ from stcal.errors import StcalError
 from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
 from stcal.register.models import MODELS, Model, Transform, jacobian
-from stcal.register.pairs import Problem, noise_of
+from stcal.register.pairs import Pairs, Problem, noise_of
 from stcal.register.result import ErrorFigures, Registration, held_out
 
 MOST_POINTS = 500
@@ -26,8 +26,8 @@ LENGTHS, RATIOS = 12, np.geomspace(1e-3, 1e7, 41)
 WILD = 0.01
 """Probability that a clean set has any point that is taken for an outlier of the field."""
 ROUNDS = 5
-_LAPACK = ("sytrd", "sytrd_lwork", "ormqr", "pttrf", "pttrs")
-_sytrd, _sytrd_lwork, _ormqr, _pttrf, _pttrs = get_lapack_funcs(_LAPACK, dtype=np.float64)
+GRID, MARGIN = 7, 0.25
+"""Number of places along each side of the grid of the field, and its margin beyond the box of the points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +69,25 @@ class Field:
     def size_mm(self) -> float:
         return float(np.sqrt((self.at(self._model.xyz_a)[0] ** 2).sum(1).mean()))
 
+    @property
+    def plain(self) -> ErrorFigures:
+        return ErrorFigures.of(self.plain_mm)
+
+    @property
+    def corrected(self) -> ErrorFigures:
+        return ErrorFigures.of(self.corrected_mm)
+
+    @property
+    def grid(self) -> dict[str, np.ndarray]:
+        """Places in and around the points, frame a, with the error to expect there and its σ per axis, mm."""
+        low, high = self._model.xyz_a.min(0), self._model.xyz_a.max(0)
+        side = MARGIN * (high - low)
+        axes = [np.linspace(a, b, GRID) if b > a else [a] for a, b in zip(low - side, high + side, strict=True)]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        error, covariance = self.at(places)
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)
+        return {"xyz_a_mm": places, "error_mm": error, "sigma_mm": sigma}
+
     def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the expected systematic error (g, 3) of the transform at places (g, 3), and its covariance, mm."""
         known, kriged, places = self._model, self._kriged, np.asarray(xyz_a, float)
@@ -81,18 +100,13 @@ class Field:
         return value, kriged.variance * covariance
 
 
-def residual_field(
-    registration: Registration,
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
-) -> Field | None:
-    """Returns the systematic part of the residuals of inliers and outliers that follow it, or None; of covariances only
-    mean variances are used."""
-    a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
-    model = MODELS[registration.model]
-    variance = _relative_variances(len(a), weights, covariances)
+def residual_field(registration: Registration, problem: Problem) -> Field | None:
+    """Returns the systematic part of the residuals, or None; of covariances only mean variances are used."""
+    a, b, model, precision = problem.xyz_a, problem.xyz_b, problem.model, problem.noise.precision
+    if precision is None:
+        variance = np.ones(len(a))
+    else:
+        variance = 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
     used = registration.inliers.copy()
     followers = np.zeros(0, int)
     for _ in range(ROUNDS):
@@ -100,21 +114,13 @@ def residual_field(
         if model.redundancy(len(rows)) < 2 * model.parameters:
             return None
         likelihood = _Likelihood.of(model, registration.b_from_a, a[rows], b[rows], variance[rows])
-        field = _field(likelihood, rows, followers)
+        field = likelihood.field(rows, followers)
         added = _followers(field, a, b - registration.b_from_a @ a, variance, used)
         if not len(added):
             return field
         used[added] = True
         followers = np.sort(np.concatenate([followers, added]))
     return field
-
-
-def _relative_variances(n: int, weights, covariances) -> np.ndarray:
-    """Returns the variances of the noise (n,) relative to a point of mean σ."""
-    precision = noise_of(n, weights, covariances).precision
-    if precision is None:
-        return np.ones(n)
-    return 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
 
 
 def _few(rows: np.ndarray) -> np.ndarray:
@@ -140,16 +146,6 @@ def _matern(distance: np.ndarray) -> np.ndarray:
     """Returns Matérn's 5/2 function of distances over the length."""
     scaled = np.sqrt(5) * distance
     return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
-
-
-def _tridiagonal(matrix: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns T's diagonal and off-diagonal, and Qᵀ ``columns`` (m, k), of a symmetric matrix Q T Qᵀ: a quarter of the
-    time of eigenvectors."""
-    m, k = columns.shape
-    work = int(_sytrd_lwork(m, lower=1)[0])
-    reflectors, diagonal, beside, scale, _ = _sytrd(matrix, lower=1, lwork=work)
-    lower, _, _ = _ormqr("L", "T", reflectors[1:, :-1], scale, columns[1:], lwork=64 * k)
-    return diagonal, beside, np.asfortranarray(np.vstack([columns[:1], lower]))
 
 
 def _motions(model: Model, transform: Transform, xyz_a: np.ndarray, about: np.ndarray) -> np.ndarray:
@@ -183,25 +179,33 @@ class _Likelihood:
         motions = _motions(model, transform, xyz_a, xyz_a) / root[:, None, None]
         return cls(model, transform, xyz_a, variance, y, motions, cdist(xyz_a, xyz_a))
 
-    def best(self) -> tuple[float, float, float, float]:
-        """Returns the best length and ratio, −2 log L there, and −2 log L without f."""
+    def field(self, rows: np.ndarray, taken: np.ndarray) -> Field:
+        """Returns the field of the best length and ratio."""
         nearest = KDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
         low, high = max(np.median(nearest), 1e-6 * self.distance.max()), 2 * self.distance.max()
         length, _ = _least(lambda length: self._at_length(length)[1], np.geomspace(low, high, LENGTHS), 0.02)
-        return length, *self._at_length(length)
+        ratio, value, without = self._at_length(length)
+        root = np.sqrt(self.variance)[:, None]
+        y, motions = self.y * root, self.motions * root[:, :, None]
+        inverse = np.linalg.inv(ratio * _matern(self.distance / length) + np.diag(self.variance))
+        kriged = _Kriged.of(inverse, y, motions)
+        corrected, sigma_ratio = kriged.left_out()
+        plain, _ = _Kriged.of(np.diag(1 / self.variance), y, motions).left_out()
+        p_value = float(chdtrc(2, max(without - value, 0.0)))
+        return Field(length, p_value, rows, taken, plain, corrected, sigma_ratio, self, ratio, kriged)
 
     def _at_length(self, length: float) -> tuple[float, float, float]:
         """Returns the best ratio, −2 log L there, and −2 log L without f."""
         root = np.sqrt(self.variance)
         m, _, p = self.motions.shape
         columns = np.concatenate([self.motions, self.y[:, :, None]], axis=2).reshape(m, -1)
-        diagonal, beside, turned = _tridiagonal(_matern(self.distance / length) / root[:, None] / root, columns)
-        rows = np.ascontiguousarray(turned).reshape(3 * m, p + 1).T
+        values, vectors = np.linalg.eigh(_matern(self.distance / length) / root[:, None] / root)
+        turned = vectors.T @ columns
+        rows = turned.reshape(3 * m, p + 1).T
 
         def twice(ratio: float) -> float:
-            spread, factor, _ = _pttrf(1 + ratio * diagonal, ratio * beside)
-            solved = np.ascontiguousarray(_pttrs(spread, factor, turned)[0])
-            both = rows @ solved.reshape(3 * m, p + 1)
+            spread = 1 + ratio * values
+            both = rows @ (turned / spread[:, None]).reshape(3 * m, p + 1)
             a, g = both[:p, :p], both[:p, p]
             rest = both[p, p] - g @ np.linalg.solve(a, g)
             return (3 * m - p) * np.log(max(rest, 1e-300)) + 3 * np.log(spread).sum() + np.linalg.slogdet(a)[1]
@@ -246,25 +250,12 @@ class _Kriged:
         return cls(inverse, of_y, of_motions, spread, beta, left, variance)
 
     def left_out(self) -> tuple[np.ndarray, float]:
-        """Returns each point's error (m,) by the model of the others, and the RMS ratio to σ (Dubrule 1983, in blocks
-        of 3)."""
+        """Returns each point's error (m,) by the model of the others, and the RMS ratio to σ (Dubrule 1983)."""
         block = np.diag(self.inverse)[:, None, None] * np.eye(3)
         block = block - self.of_motions @ self.spread @ np.swapaxes(self.of_motions, 1, 2)
         error = np.linalg.solve(block, self.left[:, :, None])[:, :, 0]
         ratio = np.sqrt((error * self.left).sum() / (3 * len(error) * self.variance))
         return np.linalg.norm(error, axis=1), float(ratio)
-
-
-def _field(found: _Likelihood, rows: np.ndarray, taken: np.ndarray) -> Field:
-    length, ratio, value, without = found.best()
-    root = np.sqrt(found.variance)[:, None]
-    y, motions = found.y * root, found.motions * root[:, :, None]
-    inverse = np.linalg.inv(ratio * _matern(found.distance / length) + np.diag(found.variance))
-    kriged = _Kriged.of(inverse, y, motions)
-    corrected, sigma_ratio = kriged.left_out()
-    plain, _ = _Kriged.of(np.diag(1 / found.variance), y, motions).left_out()
-    p_value = float(chdtrc(2, max(without - value, 0.0)))
-    return Field(length, p_value, rows, taken, plain, corrected, sigma_ratio, found, ratio, kriged)
 
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
@@ -277,9 +268,8 @@ DIGITS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubes:
-    """Errors by region of fit and of use. ``middle`` : (3,) of the cubes, mm, axes of frame a; ``sides_mm`` : (k,)
-    increasing; ``errors[i][j]`` : of the fit in cube i at points in cube j that are not in cube j − 1, held out in
-    turn, or None."""
+    """``middle`` : (3,) of the cubes, mm, axes of frame a; ``errors[i][j]`` : of the fit in cube i at points in cube j
+    that are not in cube j − 1, held out in turn, or None."""
 
     middle: Array
     sides_mm: Array
@@ -291,25 +281,12 @@ class Cubes:
 
 
 def cubes(
-    registration: Registration,
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    taken_back: np.ndarray | None = None,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
-    folds: int = 6,
+    registration: Registration, every: Problem, taken_back: np.ndarray | None = None, folds: int = 6
 ) -> Cubes | None:
-    """Fits the registration's model in cubes about the middle of its inliers and ``taken_back``, (m,) outliers; None
-    for too few points. Other arguments as in :func:`stcal.register.register`."""
+    """Fits the model in cubes about the middle of the inliers and ``taken_back``; None for too few points."""
     used = registration.inliers.copy()
     if taken_back is not None:
         used[taken_back] = True
-    every = Problem(
-        MODELS[registration.model],
-        np.asarray(xyz_a, float),
-        np.asarray(xyz_b, float),
-        noise_of(len(xyz_a), weights, covariances),
-    )
     problem = every[np.flatnonzero(used)]
     a = problem.xyz_a
     middle = (a.min(0) + a.max(0)) / 2
@@ -344,49 +321,46 @@ def _errors(problem: Problem, inside: np.ndarray, folds: int, seed: int) -> np.n
     return error
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Findings:
-    """A registration of file ``where`` and its checks. ``lines`` : (n,) of the points; ``field``, ``cubes`` : or
-    None."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Findings(Registration):
+    """A registration of the file ``pairs`` and its checks. ``lines`` : (n,) of the points; ``xyz_a`` : (n, 3) points,
+    mm; ``field``, ``cubes`` : or None."""
 
-    where: str
+    format: ClassVar = "stcal registration 1"
+    pairs: str
     lines: Sequence[int]
     xyz_a: Array
-    registration: Registration
     field: Field | None
     cubes: Cubes | None
 
     def __post_init__(self):
-        freeze(self, "xyz_a", (len(self.registration), 3), "points")
+        Registration.__post_init__(self)
+        freeze(self, "xyz_a", (len(self), 3), "points")
+
+    @property
+    def covariance_of(self) -> tuple[str, ...]:
+        """Names of the covariance's rows, with units."""
+        if len(self.covariance) < 12:
+            return ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm", "scale")[: len(self.covariance)]
+        return tuple(f"m{row}{column}" + ("_mm" if column == "4" else "") for row in "123" for column in "1234")
 
     @property
     def length_mm(self) -> np.ndarray:
         """Lengths (n,) of the residuals, mm."""
-        return np.linalg.norm(self.registration.residuals, axis=1)
-
-    def middle(self) -> np.ndarray:
-        """Middle (3,) of the inliers, frame a, mm."""
-        return self.xyz_a[self.registration.inliers].mean(0)
+        return np.linalg.norm(self.residuals, axis=1)
 
     def sigma_mm_at(self, xyz_a: np.ndarray) -> np.ndarray:
         """Returns σ (3,) by the transform's covariance at a point of frame a, along b's axes."""
-        found = self.registration
-        by_step = jacobian(MODELS[found.model], found.b_from_a, xyz_a[None])[0]
-        return np.sqrt(np.diag(by_step @ found.covariance @ by_step.T).clip(0))
+        by_step = jacobian(MODELS[self.model], self.b_from_a, xyz_a[None])[0]
+        return np.sqrt(np.diag(by_step @ self.covariance @ by_step.T).clip(0))
 
 
 @one_thread()
-def findings(
-    where: str,
-    lines: Sequence[int],
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
-    registration: Registration,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
-) -> Findings:
-    """Returns a registration with its residual field and cubes. Arguments as in :func:`stcal.register.pipeline`."""
-    field = residual_field(registration, xyz_a, xyz_b, weights, covariances)
-    back = None if field is None else field.taken_back
-    reach = cubes(registration, xyz_a, xyz_b, back, weights, covariances)
-    return Findings(where, lines, xyz_a, registration, field, reach)
+def findings(pairs: Pairs, registration: Registration) -> Findings:
+    """Returns a registration of these pairs with its residual field and cubes."""
+    noise = noise_of(len(pairs), pairs.weights, pairs.covariances)
+    problem = Problem(MODELS[registration.model], pairs.xyz_a, pairs.xyz_b, noise)
+    field = residual_field(registration, problem)
+    reach = cubes(registration, problem, None if field is None else field.taken_back)
+    found = {each.name: getattr(registration, each.name) for each in fields(registration)}
+    return Findings(**found, pairs=pairs.where, lines=pairs.lines, xyz_a=pairs.xyz_a, field=field, cubes=reach)

@@ -10,19 +10,17 @@ import numpy as np
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
-from stcal.geometry.rigid import align_rigid
+from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.geometry.robust import length_limit
 from stcal.io.table import Table, read_table
 from stcal.parallel import one_thread
 from stcal.register import register
-from stcal.register.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
 from stcal.register.liu2017 import Liu2017Options
-from stcal.register.page import matrix_table
+from stcal.register.page import error_table, matrix_table
 from stcal.register.pairs import WHAT, Pairs
 from stcal.register.result import ErrorFigures, Registration
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
-from stcal.report.text import number
 from stcal.robot.identification.adjustment import State, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
@@ -76,19 +74,25 @@ class RegisteredRobot(Brief):
     wild: np.ndarray
     off_mm: float
 
-    def errors(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """Returns (which rows, errors by the transform, errors by base and kinematics)."""
-        groups = [("all rows", self.transform_mm, self.kinematics_mm)]
-        if self.wild.any() and not self.wild.all():
-            name = f"without {self.wild.sum()} outliers"
-            groups.append((name, self.transform_mm[~self.wild], self.kinematics_mm[~self.wild]))
-        return groups
+    @property
+    def b_from_base(self) -> Rigid:
+        """The identified robot's base in frame b, mm."""
+        return self.identified.robot.world_from_base
+
+    @property
+    def transform(self) -> ErrorFigures:
+        """Errors of the transform at rows held out, without outliers of both."""
+        return ErrorFigures.of(self.transform_mm[~self.wild | self.wild.all()])
+
+    @property
+    def kinematics(self) -> ErrorFigures:
+        """Errors of base and kinematics at rows held out, without outliers of both."""
+        return ErrorFigures.of(self.kinematics_mm[~self.wild | self.wild.all()])
 
     @property
     def better(self) -> bool:
         """True if base and kinematics together predict better."""
-        _, transform, kinematics = self.errors()[-1]
-        return bool(len(transform) and kinematics.mean() < transform.mean())
+        return self.kinematics.mean_mm < self.transform.mean_mm
 
 
 @require_arguments
@@ -138,10 +142,9 @@ def register_with_robot(
     ConvergenceError
         The identification reaches no minimum.
     """
-    if isinstance(registration, Registration):
-        known = pairs.weights, pairs.covariances
-        registration = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, registration, *known)
-    found, data = registration.registration, _measurements(pairs, joints, robot)
+    if not isinstance(registration, Findings):
+        registration = findings(pairs, registration)
+    found, data = registration, _measurements(pairs, joints, robot)
     if not len(found) == len(data) == len(pairs):
         raise InputError(
             "E-ARRAY-SHAPE",
@@ -149,7 +152,7 @@ def register_with_robot(
             "many of each needed",
         )
     options = {"model": found.model, "method": found.method, "threshold_mm": threshold_mm, "seed": found.seed}
-    options |= {"liu2017_options": liu2017_options} if liu2017_options else {}
+    options["liu2017_options"] = liu2017_options
     settings = IdentifyOptions("position", folds=0, seed=found.seed, partial=True)
     good = found.inliers.copy()
     if registration.field is not None:
@@ -157,12 +160,9 @@ def register_with_robot(
     identified, used = grown(robot, data, good, settings)
 
     def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
-        of_train = {
-            name: None if values is None else values[train]
-            for name, values in (("weights", pairs.weights), ("covariances", pairs.covariances))
-        }
-        settings_of_fold = {"folds": 0, "allow_ambiguous": True}
-        b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **of_train, **settings_of_fold).b_from_a
+        weights, covariances = (None if each is None else each[train] for each in (pairs.weights, pairs.covariances))
+        of_train = {"weights": weights, "covariances": covariances, "folds": 0, "allow_ambiguous": True}
+        b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **of_train).b_from_a
         return np.linalg.norm(pairs.xyz_b[test] - b_from_a @ pairs.xyz_a[test], axis=1)
 
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
@@ -171,37 +171,25 @@ def register_with_robot(
 
     parts = dealt(len(data), folds, np.random.default_rng([found.seed, 4]))
     done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
-    outliers_of_both = ~(found.inliers | used)[rows]
     nominal = positions(robot, data)
     off_mm = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
-    return RegisteredRobot(
-        robot,
-        identified,
-        found.model,
-        pairs.lines,
-        done,
-        rows,
-        by_one,
-        by_both,
-        outliers_of_both,
-        off_mm,
-    )
+    wild = ~(found.inliers | used)[rows]
+    return RegisteredRobot(robot, identified, found.model, pairs.lines, done, rows, by_one, by_both, wild, off_mm)
 
 
 def _measurements(pairs: Pairs, joints: Measurements | Table | str | Path, robot: Robot) -> Measurements:
     if isinstance(joints, Measurements):
+        q, targets, conditions = joints.q, joints.targets, joints.conditions
         if len(joints) != len(pairs):
             return joints
-        return Measurements(
-            pairs.where, pairs.lines, joints.q, joints.targets, pairs.xyz_b, conditions=joints.conditions
-        )
-    table = read_table(joints, WHAT)
-    try:
-        q = joint_values(table, robot)
-    except InputError as error:
-        raise InputError(error.code, f"{error} (--robot needs the joint values of each point)") from error
-    conditions = read_conditions(table, joints=len(robot.rows))
-    return Measurements(pairs.where, pairs.lines, q, targets_of(table), pairs.xyz_b, conditions=conditions)
+    else:
+        table = read_table(joints, WHAT)
+        try:
+            q = joint_values(table, robot)
+        except InputError as error:
+            raise InputError(error.code, f"{error} (--robot needs the joint values of each point)") from error
+        targets, conditions = targets_of(table), read_conditions(table, joints=len(robot.rows))
+    return Measurements(pairs.where, pairs.lines, q, targets, pairs.xyz_b, conditions=conditions)
 
 
 def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
@@ -226,59 +214,19 @@ def positions(robot: Robot, data: Measurements) -> np.ndarray:
     return tips(State(robot.chain(), tools), data.q, data.targets, data.conditions).translation
 
 
-def robot_part(beside: RegisteredRobot) -> RobotPart:
-    """Returns the comparison as part of the registration's file."""
-    result, lines = beside.identified, beside.lines
-    return RobotPart(
-        name=beside.robot.name,
-        b_from_base=_b_from_base(beside),
-        rank=result.rank,
-        parameters=len(result.names),
-        undetermined=list(result.undetermined),
-        sigma_mm=result.weighting.sigma_mm,
-        a_off_robot_file_mm=beside.off_mm,
-        better=beside.better,
-        held_out=HeldOutBoth(
-            folds=beside.folds,
-            lines=[lines[i] for i in beside.rows],
-            transform_mm=beside.transform_mm,
-            kinematics_mm=beside.kinematics_mm,
-            outliers_of_both=[lines[i] for i in beside.rows[beside.wild]],
-            figures=[
-                FiguresRow(rows=name, points=len(t), transform=_figures(t), kinematics=_figures(k))
-                for name, t, k in beside.errors()
-                if len(t)
-            ],
-        ),
-    )
-
-
 def comparison_section(beside: RegisteredRobot) -> document.Section:
     """Returns the comparison as a section of the report."""
-    result = beside.identified
+    outliers = f", without {beside.wild.sum()} outliers of both" if beside.wild.any() else ""
+    identified, open_ones = beside.identified, beside.identified.undetermined
     told = (
-        f"robot {beside.robot.name}: {result.rank} of {len(result.names)} parameters of axes, base and tool "
+        f"robot {beside.robot.name}: {identified.rank} of {len(identified.names)} parameters of axes, base and tool "
         "determined, solved together from the joint values and the positions in b; the same rows are held out of both "
-        "ways"
+        f"ways{outliers}"
     )
-    errors = document.Table(["<held out, mm", "points", "mean", "RMS", "max"], _rows(beside))
-    blocks = [told, errors, matrix_table("b_from_base of the identified robot", _b_from_base(beside)), *_notes(beside)]
-    return document.Section("Base and kinematics together", blocks, terminal=True)
-
-
-def _rows(beside: RegisteredRobot) -> list[list[str]]:
-    rows = []
-    for name, transform, kinematics in beside.errors():
-        for way, errors in ((f"{beside.model} transform", transform), ("base and kinematics together", kinematics)):
-            if len(errors):
-                rows.append([f"{name}: {way}", str(len(errors)), *(number(v, 4) for _, v in _figures(errors))])
-    return rows
-
-
-def _notes(beside: RegisteredRobot) -> list[str]:
-    notes, open_ones = [], beside.identified.undetermined
+    ways = [(f"{beside.model} transform", beside.transform), ("base and kinematics together", beside.kinematics)]
+    notes = []
     if open_ones:
-        shown = ", ".join(open_ones[:FIRST_NAMES]) + (", …" if len(open_ones) > FIRST_NAMES else "")
+        shown = ", ".join(open_ones[:FIRST_NAMES]) + ", …" * (len(open_ones) > FIRST_NAMES)
         notes.append(
             f"the points leave open: {shown}; b_from_base and the tool may be off along these; vary the orientation "
             "more"
@@ -290,12 +238,6 @@ def _notes(beside: RegisteredRobot) -> list[str]:
             f"a is {beside.off_mm:.3g} mm RMS off the positions of the robot file, after a rigid fit: it comes from "
             "another tool or other kinematics"
         )
-    return notes
-
-
-def _b_from_base(beside: RegisteredRobot) -> np.ndarray:
-    return beside.identified.robot.world_from_base.matrix()
-
-
-def _figures(errors: np.ndarray) -> MeanRmsMax:
-    return MeanRmsMax.model_validate(ErrorFigures.of(errors))
+    errors = error_table("held out, mm", ways) if len(beside.rows) else None
+    matrix = matrix_table("b_from_base of the identified robot", beside.b_from_base.matrix())
+    return document.Section("Base and kinematics together", [told, errors, matrix, *notes], terminal=True)

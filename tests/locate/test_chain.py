@@ -8,7 +8,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid, UncertainRigid
 from stcal.io.table import COVARIANCE, POSE, pose_cells
-from stcal.locate.chain import goal_chain, read_registered
+from stcal.locate.chain import goal_chain
 
 MOUNT = Rigid.exp([0.1, 0.2, 0.3, 10, 20, 30])
 FLANGE = Rigid.exp([1.0, 0, 0.5, 400, 0, 600])
@@ -71,7 +71,7 @@ def registered(path, b_from_a, model="rigid", covariance=None):
 
 def test_a_registration_leads_to_the_base_too(files, tmp_path):
     file = registered(tmp_path / "register.json", MOUNT.matrix())
-    goal = read_registered(file, files[2]).base_from_goal("any", SEEN)
+    goal = goal_chain(registration=file, offset=files[2]).base_from_goal("any", SEEN)
     mount = UncertainRigid(MOUNT, np.eye(6) * 1e-6)
     wanted = mount @ SEEN @ UncertainRigid.exact(OFFSET)
     assert np.allclose(goal.rigid.matrix(), wanted.rigid.matrix())
@@ -89,7 +89,7 @@ def test_a_registration_leads_to_the_base_too(files, tmp_path):
 def test_a_registration_that_is_no_rigid_motion_is_refused(tmp_path, matrix, model, size):
     file = registered(tmp_path / "register.json", matrix, model, np.eye(size))
     with pytest.raises(InputError, match=f"no rigid motion \\({model}: .*register with --model rigid"):
-        read_registered(file)
+        goal_chain(registration=file)
 
 
 def test_scenes_are_found_by_another_column(files):

@@ -64,11 +64,11 @@ def test_run_writes_accepted_poses(run, files, tmp_path):
     assert np.abs(goal.matrix() - chain.matrix()).max() < 1e-6
     assert (np.linalg.eigvalsh(table.pose_covariances("base_from_goal_")[0]) > 0).all()
     assert "# empty: reject: no tag of" in out.read_text()
-    scenes = {scene["scene"]: scene for scene in json.loads(record.read_text())["scenes"]}
-    assert scenes["empty"]["verdict"] == "reject"
+    scenes = {scene["name"]: scene for scene in json.loads(record.read_text())["scenes"]}
+    assert scenes["empty"]["verdict"]["decision"] == "reject"
     assert scenes["empty"]["camera_from_obj"] is None
-    assert all(check["passed"] for check in scenes["good"]["checks"])
-    assert len(scenes["good"]["corners"]) == 24
+    assert all(check["passed"] for check in scenes["good"]["verdict"]["checks"])
+    assert len(scenes["good"]["pose"]["residuals_px"]) == 24
     page = report.read_text()
     assert page.count("<svg") == 2
     assert "http://" not in page.replace("http://www.w3.org", "")
