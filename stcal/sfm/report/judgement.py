@@ -13,7 +13,7 @@ from stcal.geometry.clusters import NOTED
 from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.text import join, number, significant
-from stcal.sfm.data.as_drawn import NOT_AS_DRAWN
+from stcal.sfm.data.note import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN, SINGLE
 
 CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in 100,000."
 """Text on the false alarms of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
@@ -49,8 +49,6 @@ TESTED_BY = {"labels", "agreement"}
 """Keys of the checks of which one at least must be possible for σ to be tested at all."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
-LEFT_OUT_WHOLE = "left out whole: "
-"""How the note begins on a group that could not be solved."""
 EVERY_SIGMA = "every σ"
 DISTANCES = "all distances and the size"
 UNKNOWN_SIZE = "nothing of known size is in view, and its size is that of the drawing"
@@ -147,11 +145,16 @@ def invalidated(failed: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(what for key in failed for what in INVALIDATES.get(key, (EVERY_SIGMA,))))
 
 
-def without_sigma(report: dict) -> dict:
-    """Returns the content of ``report.json`` without σ and distances of chains, which a failed run must not show."""
+def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
+    """Returns the rows of the faces without σ, which a failed run must not show."""
     none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
+    return {name: face | none for name, face in faces.items()}
+
+
+def without_sigma(report: dict) -> dict:
+    """Returns the content of ``report.json`` without σ."""
     return report | {
-        "faces": {name: face | none for name, face in report["faces"].items()},
+        "faces": without_sigma_of(report["faces"]),
         "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],
         "summary": report["summary"] | {"scale_sigma_ppm": None},
     }
@@ -192,8 +195,8 @@ def _capital(text: str) -> str:
 
 def _drawn(report: dict) -> list[tuple[str, str]]:
     """Returns in which ways the faces are not where they were drawn, and what to do about each."""
-    notes = [note.removeprefix(NOT_AS_DRAWN) for note in report["notes"] if note.startswith(NOT_AS_DRAWN)]
-    return [(what, remedy) for what, _, remedy in (note.rpartition(": ") for note in notes)] if report["faces"] else []
+    notes = _notes(report, NOT_AS_DRAWN) if report["faces"] else []
+    return [(note["words"], note["remedy"]) for note in notes]
 
 
 def _by_drawing(report: dict) -> _Cause | None:
@@ -292,29 +295,24 @@ def _missing_faces(report: dict) -> list[str]:
     return [face for face in report["summary"]["faces_not_seen"] if face in expected]
 
 
-def lost_groups(notes: Iterable[str]) -> list[str]:
-    """Returns the names of the groups that could not be solved, of all notes of a run."""
-    begin = f"{LEFT_OUT_WHOLE}group "
-    return [note.removeprefix(begin).partition(":")[0] for note in notes if note.startswith(begin)]
+def _notes(report: dict, code: str) -> list[dict]:
+    return [note for note in report["notes"] if note["code"] == code]
 
 
 def _lost_groups(report: dict) -> list[str]:
-    return [f"group {name}" for name in lost_groups(report["notes"])]
+    return [f"group {note['place']}" for note in _notes(report, GROUP_LEFT_OUT)]
 
 
-def images_left_out(face: str, notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Returns the images in which a face was read but left out, of all notes (image, note)."""
-    begins = f"a pattern like face {face}:", f"face {face}: read in one image"
-    return list(dict.fromkeys(image for image, note in notes if note.startswith(begins)))
-
-
-def _left_out_in(report: dict, face: str) -> list[str]:
-    return images_left_out(face, ((note["image"], note["note"]) for note in report["left_out"]["notes"]))
+def left_out_in(report: dict, face: str) -> list[str]:
+    """Returns the images in which a face was read but left out."""
+    of_face = {(ELSEWHERE, face), (SINGLE, face)}
+    notes = report["left_out"]["notes"]
+    return list(dict.fromkeys(each["image"] for each in notes if (each["code"], each["place"]) in of_face))
 
 
 def _is_read(report: dict, face: str) -> bool:
     """Whether a face that is not in the result was read in two images, or has circles that were mapped or left out."""
-    return len(_left_out_in(report, face)) > 1 or _has_circles(report, face)
+    return len(left_out_in(report, face)) > 1 or _has_circles(report, face)
 
 
 def _has_circles(report: dict, face: str) -> bool:
@@ -331,7 +329,7 @@ def _gaps(report: dict) -> list[str]:
     """Returns in words what is missing: faces that are not in the result, or in one image alone, and lost groups."""
     never, words = [], []
     for face in report["summary"]["faces_not_seen"]:
-        images = _left_out_in(report, face)
+        images = left_out_in(report, face)
         if images:
             shown = "1 image" if len(images) == 1 else f"{len(images)} images"
             words.append(f"face {face} was read in {shown} and left out")
@@ -386,10 +384,10 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
         ways = [chain for chains in report["chains"].values() if len(chains) > 1 for chain in chains]
         if not ways:
             return "There are no σ, and no face is reached by two chains that could be compared."
-        apart, turned = (max(way[key] for way in ways) for key in ("translation_um", "rotation_mdeg"))
+        apart, turned = max(way["translation_mm"] for way in ways), max(way["rotation_rad"] for way in ways)
         return (
-            f"There are no σ; chains to the same face through different groups are up to {number(apart, 1)} µm and "
-            f"{number(turned, 2)} mdeg off their mean."
+            f"There are no σ; chains to the same face through different groups are up to {number(1e3 * apart, 1)} µm "
+            f"and {number(1e3 * math.degrees(turned), 2)} mdeg off their mean."
         )
     size = report["summary"]["scale_sigma_ppm"]
     scale = "" if size is None else f", the size to {_relative(size)}"
@@ -477,10 +475,9 @@ def _by_gaps(report: dict) -> _Cause | None:
 
 def _by_lost_group(report: dict) -> _Cause | None:
     """Returns why the first group that was left out could not be solved; None if all could."""
-    for note in report["notes"]:
-        if note.startswith(f"{LEFT_OUT_WHOLE}group "):
-            found, _, remedy = note.removeprefix(LEFT_OUT_WHOLE).partition("; ")
-            return _Cause(f"Left out: {found}.", f"{_capital(remedy)}." if remedy else "Take it again.")
+    for note in _notes(report, GROUP_LEFT_OUT):
+        remedy = f"{_capital(note['remedy'])}." if note["remedy"] else "Take it again."
+        return _Cause(f"Left out: {note['words']}.", remedy)
     return None
 
 
@@ -535,7 +532,7 @@ def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cau
         return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")
     centre = summary.get("circle_sigma_px")
     of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
-    blurs = [(row["nearest_blur_px"] + row["farthest_blur_px"]) / 2 for row in report.get("focus", [])]
+    blurs = [sum(row["blur_px"]) / 2 for row in report.get("focus", [])]
     if blurs and (blur := median(blurs)) > SHARP_PX:
         return _Cause(
             f"The sharpness: edges are blurred by {number(blur, 1)} px, half of that is usual, and σ of centres grow "
@@ -585,7 +582,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
     if report["faces"] and _are_few(report):
         advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
     if report["faces"] and (missing := _lacking(report)):
-        read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
+        read = [face for face in missing if _is_read(report, face) or left_out_in(report, face)]
         unseen = [face for face in missing if face not in read]
         if unseen:
             seen = "in no image that was used" if _some_unused(report) else "not seen in any image"

@@ -49,8 +49,7 @@ from stcal.sfm.report.figures import FIRST_IMAGES, Photograph, Photographs, Resi
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
 from stcal.sfm.report.sections import Words
-from stcal.sfm.runs.output import report_of, residuals_px
-from stcal.sfm.runs.report import ReportFile
+from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, folder_of, require_run, verify
 from stcal.sfm.runs.text import found_in_all
