@@ -61,32 +61,15 @@ LEAST_UPRIGHT = 0.5
 """Length of the mean of the cameras' upward directions from which on the photographs say where up is."""
 
 
-def upright(report: dict) -> dict:
-    """Report with target, boards and cameras as they stood for upright photographs, else the target's Z up."""
+def upright(parts: list[dict], cameras: list[dict]) -> list[dict]:
+    """Returns the parts of the scene as they stood for upright photographs, else with the target's Z up."""
     from scipy.spatial.transform import Rotation
 
-    scene = report["scene"]
-    up = -np.mean([camera["axes"][1] for camera in scene["cameras"]] or [np.zeros(3)], axis=0)
+    up = -np.mean([camera["axes"][1] for camera in cameras] or [np.zeros(3)], axis=0)
     if np.linalg.norm(up) < LEAST_UPRIGHT:
-        return report
-    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0].as_matrix()
-    whole = np.eye(4)
-    whole[:3, :3] = turn
-
-    def turned(xyz) -> np.ndarray:
-        return np.asarray(xyz, float).reshape(-1, 3) @ turn.T
-
-    cameras = [
-        {**camera, "position_mm": turned(camera["position_mm"])[0], "axes": turned(camera["axes"])}
-        for camera in scene["cameras"]
-    ]
-    circles = {label: turned(xyz)[0] for label, xyz in scene["circles"].items()}
-    boards = {name: turned(xyz) for name, xyz in scene["boards"].items()}
-    faces = {
-        name: {**face, "target_from_face": whole @ np.array(face["target_from_face"])}
-        for name, face in report["faces"].items()
-    }
-    return {**report, "faces": faces, "scene": {**scene, "cameras": cameras, "circles": circles, "boards": boards}}
+        return parts
+    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0]
+    return [part | {"xyz": np.round(turn.apply(part["xyz"]), DIGITS).tolist()} for part in parts]
 
 
 def _points(places: Iterable) -> np.ndarray:

@@ -150,7 +150,7 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     space = [
         macro(
             "turned",
-            space_parts(figures.upright(report), colours),
+            lambda: figures.upright(parts, report["scene"]["cameras"]),
             f"Target, {with_it} in space",
             [("target", "Target"), ("all", f"With {with_it}")],
         ),
