@@ -49,8 +49,8 @@ class FaceOff(Part):
 
 class ComparedRow(Part):
     method: str
-    faces: dict[ByFace, FaceOff] = {}
-    missing: list[str] = []
+    faces: dict[ByFace, FaceOff] = Field(default={})
+    missing: list[str] = Field(default=[])
     board_mean_um: float | None = None
     board_spread_um: float | None = None
     residual_rms_px: float | None = None
