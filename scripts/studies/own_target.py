@@ -44,9 +44,9 @@ def rehearse(folder: Path) -> None:
         *("--images", IMAGES, *WORKERS),
     )  # fmt: skip
     run = call(folder, "run", "data/images", "--camera", "data/cameras.txt", *OWN, "--out", "run", *WORKERS)
-    table = next(number for number, line in enumerate(run) if line.split()[:2] == ["face", "x"])
-    end = next(number for number, line in enumerate(run) if line.startswith("checks:"))
-    show(run[table : end + 1])
+    table = next(number for number, line in enumerate(run) if line.startswith("Face "))
+    end = run.index("", table)
+    show(run[table:end])
     show(call(folder, "compare", "run", "data/truth.json")[:-1])
 
 

@@ -126,7 +126,7 @@ def tags_of_no_face(files: Sequence[ImageFile], faces: Sequence[FaceDesign], uns
         return []
     shown = ", ".join(f"tag {number} of {name} in {count} of {len(chosen)}" for (name, number), count in strange[:3])
     names = ", ".join(f"{number} of {name}" for name, number in missing[:3])
-    return [f"images show tags that no face has ({shown}), and not {names}: correct the ids in target.toml"]
+    return [f"images show tags that no face has ({shown}), and not {names}"]
 
 
 def why_unseen(files: Sequence[ImageFile], faces: Sequence[FaceDesign]) -> str:

@@ -33,18 +33,18 @@ from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.causes import cause_of_drawing, cause_of_size
 from stcal.sfm.checks.suite import run_checks, shows_rim
 from stcal.sfm.checks.verdict import MOST_SIGMAS, Check
-from stcal.sfm.data.as_drawn import NOT_AS_DRAWN, misnamed_groups, misplaced_images, not_as_drawn
+from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import by_group, detections_csv
+from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays, seen_by
 from stcal.sfm.detect.labels import LabelledImage, is_board_alone, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, plain_lens, unknown_lens
-from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.folder import overlays_beside, shown_if_failed, write_run
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.output import unadjusted
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
+from stcal.sfm.runs.report import unadjusted
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import (
     DetectedImages,
@@ -264,7 +264,8 @@ def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -
             result = _solved(task, detection, labelled, model_of(plain_lens(result.calibration.camera), PHOTOGRAPHS))
         printed = target.with_faces(printed=True).faces
         absent = [face for face in printed if face.id not in result.target.target_from_face]
-        strange = [f"{NOT_AS_DRAWN}{note}" for note in tags_of_no_face(task.files[0], printed, absent)]
+        tags, remedy = tags_of_no_face(task.files[0], printed, absent), "correct the ids in target.toml"
+        strange = [Note(words, NOT_AS_DRAWN, remedy=remedy, then=": ") for words in tags]
         result = replace(result, notes=(*result.notes, *strange))
         left_out.update(unadjusted(result))
     return result

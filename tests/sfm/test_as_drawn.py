@@ -13,6 +13,7 @@ from stcal.sfm import pipeline
 from stcal.sfm.checks.causes import cause_of_drawing
 from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_drawn
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
 from stcal.sfm.mapping.body import Corners, wrong_sizes
 from stcal.sfm.mapping.placed import place_with_camera
 from stcal.sfm.planning.bodies import corners_seen
@@ -110,7 +111,8 @@ def test_one_tag_of_another_size_or_id_is_named(tmp_path, what):
 
 def test_a_run_that_is_not_as_drawn_is_with_care_and_says_what_to_do(small_run):
     report = load_run(small_run).report
-    notes = [*report["notes"], "not as drawn: faces are 0.1 times as far: check the sizes"]
+    drawn = {"code": NOT_AS_DRAWN, "words": "faces are 0.1 times as far", "remedy": "check the sizes"}
+    notes = [*report["notes"], drawn]
     report["options"]["expect_faces"] = list(report["faces"])
     assert judgement_of(report).verdict == "yes"
     judged = judgement_of(report | {"notes": notes})
@@ -148,11 +150,11 @@ def test_photographs_that_belong_to_another_group_are_named():
     target = reference_target()
     right, wrong = seen("12", "1", "2"), seen("14", "1", "4")
     stray = seen("12")[0]
-    notes = {stray.name: ("a pattern like face 1: left out", "a pattern like face 4: left out")}
+    notes = {stray.name: (Note("left out", ELSEWHERE, "1"), Note("left out", ELSEWHERE, "4"))}
     images = [stray, *right[1:], *wrong]
     [note] = misplaced_images(images, notes, target)
     assert note == "12/0 shows faces 1 and 4, as group 14 does: move it there if it was taken with these"
-    both = {stray.name: (*notes[stray.name], "a pattern like face 2: left out")}
+    both = {stray.name: (*notes[stray.name], Note("left out", ELSEWHERE, "2"))}
     assert misplaced_images(images, both, target) == []
     assert misplaced_images([*right, *wrong], {}, target) == []
 

@@ -1,7 +1,8 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -216,12 +217,18 @@ def loops_check(again: Again) -> Check:
     ]
     groups = sorted({group for _, *ways in pairs for way in ways for group in way.groups})
     alone = again.adjust([[m for m in again.joint.models if m.group == group] for group in groups])
-    steps = _Steps(again, dict(zip(groups, alone, strict=True)))
+    single = dict(zip(groups, alone, strict=True))
+
+    @cache  # several ways share a step
+    def step_of(group: str, a: str, b: str) -> tuple[Rigid, np.ndarray]:
+        target, _ = again.posed(single[group], (a, b))
+        return target.target_from_face[b], target.face_covariance[b]
+
     trials = []
     redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
     for face, first, second in pairs:
         try:
-            ends = [_along(steps, way) for way in (first, second)]
+            ends = [_along(step_of, way) for way in (first, second)]
         except StcalError:
             continue
         difference = _difference(ends[0][0], ends[1][0])
@@ -234,27 +241,15 @@ def loops_check(again: Again) -> Check:
     return judge(key, title, trials, "loops", remedy, covered=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Steps:
-    """Steps from one face to another by one group, which several ways share. ``single`` : adjustments by group."""
-
-    again: Again
-    single: Mapping[str, JointResult | StcalError]
-    known: dict[tuple[str, str, str], tuple[Rigid, np.ndarray]] = field(default_factory=dict)
-
-    def of(self, group: str, a: str, b: str) -> tuple[Rigid, np.ndarray]:
-        """Returns a_from_b by a group, and its covariance (6, 6)."""
-        if (group, a, b) not in self.known:
-            target, _ = self.again.posed(self.single[group], (a, b))
-            self.known[group, a, b] = target.target_from_face[b], target.face_covariance[b]
-        return self.known[group, a, b]
+Step = Callable[[str, str, str], tuple[Rigid, np.ndarray]]
+"""Returns a_from_b by a group alone, and its covariance (6, 6), from the names of group, face a and face b."""
 
 
-def _along(steps: _Steps, way: FaceChain) -> tuple[Rigid, np.ndarray]:
+def _along(step_of: Step, way: FaceChain) -> tuple[Rigid, np.ndarray]:
     """Returns reference_from_face along a way, with each group adjusted alone, and its covariance (6, 6)."""
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
-        step, step_covariance = steps.of(group, a, b)
+        step, step_covariance = step_of(group, a, b)
         # The pose of face a turns the step to face b; an error of its rotation moves b by the lever arm from a to b.
         arm = np.block([[np.eye(3), np.zeros((3, 3))], [-skew(pose.rotation @ step.translation), np.eye(3)]])
         turn = block_diag(pose.rotation, pose.rotation)

@@ -10,10 +10,8 @@ import numpy as np
 from stcal.design import TargetDesign
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
 
-NOT_AS_DRAWN = "not as drawn: "
-"""How a note begins on faces that are not where the design or the names of groups have them; what to do follows behind
-the last colon."""
 MOST_TURNED_DEG = 25.0
 """Largest angle of a face to its rough pose. A rough pose is good to a few degrees; a face on the wrong side of the
 body, or drawn turned, is off by far more."""
@@ -21,14 +19,12 @@ FAR_DEG = 45.0
 """Angle from which a face is not the one that was drawn: half of that between two sides of a box."""
 LIKE_DRAWN = 1.3
 """Largest factor between distances of faces and those of their rough poses."""
-LIKE_A_FACE = re.compile(r"a pattern like face ([^:]+):")
-"""How a note of an image begins on a face that was read and left out."""
 SHOWN, RARELY = 2, 3
 """Number of images that must show a face before its group counts as one of it, and how many times as many must show it
 as a face that the group is named after."""
 
 
-def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, one_folder: bool = False) -> list[str]:
+def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, one_folder: bool = False) -> list[Note]:
     """Returns notes on faces that are not where the rough poses of the design have them; ``one_folder``: whether
     photographs in one folder were taken to be of one setting of target and board."""
     rough = {face: pose for face, pose in design.rough_poses().items() if face in target_from_face}
@@ -43,10 +39,9 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
     ratios = [seen / drawn for drawn, seen in apart if drawn > 0]
     ratio = float(np.median(ratios)) if ratios else 1.0
     if not 1 / LIKE_DRAWN < ratio < LIKE_DRAWN:
-        notes.append(
-            f"{NOT_AS_DRAWN}faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has "
-            "them: check the sizes that it states (size_mm, radius_mm, pitch_mm), and that of the board"
-        )
+        what = f"faces are {ratio:.2g} times as far from one another as their rough_pose in target.toml has them"
+        sizes = "check the sizes that it states (size_mm, radius_mm, pitch_mm), and that of the board"
+        notes.append(Note(what, NOT_AS_DRAWN, remedy=sizes, then=": "))
     turned = turned_faces(found, rough)
     if not turned:
         return notes
@@ -60,7 +55,7 @@ def not_as_drawn(target_from_face: Mapping[str, Rigid], design: TargetDesign, on
     folders = (
         "put the photographs of each setting of target and board into a folder of its own; or " if one_folder else ""
     )
-    return [*notes, f"{NOT_AS_DRAWN}{what}: {folders}correct names, ids or rough_pose"]
+    return [*notes, Note(what, NOT_AS_DRAWN, remedy=f"{folders}correct names, ids or rough_pose", then=": ")]
 
 
 def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict[str, float]:
@@ -74,7 +69,7 @@ def turned_faces(found: Mapping[str, Rigid], rough: Mapping[str, Rigid]) -> dict
     return {face: angle for face, angle in angles[anchor].items() if angle > MOST_TURNED_DEG}
 
 
-def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[str]:
+def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDesign) -> list[Note]:
     """Returns notes on groups that are named after faces, and show others in place of them."""
     ids, notes = [face.id for face in design.faces], []
     for group, images in by_group(observations).items():
@@ -84,10 +79,9 @@ def misnamed_groups(observations: Sequence[ImageObservations], design: TargetDes
         most = max((seen[face] for face in others), default=0)
         if named and most and any(RARELY * seen[face] < most for face in named):
             shown = [face for face, _ in seen.most_common(len(named))]
-            notes.append(
-                f"{NOT_AS_DRAWN}group {group} is named after {_faces(sorted(named))} and shows {_faces(shown)}: "
-                "correct the names of faces in target.toml, or of folders"
-            )
+            what = f"group {group} is named after {_faces(sorted(named))} and shows {_faces(shown)}"
+            remedy = "correct the names of faces in target.toml, or of folders"
+            notes.append(Note(what, NOT_AS_DRAWN, group, remedy, then=": "))
     return notes
 
 
@@ -99,7 +93,7 @@ def misplaced_images(
     named = {image.group: faces_in_name(image.group, ids) for image in observations}
     found = []
     for image in observations:
-        read = {match[1] for note in notes.get(image.name, ()) if (match := LIKE_A_FACE.match(note))}
+        read = {n.place for n in notes.get(image.name, ()) if isinstance(n, Note) and n.code == ELSEWHERE}
         seen = (set(image.face_ids()) | read) & set(ids)
         if not named[image.group] or named[image.group] <= seen:
             continue

@@ -25,6 +25,7 @@ from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.model import Centres, ImageObservations
+from stcal.sfm.data.note import BOARD_LEFT_OUT, ELSEWHERE, SINGLE, Note
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import Focus, correct_defocus
@@ -86,7 +87,12 @@ def labelled_image(
     measured = {f.name: getattr(centres, f.name) for f in fields(ImageObservations)[3:]}
     observations = ImageObservations(name, group, tuple(labels), **measured)
     times = Counter(notes)
-    return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))
+    return LabelledImage(observations, tuple(note if n == 1 else _repeatedly(note, n) for note, n in times.items()))
+
+
+def _repeatedly(note: str, times: int) -> Note:
+    code, place = (note.code, note.place) if isinstance(note, Note) else ("", "")
+    return Note(f"{note} ({times} times)", code, place)
 
 
 def unlabelled(name: str, group: str, detection: ImageDetection, *notes: str) -> LabelledImage:
@@ -302,7 +308,7 @@ def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[La
         note = f"{read} that other images must show; left out, it is a reflection or another object, or hidden there"
         for i, image in enumerate(images):
             labels_of_face = [label for label in image.observations.labels if label.plane == face]
-            images[i] = image.without(labels_of_face, [note])
+            images[i] = image.without(labels_of_face, [Note(note, SINGLE, face)])
     return images
 
 
@@ -418,40 +424,37 @@ def _repeated(detection: ImageDetection) -> list[str]:
     return [f"{what} found more than once; left out, one may be a reflection" for what in detection.repeated]
 
 
-OF_A_BOARD = ("a board of ", "board of ")
-"""Beginnings of notes on a whole board that is left out of an image."""
-
-
-def leaves_a_board_out(note: str) -> bool:
-    """Returns whether a note concerns a whole board, not single dots."""
-    return note.startswith(OF_A_BOARD)
-
-
 def _contradiction(views: Readings) -> str:
     view = views[0]
     if not view.named:
         return _open(views)
-    name = f"a board of {len(view.rows)} dots" if view.plane == BOARD else f"a pattern like face {view.plane}"
-    return (
+    is_board = view.plane == BOARD
+    name = f"a board of {len(view.rows)} dots" if is_board else f"a pattern like face {view.plane}"
+    return Note(
         f"{name}: not where the group's other images see it; left out, it is a reflection or another object, or the "
-        "photograph is of another group or of a body that was moved"
+        "photograph is of another group or of a body that was moved",
+        BOARD_LEFT_OUT if is_board else ELSEWHERE,
+        view.plane,
     )
 
 
 def _open(views: Readings) -> str:
     if not views[0].named:
         return open_face_note(len(views[0].rows), (view.plane for view in views))
-    return (
+    return Note(
         f"board of {len(views[0].rows)} dots left out: {len(views)} numberings fit, none keeps it where the group's "
-        "other images see it; show a face that they show, or check that nothing was moved"
+        "other images see it; show a face that they show, or check that nothing was moved",
+        BOARD_LEFT_OUT,
     )
 
 
 def _foreign(view: PlaneView) -> str:
-    return (
+    return Note(
         f"a pattern like face {view.plane}: not where other groups see that face against the others, or turned from "
         f"its rough_pose by more than {FAR_DEG:.0f}°; left out, it is a reflection or another object, "
-        "the image is mirrored, or rough_pose is wrong"
+        "the image is mirrored, or rough_pose is wrong",
+        ELSEWHERE,
+        view.plane,
     )
 
 
@@ -495,7 +498,7 @@ def _views(image: DetectedImage, target: TargetDesign, board: BoardDesign) -> li
     if not views:
         return f"a board without a pose; {UNNUMBERED}"
     if not all(_is_symmetry(views[0].camera_from_plane.inverse() @ v.camera_from_plane, board) for v in views):
-        return f"board of {len(views[0].rows)} dots: {len(views)} numberings fit; {UNNUMBERED}"
+        return Note(f"board of {len(views[0].rows)} dots: {len(views)} numberings fit; {UNNUMBERED}", BOARD_LEFT_OUT)
     return list(views)
 
 

@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, groupby
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from stcal.report.svg import (
     arrows,
     mixed_names,
     round_below,
-    ticks,
 )
 from stcal.report.text import number
 
@@ -58,58 +57,19 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     return drawing
 
 
-def image_bars(rows: list[dict], colours: dict[str, str]) -> Drawing:
-    """Draws the RMS residual of each image as a bar in its group's colour, and its largest residual as a tick."""
-    drawing, count = Drawing(10.5, 2.9), max(len(rows), 1)
-    top = max((row["max_px"] for row in rows), default=0.0)
-    axes = Axes(drawing, (43.0, 19.0, 749.0, 176.0), (0.2, count + 0.8), (0.0, 1.05 * top if top > 0 else 1.0))
-    numbers = list(range(1, len(rows) + 1, max(1, int(np.ceil(len(rows) / 40)))))
-    columns = numbers, list(map(str, numbers))
-    axes.frame("number of the image in the table below", "residual, px", "y", columns, ticks(*axes.y, 8))
-    groups = [row["group"] for row in rows]
-    for group in dict.fromkeys(groups):
-        colour = colours.get(group, INK)
-        own = [(i, row["rms_px"]) for i, row in enumerate(rows, 1) if row["group"] == group]
-        bars = [axes.at([i - 0.36, i + 0.36, i + 0.36, i - 0.36], [0, 0, rms, rms]) for i, rms in own]
-        drawing.lines(bars, fill=colour)
-        # The name of each group stands over its first image, so that colour is not needed.
-        drawing.words((axes.at(groups.index(group) + 0.6, 0)[0, 0], axes.box[1] - 6), group, SMALL, "start", colour)
-    largest = axes.at(np.arange(1, len(rows) + 1), [row["max_px"] for row in rows])
-    half = np.array([min(4.5, 0.4 * (axes.box[2] - axes.box[0]) / (count + 0.6)), 0.0])
-    drawing.lines([np.array([at - half, at + half]) for at in largest], INK, 1.4)
-    return drawing
-
-
 LEAST_UPRIGHT = 0.5
 """Length of the mean of the cameras' upward directions from which on the photographs say where up is."""
 
 
-def upright(report: dict) -> dict:
-    """Report with target, boards and cameras as they stood for upright photographs, else the target's Z up."""
+def upright(parts: list[dict], cameras: list[dict]) -> list[dict]:
+    """Returns the parts of the scene as they stood for upright photographs, else with the target's Z up."""
     from scipy.spatial.transform import Rotation
 
-    scene = report["scene"]
-    up = -np.mean([camera["axes"][1] for camera in scene["cameras"]] or [np.zeros(3)], axis=0)
+    up = -np.mean([camera["axes"][1] for camera in cameras] or [np.zeros(3)], axis=0)
     if np.linalg.norm(up) < LEAST_UPRIGHT:
-        return report
-    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0].as_matrix()
-    whole = np.eye(4)
-    whole[:3, :3] = turn
-
-    def turned(xyz) -> np.ndarray:
-        return np.asarray(xyz, float).reshape(-1, 3) @ turn.T
-
-    cameras = [
-        {**camera, "position_mm": turned(camera["position_mm"])[0], "axes": turned(camera["axes"])}
-        for camera in scene["cameras"]
-    ]
-    circles = {label: turned(xyz)[0] for label, xyz in scene["circles"].items()}
-    boards = {name: turned(xyz) for name, xyz in scene["boards"].items()}
-    faces = {
-        name: {**face, "target_from_face": whole @ np.array(face["target_from_face"])}
-        for name, face in report["faces"].items()
-    }
-    return {**report, "faces": faces, "scene": {**scene, "cameras": cameras, "circles": circles, "boards": boards}}
+        return parts
+    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0]
+    return [part | {"xyz": np.round(turn.apply(part["xyz"]), DIGITS).tolist()} for part in parts]
 
 
 def _points(places: Iterable) -> np.ndarray:
@@ -122,41 +82,21 @@ def _length(share: float, points: np.ndarray) -> float:
     return share * float(np.ptp(points, axis=0).max()) if len(points) else 1.0
 
 
-def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> Drawing:
-    """Draws cameras, boards and the target's circles in the target frame."""
-    target = _points(scene["circles"].values())
-    positions = _points(view["position_mm"] for view in scene["cameras"])
-    boards = {name: _points(xyz) for name, xyz in scene["boards"].items()}
-    everything = np.vstack([target, positions, *boards.values()])
-    depth = _length(CAMERA, everything)
+def still(parts: list[dict], azimuth: float) -> Drawing:
+    """Draws the parts of the scene from one side; sheets lie below all else."""
     drawing = Drawing(5.4, 4.9)
-    space = Space(drawing, everything, 22, azimuth)
-    for name, xyz in boards.items():
-        drawing.marks(space.at(xyz), "dot", 1.8, colours.get(name, INK))
-    drawing.marks(space.at(target), "dot", 2.0, "#000000")
-    for name in dict.fromkeys(view["group"] for view in scene["cameras"]):
-        views = [view for view in scene["cameras"] if view["group"] == name]
-        pyramids = [space.at(line) for view in views for line in frustum(view, camera, depth)]
-        drawing.lines(pyramids, colours.get(name, INK), 0.9)
-    return drawing
-
-
-def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> Drawing:
-    """Draws the target's circles, and the frame of each face with its name at the end of the normal."""
-    parts = _faces(circles, faces)
-    xyz = _points(circles.values())
-    shown = [_points(part["xyz"]) for part in parts]
-    drawing = Drawing(5.4, 4.9)
-    space = Space(drawing, np.vstack([xyz, *shown]), 24, azimuth)
-    for part, own in zip(parts, shown, strict=True):
+    space = Space(drawing, np.vstack([_points(part["xyz"]) for part in parts] or [np.zeros((1, 3))]), 24, azimuth)
+    for part in sorted(parts, key=lambda part: part["kind"] != "sheet"):
+        places, colour = space.at(_points(part["xyz"])), part["colour"]
         if part["kind"] == "sheet":
-            drawing.lines([space.at(own)], fill=SHEET, opacity=0.16)
-    drawing.marks(space.at(xyz), "dot", 3.0, INK)
-    for part, own in zip(parts, shown, strict=True):
-        if part["kind"] == "line":
-            drawing.lines([space.at(own)], part["colour"], 1.6)
+            drawing.lines([places], fill=colour, opacity=0.16)
+        elif part["kind"] == "line":
+            drawing.lines([places], colour, part["size"])
         elif part["kind"] == "text":
-            drawing.words(space.at(own)[0], part["name"], 11, colour="#000000", weight="bold")
+            drawing.words(places[0], part["name"], 11, colour=colour, weight="bold")
+    points = (part for part in parts if part["kind"] == "point")
+    for (size, colour), alike in groupby(points, lambda part: (part["size"], part["colour"])):
+        drawing.marks(space.at(_points(part["xyz"][0] for part in alike)), "dot", size, colour)
     return drawing
 
 

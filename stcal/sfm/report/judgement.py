@@ -3,7 +3,6 @@ alone."""
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from statistics import median
 from typing import Literal
 
@@ -13,7 +12,7 @@ from stcal.geometry.clusters import NOTED
 from stcal.io.images import TOP_GROUP
 from stcal.io.json import Part
 from stcal.report.text import join, number, significant
-from stcal.sfm.data.as_drawn import NOT_AS_DRAWN
+from stcal.sfm.data.note import ELSEWHERE, GROUP_LEFT_OUT, NOT_AS_DRAWN, SINGLE
 
 CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in 100,000."
 """Text on the false alarms of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
@@ -49,11 +48,16 @@ TESTED_BY = {"labels", "agreement"}
 """Keys of the checks of which one at least must be possible for σ to be tested at all."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
-LEFT_OUT_WHOLE = "left out whole: "
-"""How the note begins on a group that could not be solved."""
 EVERY_SIGMA = "every σ"
 DISTANCES = "all distances and the size"
 UNKNOWN_SIZE = "nothing of known size is in view, and its size is that of the drawing"
+SIZES = {
+    "board": "the board's pitch",
+    "faces": "the printed size of the faces",
+    "distances": "the known distances",
+    "drawing": "a length of the drawing",
+}
+"""What the size of a result rests on."""
 PLACES = "the places of all faces"
 CENTRES = "all centres of circles"
 INVALIDATES: dict[str, tuple[str, ...]] = {
@@ -103,12 +107,8 @@ class Judgement(Part):
         return [(question, getattr(self, key)) for key, question in QUESTIONS.items()]
 
 
-@dataclass(frozen=True, slots=True)
-class _Cause:
-    """Cause that limits a result, and its remedy."""
-
-    limit: str
-    remedy: str
+Cause = tuple[str, str]
+"""What limits a result, and the remedy."""
 
 
 def judged(report: dict) -> dict:
@@ -120,9 +120,11 @@ def judgement_of(report: dict) -> Judgement:
     """Returns the judgement of a run from the content of ``report.json``."""
     verdict, use = _use(report)
     failed = [check["key"] for check in report.get("checks", []) if check["verdict"] == "failed"]
-    lost = None if failed else _by_lost_group(report)  # what is only suspicious comes after it
-    by_result = _control(report) or lost or _by_checks(report) or _by_gaps(report)
-    cause = by_result or _by_drawing(report) or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
+    lost = _of_notes(report, GROUP_LEFT_OUT, "Left out")
+    before = None if failed else lost  # what is only suspicious comes after it
+    by_result = _control(report) or before or _by_checks(report) or _by_gaps(report)
+    drawing = _of_notes(report, NOT_AS_DRAWN, "The drawing") if report["faces"] else None
+    cause = by_result or drawing or lost or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
@@ -131,8 +133,8 @@ def judgement_of(report: dict) -> Judgement:
         verdict=verdict,
         use=use,
         quality=_unknown(report, invalid) if verdict == "no" else _quality(report, position, rotation),
-        limit=cause.limit,
-        next=" ".join([*([cause.remedy] if cause.remedy else []), *_more(report, verdict)]),
+        limit=cause[0],
+        next=" ".join([*filter(None, cause[1:]), *_more(report, verdict)]),
         position_sigma_um=position and position[0],
         position_face=position and position[1],
         rotation_sigma_mdeg=rotation and rotation[0],
@@ -147,11 +149,16 @@ def invalidated(failed: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(what for key in failed for what in INVALIDATES.get(key, (EVERY_SIGMA,))))
 
 
-def without_sigma(report: dict) -> dict:
-    """Returns the content of ``report.json`` without σ and distances of chains, which a failed run must not show."""
+def without_sigma_of(faces: dict[str, dict]) -> dict[str, dict]:
+    """Returns the rows of the faces without σ, which a failed run must not show."""
     none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
+    return {name: face | none for name, face in faces.items()}
+
+
+def without_sigma(report: dict) -> dict:
+    """Returns the content of ``report.json`` without σ."""
     return report | {
-        "faces": {name: face | none for name, face in report["faces"].items()},
+        "faces": without_sigma_of(report["faces"]),
         "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],
         "summary": report["summary"] | {"scale_sigma_ppm": None},
     }
@@ -166,50 +173,37 @@ def not_first(keys: Iterable[str]) -> set[str]:
 # --- may I use it -----------------------------------------------------------------------------------------------------
 
 
+BEGINNINGS = {"yes": "Yes", "with care": "With care", "no": "No"}
+
+
 def _use(report: dict) -> tuple[Use, str]:
-    verdict, answer = _by_result(report)
+    verdict, words = _by_result(report)
+    begin, reasons, gaps = "", [words], _gaps(report) if report["faces"] else []
     if verdict != "no" and "drawing" in report["summary"].get("scale_from", []):
-        verdict, answer = "with care", f"With care, for its shape alone: {UNKNOWN_SIZE}; {answer.partition(': ')[2]}"
-    if drawn := _drawn(report):
-        answer = f"With care: {answer.removeprefix('Yes: ')}" if verdict == "yes" else answer
-        verdict = "with care" if verdict == "yes" else verdict
-        answer = f"{answer.removesuffix('.')}; {drawn[0][0]}."
-    gaps = _gaps(report)
-    if not gaps or not report["faces"]:
-        return verdict, answer
-    if verdict == "yes" and _lost_groups(report):
-        verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
-    if verdict != "no" and (absent := _lacking(report)):
-        care, (_, _, reasons) = ", with care" if verdict == "with care" else "", answer.partition(": ")
-        n, of = len(report["faces"]), len(report["faces"]) + len(absent)
-        verdict, answer = "part", f"Part{care}: {n} of {of} faces; {reasons}"
-    return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
+        verdict, begin, reasons = "with care", "With care, for its shape alone", [UNKNOWN_SIZE, words]
+    drawn = _notes(report, NOT_AS_DRAWN) if report["faces"] else []
+    reasons += [note["words"] for note in drawn[:1]]
+    if verdict == "yes" and (drawn or (gaps and _lost_groups(report))):
+        verdict = "with care"
+    if verdict != "no" and gaps and (absent := _lacking(report)):
+        begin = "Part, with care" if verdict == "with care" else "Part"
+        verdict, n = "part", len(report["faces"])
+        reasons.insert(0, f"{n} of {n + len(absent)} faces")
+    return verdict, f"{begin or BEGINNINGS[verdict]}: {'; '.join([*reasons, *gaps])}."
 
 
 def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
-def _drawn(report: dict) -> list[tuple[str, str]]:
-    """Returns in which ways the faces are not where they were drawn, and what to do about each."""
-    notes = [note.removeprefix(NOT_AS_DRAWN) for note in report["notes"] if note.startswith(NOT_AS_DRAWN)]
-    return [(what, remedy) for what, _, remedy in (note.rpartition(": ") for note in notes)] if report["faces"] else []
-
-
-def _by_drawing(report: dict) -> _Cause | None:
-    for what, remedy in _drawn(report):
-        return _Cause(f"The drawing: {what}.", f"{_capital(remedy)}.")
-    return None
-
-
 def _by_result(report: dict) -> tuple[Use, str]:
-    """Returns verdict and answer by what is in the result."""
+    """Returns verdict and reason by what is in the result."""
     checks = [check for check in report.get("checks", []) if check["key"] != CAUSE]
     counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
     if not report["faces"]:
-        return "no", "No: there is no face in it, only λ and residuals of the board."
+        return "no", "there is no face in it, only λ and residuals of the board"
     if _control(report):
-        return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
+        return "no", "it was made for comparison, and its faces are biased by tens of µm"
     made = len(checks) - counts["not possible"]
     missing = sum(c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"]) for c in checks)
     n = counts["failed"]
@@ -217,36 +211,36 @@ def _by_result(report: dict) -> tuple[Use, str]:
     name = cause[0]["title"].removeprefix(OF_WHOLE_SET) if cause else ""
     if cause and cause[0]["verdict"] == "failed":
         of = f"; that is the likely cause of {n} of {made} checks that failed" if n else ""
-        return "no", f"No: {name}{of}."
+        return "no", f"{name}{of}"
     if n:
-        return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
+        return "no", f"{n} of {made} checks failed, the first: {_first(report, 'failed')['title']}"
     if different := report.get("crosscheck", {}).get("differences"):
-        return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
+        return "with care", f"the native COLMAP comes to other faces ({different[0]})"
     if words := _larger(report, checks):
-        return "with care", f"With care: {words}{f'; the likely cause: {name}' if cause else ''}."
+        return "with care", f"{words}{f'; the likely cause: {name}' if cause else ''}"
     if cause:
-        return "with care", f"With care: {name}, though no check failed."
+        return "with care", f"{name}, though no check failed"
     if n := counts["suspicious"]:
         message = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
         first = _first(report, "suspicious")
         # A residual beyond its limit that was left out is none by chance, and has no probability.
         chance = all(value["probability"] is not None for value in first["measured"][:1])
         by_chance = f"; of {made} checks one is so by chance in one sound run of {round(TESTS_OF_CHANCE / made)}"
-        return "with care", f"With care: {message}{first['title']}{by_chance if chance else ''}."
+        return "with care", f"{message}{first['title']}{by_chance if chance else ''}"
     if report["summary"]["sigma0"] is None:
         return (
             "with care",
-            "With care: groups were solved one by one; there are no σ, and there are fewer checks.",
+            "groups were solved one by one; there are no σ, and there are fewer checks",
         )
     testing = [check["verdict"] for check in checks if check["key"] in TESTED_BY]
     if testing and set(testing) == {"not possible"}:
         return (
             "with care",
-            f"With care: the photographs are too few to test one another, {missing} checks were not possible.",
+            f"the photographs are too few to test one another, {missing} checks were not possible",
         )
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
-    return "yes", f"Yes: {passed}{open_}."
+    return "yes", f"{passed}{open_}"
 
 
 def _larger(report: dict, checks: list[dict]) -> str:
@@ -292,29 +286,24 @@ def _missing_faces(report: dict) -> list[str]:
     return [face for face in report["summary"]["faces_not_seen"] if face in expected]
 
 
-def lost_groups(notes: Iterable[str]) -> list[str]:
-    """Returns the names of the groups that could not be solved, of all notes of a run."""
-    begin = f"{LEFT_OUT_WHOLE}group "
-    return [note.removeprefix(begin).partition(":")[0] for note in notes if note.startswith(begin)]
+def _notes(report: dict, code: str) -> list[dict]:
+    return [note for note in report["notes"] if note["code"] == code]
 
 
 def _lost_groups(report: dict) -> list[str]:
-    return [f"group {name}" for name in lost_groups(report["notes"])]
+    return [f"group {note['place']}" for note in _notes(report, GROUP_LEFT_OUT)]
 
 
-def images_left_out(face: str, notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Returns the images in which a face was read but left out, of all notes (image, note)."""
-    begins = f"a pattern like face {face}:", f"face {face}: read in one image"
-    return list(dict.fromkeys(image for image, note in notes if note.startswith(begins)))
-
-
-def _left_out_in(report: dict, face: str) -> list[str]:
-    return images_left_out(face, ((note["image"], note["note"]) for note in report["left_out"]["notes"]))
+def left_out_in(report: dict, face: str) -> list[str]:
+    """Returns the images in which a face was read but left out."""
+    of_face = {(ELSEWHERE, face), (SINGLE, face)}
+    notes = report["left_out"]["notes"]
+    return list(dict.fromkeys(each["image"] for each in notes if (each["code"], each["place"]) in of_face))
 
 
 def _is_read(report: dict, face: str) -> bool:
     """Whether a face that is not in the result was read in two images, or has circles that were mapped or left out."""
-    return len(_left_out_in(report, face)) > 1 or _has_circles(report, face)
+    return len(left_out_in(report, face)) > 1 or _has_circles(report, face)
 
 
 def _has_circles(report: dict, face: str) -> bool:
@@ -331,7 +320,7 @@ def _gaps(report: dict) -> list[str]:
     """Returns in words what is missing: faces that are not in the result, or in one image alone, and lost groups."""
     never, words = [], []
     for face in report["summary"]["faces_not_seen"]:
-        images = _left_out_in(report, face)
+        images = left_out_in(report, face)
         if images:
             shown = "1 image" if len(images) == 1 else f"{len(images)} images"
             words.append(f"face {face} was read in {shown} and left out")
@@ -386,10 +375,10 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
         ways = [chain for chains in report["chains"].values() if len(chains) > 1 for chain in chains]
         if not ways:
             return "There are no σ, and no face is reached by two chains that could be compared."
-        apart, turned = (max(way[key] for way in ways) for key in ("translation_um", "rotation_mdeg"))
+        apart, turned = max(way["translation_mm"] for way in ways), max(way["rotation_rad"] for way in ways)
         return (
-            f"There are no σ; chains to the same face through different groups are up to {number(apart, 1)} µm and "
-            f"{number(turned, 2)} mdeg off their mean."
+            f"There are no σ; chains to the same face through different groups are up to {number(1e3 * apart, 1)} µm "
+            f"and {number(1e3 * math.degrees(turned), 2)} mdeg off their mean."
         )
     size = report["summary"]["scale_sigma_ppm"]
     scale = "" if size is None else f", the size to {_relative(size)}"
@@ -410,13 +399,10 @@ def _relative(ppm: float) -> str:
 
 
 def _premise(report: dict) -> str:
-    refined = report["options"].get("refine_camera")
-    sizes = {"board": "the board's pitch", "faces": "the printed size of the faces", "distances": "the known distances"}
-    sizes["drawing"] = "a length of the drawing"
-    premises = [sizes[source] for source in report["summary"].get("scale_from", ["board"])]
-    premises = premises if refined else ["the intrinsics", *premises]
-    single = len(premises) == 1 and not premises[0].endswith("distances")
-    return f"{' and '.join(premises)} {'is' if single else 'are'}"
+    premises = [] if report["options"].get("refine_camera") else ["the intrinsics"]
+    sources = report["summary"].get("scale_from", ["board"])
+    single = len(premises) + len(sources) == 1 and sources != ["distances"]
+    return f"{' and '.join([*premises, *(SIZES[source] for source in sources)])} {'is' if single else 'are'}"
 
 
 def _largest(report: dict, key: str) -> tuple[float, str] | None:
@@ -428,23 +414,25 @@ def _largest(report: dict, key: str) -> tuple[float, str] | None:
 # --- what limits it, what next ----------------------------------------------------------------------------------------
 
 
-def _control(report: dict) -> _Cause | None:
+def _control(report: dict) -> Cause | None:
     """Returns the cause of a result without faces, or of one made for comparison; None for other results."""
     options = report["options"]
     if not report["faces"]:
-        return _Cause(
+        return (
             f"No face of the target was recognised in {report['summary']['images']} images.",
             "Look at the overlays; where a face is in view, give its design with --target.",
         )
     if options["solve"] == "paper":
-        return _Cause("The published method: contours with equal weights, without the eccentricity of circles.",
-                      "Run it without --solve paper.")  # fmt: skip
+        return (
+            "The published method: contours with equal weights, without the eccentricity of circles.",
+            "Run it without --solve paper.",
+        )
     if not options["eccentricity"]:
-        return _Cause("The eccentricity of circles is not corrected.", "Run it without --no-eccentricity.")
+        return "The eccentricity of circles is not corrected.", "Run it without --no-eccentricity."
     return None
 
 
-def _by_checks(report: dict) -> _Cause | None:
+def _by_checks(report: dict) -> Cause | None:
     """Returns the cause by the first failed check, a suspicious one that limits the result, or the cross-check."""
     verdicts = {check["verdict"] for check in report.get("checks", [])}
     for verdict in ("failed", "suspicious"):
@@ -453,56 +441,54 @@ def _by_checks(report: dict) -> _Cause | None:
             remedy = f"{_capital(check['remedy'] or 'look at what the check names')}."
             found = f"{check['title']}: {check['reason']}."
             if verdict == "failed":
-                return _Cause(found, remedy)
+                return found, remedy
             limits = _by_gaps(report) or _by_size(report) or _by_sigma(report)
-            return _Cause(limits.limit, f"{found} {remedy}")  # what is suspicious is to be looked at; σ still tell
+            return limits[0], f"{found} {remedy}"  # what is suspicious is to be looked at; σ still tell
     if different := report.get("crosscheck", {}).get("differences"):
         remedy = "Look at the cross-check to see which of the two is right."
-        return _Cause(f"The native COLMAP differs: {different[0]}.", remedy)
+        return f"The native COLMAP differs: {different[0]}.", remedy
     return None
 
 
-def _by_gaps(report: dict) -> _Cause | None:
+def _by_gaps(report: dict) -> Cause | None:
     """Returns the cause where faces are missing that were to be there; None if all are."""
     if missing := _missing_faces(report):
-        return _Cause(
+        return (
             f"Face {join(missing)} should have been photographed, and is not in the result.",
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
     if report["faces"] and (absent := _lacking(report)):
         n, of = len(report["faces"]), len(report["faces"]) + len(absent)
-        return _Cause(f"The photographs: they give {n} of the {of} faces of the design.", "")
+        return f"The photographs: they give {n} of the {of} faces of the design.", ""
     return None
 
 
-def _by_lost_group(report: dict) -> _Cause | None:
-    """Returns why the first group that was left out could not be solved; None if all could."""
-    for note in report["notes"]:
-        if note.startswith(f"{LEFT_OUT_WHOLE}group "):
-            found, _, remedy = note.removeprefix(LEFT_OUT_WHOLE).partition("; ")
-            return _Cause(f"Left out: {found}.", f"{_capital(remedy)}." if remedy else "Take it again.")
+def _of_notes(report: dict, code: str, begin: str) -> Cause | None:
+    """Returns what the first note of this kind says limits the result; None if there is none."""
+    for note in _notes(report, code)[:1]:
+        return f"{begin}: {note['words']}.", f"{_capital(note['remedy'] or 'take it again')}."
     return None
 
 
-def _by_size(report: dict) -> _Cause | None:
+def _by_size(report: dict) -> Cause | None:
     """Returns the cause where no size is known; None where one is."""
     if "drawing" not in report["summary"].get("scale_from", []):
         return None
-    return _Cause(
+    return (
         "Its size: nothing of known size is in view.",
         "Measure the distance of two points and state it with scale in target.toml, or photograph the board of dots "
         "with it; if one is in view, give its file with --board.",
     )
 
 
-def _by_sigma(report: dict) -> _Cause:
+def _by_sigma(report: dict) -> Cause:
     """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
     if len(report["faces"]) == 1:
         remedy = "Photograph it together with other faces."
-        return _Cause("There is only one face, and nothing links it to others.", remedy)
+        return "There is only one face, and nothing links it to others.", remedy
     found = _largest(report, "translation_sigma_um")
     if found is None:
-        return _Cause("What limits it is unknown without σ.", "Run it with --solve joint.")
+        return "What limits it is unknown without σ.", "Run it with --solve joint."
     sigma, worst = found
     face = report["faces"][worst]
     axis = face["translation_sigma_um"].index(sigma)
@@ -512,7 +498,7 @@ def _by_sigma(report: dict) -> _Cause:
     of_all = f"% of the variance of face {worst} along {'xyz'[axis]} (σ {number(sigma, 1)} µm)"
     if source and variance[source] > photographs:
         name, remedy = _source(report, source)
-        return _Cause(f"{name}: {number(100 * variance[source] / sigma**2, 0)} {of_all}.", remedy)
+        return f"{name}: {number(100 * variance[source] / sigma**2, 0)} {of_all}.", remedy
     others = [
         max(row["translation_sigma_um"])
         for name, row in report["faces"].items()
@@ -520,7 +506,7 @@ def _by_sigma(report: dict) -> _Cause:
     ]
     if others and sigma > TAIL * median(others):
         of_groups = "" if face["groups"] == [TOP_GROUP] else f", of group {join(face['groups'])}"
-        return _Cause(
+        return (
             f"Face {worst}: {number(sigma, 1)} µm along {'xyz'[axis]}, where the others have "
             f"{number(median(others), 1)} µm; {face['images']} images show it{of_groups}.",
             f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
@@ -528,22 +514,22 @@ def _by_sigma(report: dict) -> _Cause:
     return _by_images(report, sigma, photographs, of_all)
 
 
-def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cause:
+def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> Cause:
     """Returns the cause where photographs limit the result; ``variance``: their part of ``sigma``², 0 if unknown."""
     summary, advice = report["summary"], "`stcal-sfm advise RUN` says which do most."
     if not variance:
-        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")
+        return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
     centre = summary.get("circle_sigma_px")
     of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
-    blurs = [(row["nearest_blur_px"] + row["farthest_blur_px"]) / 2 for row in report.get("focus", [])]
+    blurs = [sum(row["blur_px"]) / 2 for row in report.get("focus", [])]
     if blurs and (blur := median(blurs)) > SHARP_PX:
-        return _Cause(
+        return (
             f"The sharpness: edges are blurred by {number(blur, 1)} px, half of that is usual, and σ of centres grow "
             f"with it; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
             f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
         )
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
-    return _Cause(
+    return (
         f"The centring of circles{of_centres} in {summary['images_mapped']} images: "
         f"{number(100 * variance / sigma**2, 0)} {of_all}; no face stands out.",
         f"Nothing has to be done; four times the images would make {number(fewer, 1)} µm of these {number(sigma, 1)} "
@@ -585,7 +571,7 @@ def _more(report: dict, verdict: Use) -> list[str]:
     if report["faces"] and _are_few(report):
         advice.append(f"Take more photographs: {used} of {given} could be used, and 10 to 20 are usual.")
     if report["faces"] and (missing := _lacking(report)):
-        read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
+        read = [face for face in missing if _is_read(report, face) or left_out_in(report, face)]
         unseen = [face for face in missing if face not in read]
         if unseen:
             seen = "in no image that was used" if _some_unused(report) else "not seen in any image"

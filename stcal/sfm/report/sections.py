@@ -1,21 +1,18 @@
 """Sections of a run's page: how far to trust it, its settings, its checks, the cross-check and the published method."""
 
-import math
 from dataclasses import dataclass
 
 from stcal.labels import parse_label
 from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import CHANCE, Judgement, applies
+from stcal.sfm.report.judgement import CHANCE, SIZES, Judgement, applies
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
     "chain": "chain: group by group, then combined",
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
-SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
-SCALES |= {"drawing": "unknown: the drawing defines the unit"}
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -37,15 +34,6 @@ class Words:
     def points(self) -> str:
         """Returns the plural of ``point``."""
         return f"{self.point}s"
-
-
-SIZES = {
-    "board": "the given pitch of the board",
-    "faces": "the stated size of the printed faces",
-    "distances": "the stated distances",
-    "drawing": "the drawing as the unit of length",
-}
-"""What gives the scale, in words."""
 
 
 def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
@@ -85,53 +73,14 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     return [
         f"{scope}, and residuals hardly show it" if scope.endswith("not in them") else scope,
         factor,
-        Table(["<Check", "Value", "<Where", "<Remark"], _worst_values(report, words), css="text"),
         f"{one_way} {join(single)}" if single else "",
     ]
-
-
-def _size_mm(report: dict) -> float:
-    """Returns the diagonal of the box around the target's circles."""
-    circles = list(report["scene"]["circles"].values())
-    return math.dist(*[[pick(axis) for axis in zip(*circles, strict=True)] for pick in (min, max)]) if circles else 0.0
 
 
 def factor_in_words(factor: float) -> str:
     if 0.95 <= factor <= 1.05:
         return "residuals are as large as the centres' own σ"
     return f"residuals are {factor:.1f} times the centres' own σ"
-
-
-def _worst(found) -> tuple[float, str] | None:
-    return max(found, key=lambda candidate: candidate[0], default=None)
-
-
-def _largest_sigma(report: dict, key: str) -> tuple[float, str] | None:
-    return _worst((max(face[key]), f"face {name}") for name, face in report["faces"].items() if face[key] is not None)
-
-
-def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
-    return _worst(
-        (chain[key], f"face {face} by {' → '.join(chain['groups'])}")
-        for face, chains in report["chains"].items()
-        if len(chains) > 1
-        for chain in chains
-    )
-
-
-def headline(report: dict, words: Words) -> list[tuple[str, str, str]]:
-    """Returns (value, unit, description) of the tiles."""
-    summary = report["summary"]
-    sigma = _largest_sigma(report, "translation_sigma_um")
-    ppm = max((abs(group["scale"]["difference_ppm"]) for group in report["groups"]), default=None)
-    of_board = (number(ppm, 1), "ppm", "largest difference of the scale by the board's rows from that by all dots")
-    return [
-        (number(summary["residual_rms_px"], 4), "px", "residual, RMS per axis"),
-        (number(summary["sigma0"], 2), "", "σ₀ of the joint adjustment"),
-        (number(summary["sigma_factor"], 2), "×", factor_in_words(summary["sigma_factor"])),
-        (number(sigma and sigma[0], 1), "µm", "largest σ of a face's position"),
-        *([of_board] if words.board else []),
-    ]
 
 
 def settings(report: dict, words: Words) -> list[list[str]]:
@@ -157,7 +106,7 @@ def settings(report: dict, words: Words) -> list[list[str]]:
             f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
             f"{len(left_out['circles']) - single} {words.points}; {single} more that one image of a group alone shows",
         ],
-        ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
+        ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
         [
             "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
             f"{camera['model']}, {sizes} px",
@@ -168,36 +117,6 @@ def settings(report: dict, words: Words) -> list[list[str]]:
         ["Program", f"stcal {report['version']}"],
     ]
     return [[name, value] for name, value in rows if value]
-
-
-def _worst_values(report: dict, words: Words) -> list[list[str]]:
-    """Returns rows of check, worst value, its place, remark."""
-    board = _worst((g["scale"]["board_rms_um"], f"group {g['name']}") for g in report["groups"])
-    ppm = _worst((abs(g["scale"]["difference_ppm"]), f"group {g['name']}") for g in report["groups"])
-    flat = _worst((face["plane_rms_um"], f"face {name}") for name, face in report["faces"].items())
-    single = _worst((row["max_px"], f"{row['image']}, {row['worst']}") for row in report["residuals_by_image"])
-    over = f"{number(1e-3 * ppm[0] * _size_mm(report), 1)} µm over the target's diagonal" if ppm else ""
-    parts = "of the groups before they are adjusted together, so many σ of the result; the checks judge it"
-    return [
-        [name, number(worst and worst[0], digits), worst[1] if worst else NONE, remark if worst else "not computed"]
-        for name, worst, digits, remark in (
-            ("σ of a face's position (µm)", _largest_sigma(report, "translation_sigma_um"), 1, "largest of X, Y, Z"),
-            ("σ of a face's rotation (mdeg)", _largest_sigma(report, "rotation_sigma_mdeg"), 2, "largest of X, Y, Z"),
-            ("Disagreement of chains, position (µm)", _worst_chain(report, "translation_um"), 1, parts),
-            ("Disagreement of chains, rotation (mdeg)", _worst_chain(report, "rotation_mdeg"), 2, "likewise"),
-            (f"{words.points.capitalize()} off their plane, RMS (µm)", flat, 1, "a face that is not flat, or noise"),
-            (
-                "Board residual, RMS (µm)" if words.board else "Residual of what gives the scale, RMS (µm)",
-                board,
-                1,
-                "of the length in space: the group's model against the board's grid"
-                if words.board
-                else "the model against what was stated",
-            ),
-            *([("Scale by the board's rows against that by all dots (ppm)", ppm, 1, over)] if words.board else []),
-            ("Residual (px)", single, 4, "one centre in one image"),
-        )
-    ]
 
 
 LIMITS = (
@@ -229,15 +148,10 @@ def crosscheck_section(check: dict) -> list[Block]:
         [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
         for face, rows in sorted(faces.items())
     ]
-    single = [
-        [label, number(value, 3), number(mapping["circles_sigmas"].get(label), 2)]
-        for label, value in mapping["circles_um"].items()
-    ]
     largest = ""
     if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
         largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
     over = [("", 1), ("Native – pycolmap", 3), ("Native, adjusted – result", 3), ("Native – result", 3)]
-    cameras = [cells(row, "image position_um:2 rotation_mdeg:3 sigmas:2") for row in mapping["cameras"]]
     return [
         f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (schema "
         f"{check['schema']} for the native one), initial pairs and thresholds",
@@ -256,11 +170,9 @@ def crosscheck_section(check: dict) -> list[Block]:
         subheading("Circles"),
         "Native against pycolmap",
         Table(["<Face", "Circles", "Mean (µm)", "Max (µm)", "<Worst"], circles),
-        fold("Circle by circle", Table(["<Circle", "Difference (µm)", "σ"], single)),
         subheading("Cameras"),
         "Native against pycolmap, against the target, and in σ of the camera in its group. They matter only if faces "
         f"move with them, which the table of faces shows{largest}",
-        fold("Camera by camera", Table(["<Image", "Position (µm)", "Rotation (mdeg)", "σ"], cameras)),
         *check["notes"],
     ]
 

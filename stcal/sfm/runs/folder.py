@@ -36,7 +36,7 @@ from stcal.io.json import checked, read_json, require_result_written
 from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
-from stcal.report.document import Document, Notes, Section, Table, macro, pdf_of, require_pdf
+from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, require_pdf
 from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel, ImageObservations
@@ -45,14 +45,12 @@ from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
-from stcal.sfm.report.figures import FIRST_IMAGES, Photograph, Photographs, Residuals, shown_overlays
+from stcal.sfm.report.figures import Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
-from stcal.sfm.report.sections import Words
-from stcal.sfm.runs.output import report_of, residuals_px
-from stcal.sfm.runs.report import ReportFile
+from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, folder_of, require_run, verify
+from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, as_written, folder_of, require_run, verify
 from stcal.sfm.runs.text import found_in_all
 from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
 
@@ -210,12 +208,12 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
     path = run / "report.json"
     report = read_json(path, "run", AGAIN)
-    with _as_written(path):
+    with as_written(path):
         checked(report, ReportFile)
         shown = shown_overlays(report)
         overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
-    with _as_written(path):
+    with as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
     contents: dict[Path, str | bytes] = {out: page}
     if pdf:
@@ -244,23 +242,9 @@ def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
     return {name: np.array(values).reshape(-1, 4) for name, values in rows.items()}
 
 
-@contextlib.contextmanager
-def _as_written(path: Path) -> Iterator[None]:
-    """Raises InputError if no page can be made of a report, or if a file that it needs is missing."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(
-            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the report needs it, run it again"
-        ) from error
-    except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else error
-        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({reason}); run it again") from error
-
-
 def require_report(saved: SavedRun) -> None:
     """Refuses a run whose report cannot be extended: of another version, without its overlays, or read-only."""
-    with _as_written(saved.folder / "report.json"):
+    with as_written(saved.folder / "report.json"):
         _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
     if not os.access(saved.folder, os.W_OK):
         raise InputError(
@@ -290,43 +274,28 @@ def shown_if_failed(
         yield
     except StcalError as error:
         seen = found_in_all(labelled)
-        save(folder.stage / "report.html", _page(name, str(error), seen, detection, labelled, folder))
+        save(folder.stage / "report.html", _page_on_failure(name, str(error), seen, detection, labelled))
         error.append(f"; {seen}")
         raise
 
 
-def _page(
-    name: str,
-    error: str,
-    seen: str,
-    detection: DetectionResult,
-    labelled: Sequence[LabelledImage],
-    folder: RunFolder,
+def _page_on_failure(
+    name: str, error: str, seen: str, detection: DetectionResult, labelled: Sequence[LabelledImage]
 ) -> str:
-    rows, rest, shown = [], max(len(labelled) - FIRST_IMAGES, 0), _photographs(detection, labelled, folder)
+    """Returns the page of a run without a result; the overlays lie beside it."""
+    rows = []
     for each in labelled:
         image = each.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
     left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
+    overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
         Section("What was found", [seen, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
-        Section("Overlays", [macro("photographs", shown, rest, Words("point", True))]),
+        Section("Overlays", [links(overlays)]),
     ]
     answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
-    about = f"{len(labelled)} images, no calibrated target"
-    return Document(name, about, sections, [answer], f"{name}: no calibration").page()
-
-
-def _photographs(detection: DetectionResult, labelled: Sequence[LabelledImage], folder: RunFolder) -> Photographs:
-    """Returns the overlays, which lie beside the page."""
-    width, height = detection.camera.width, detection.camera.height
-    shown = []
-    for each in labelled[:FIRST_IMAGES]:
-        name = each.observations.name
-        place = overlay_path(folder.stage, name).relative_to(folder.stage).as_posix()
-        shown.append(Photograph(name, f"{len(each.observations)} named", place, ""))
-    return Photographs(tuple(shown), f"-0.5 -0.5 {width} {height}", round(width / height, 5), 0.0, 1.0, "", 0.0)
+    return Document(name, f"{len(labelled)} images, no calibrated target", sections, [answer]).page()

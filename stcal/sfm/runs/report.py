@@ -1,30 +1,30 @@
-"""Content of ``report.json``. A field without a description is described at the object that holds it."""
+"""``report.json``: everything that tells how far to trust a run; its keys, and how they are filled."""
 
-from typing import Literal
+from itertools import combinations
+from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field
 
-from stcal.io.images import name_fault
-from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, Pose, ResultFile, Vector, Vector3
-from stcal.sfm.adjust.calibration import Solve
-from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.scale import ScaleSource
-from stcal.sfm.checks.verdict import Verdict
+import stcal
+from stcal.design import faces_of_known_shape
+from stcal.geometry.arrays import rms
+from stcal.geometry.plane import fit_plane
+from stcal.io.images import Skipped, name_fault
+from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, ResultFile, Vector, Vector3
+from stcal.labels import DotLabel, Label
+from stcal.sfm.adjust.chain import FaceChain
+from stcal.sfm.checks.verdict import Check
+from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
+from stcal.sfm.data.note import Note, lost_groups
+from stcal.sfm.detect.defocus import Focus
+from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.crosscheck import Crosscheck
-from stcal.sfm.runs.result import Comparison
+from stcal.sfm.runs.result import Comparison, RunResult
 
-Number = int | float
-"""Number that remains an integer if it is one."""
-
-
-class ReportOptions(Part):
-    solve: Solve
-    frame: FrameKind
-    eccentricity: bool
-    refine_camera: bool
-    max_pair_angle_deg: float
-    expect_faces: list[str] = Field(default=[])
+MICRO = 1e3
+Row = dict[str, Any]
 
 
 class ReportCamera(Part):
@@ -35,138 +35,22 @@ class ReportCamera(Part):
     distortion: Vector
 
 
-class Summary(Part):
-    files: int
-    images: int
-    images_mapped: int
-    groups: int
-    faces: int
-    faces_not_seen: list[str]
-    faces_expected: list[str]
-    observations: int
-    residual_rms_px: float
-    centre_sigma_rms_px: float
-    sigma_factor: float
-    circle_sigma_factor: float
-    dot_sigma_factor: float
-    printed_sigma_factor: float | None = None
-    scale_sigma_ppm: float | None
-    sigma0: float | None
-    redundancy: int | None
-    last_move_px: float | None
-    photographs_differ: float | None = None
-    sigma_enlarged: float | None = None
-    rim_mm: float | None = None
-    rim_sigma_mm: float | None = None
-    dot_rim_mm: float | None = None
-    scale_from: list[ScaleSource] = Field(default=["board"])
-    print_factor: float | None = None
-    bend_factor: float | None = None
-    camera_given: bool = True
-    circle_sigma_px: float | None = None
-    size_sigma_ppm: float | None = None
-    edge_share: float | None = None
-    printed_faces: list[str] = Field(default=[])
-
-
-class FaceRow(Part):
-    target_from_face: Pose
-    translation_mm: Vector3
-    angle_to_reference_deg: float
-    translation_sigma_um: Vector3 | None
-    rotation_sigma_mdeg: Vector3 | None
-    translation_sources_um: dict[str, Vector3] = Field(default={})
-    circles: int
-    circles_of_design: int
-    plane_rms_um: float
-    groups: list[str]
-    images: int
-
-
-class BetweenFaces(Part):
-    a: str
-    b: str
-    distance_mm: float
-    distance_sigma_um: float | None
-    angle_deg: float
-
-
-class ChainRow(Part):
-    faces: list[str]
-    groups: list[str]
-    translation_um: float
-    rotation_mdeg: float
-
-
-class MeasuredRow(Part):
-    name: str
-    value: Number
-    limit: Number | None
-    unit: str
-    probability: float | None
-
-
-class CheckRow(Part):
-    """One check."""
-
-    key: str = Field(description="short name")
-    title: str = Field(description="what is checked")
-    verdict: Verdict = Field(
-        description="`passed`; `suspicious`: by chance in one honest run of 1000, and `agreement` where the joint "
-        "adjustment has not settled; `failed`: of 100 000; `not possible` in this run (without a "
-        "`remedy`: not applicable to what was photographed)"
-    )
-    reason: str = Field(description="the verdict in words")
-    measured: list[MeasuredRow] = Field(
-        description="at most 8 values, the worst first: `name` of what was tested (image, label, face, group, row …), "
-        "`value`, `limit` beyond which it is suspicious (null where there is none), `unit`, `probability` of as much "
-        "by chance before the number of things tested is allowed for (null where it is no test)"
-    )
-    tested: int = Field(description="how many things were")
-    names: list[str] = Field(description="all that are beyond the limit, the worst first")
-    remedy: str = Field(description="what to do about it; empty where nothing is")
-    enlarges: float = Field(default=1.0, description="factor on the σ of the result by which they cover what was found")
+class Remark(Part):
+    note: str
+    code: str = ""
+    place: str = ""
+    words: str = ""
+    remedy: str = ""
 
 
 class PairRow(Part):
     first: str
     second: str
     shared: int
-    median_angle_deg: float
+    median_angle_rad: float
     in_front: float
     forward: float
     verdict: str
-
-
-class ScaleRow(Part):
-    mm_per_unit: float
-    mm_per_unit_rows: float
-    rows: list[int]
-    difference_ppm: float
-    sigma_ppm: float
-    dots: int
-    board_mean_um: float
-    board_spread_um: float
-    board_rms_um: float
-    board_residuals_um: dict[ByLabel, Vector3]
-    source: ScaleSource = "board"
-
-
-class GroupRow(Part):
-    name: str
-    images: list[str]
-    faces: list[str]
-    points: int
-    seeded: str
-    rounds: int
-    pairs: list[PairRow]
-    scale: ScaleRow = Field(
-        description="`mm_per_unit` by least squares over all dots, `mm_per_unit_rows` from all pairs of the two "
-        "`rows`, `difference_ppm`, `sigma_ppm`, `dots`; residuals after the similarity, reconstructed minus design, "
-        "board frame: `board_mean_um`, `board_spread_um` (standard deviation), `board_rms_um` of their lengths, "
-        "`board_residuals_um` label → `[x, y, z]`; `source` of λ: `board`, `faces` of known shape, whose corners then "
-        "stand for the dots, or known `distances`"
-    )
 
 
 class ImageResiduals(Part):
@@ -178,42 +62,11 @@ class ImageResiduals(Part):
     worst: str
 
 
-class LabelResiduals(Part):
-    label: str
-    group: str | None
-    observations: int
-    rms_px: float
-    max_px: float
-
-
-class FileLeftOut(Part):
-    name: str
-    reason: str
-    gate: str
-    value: Number | str | None
-    limit: Number | str | None
-
-
-class CircleLeftOut(Part):
-    image: str
-    label: str
-    reason: str
-    gate: str
-    value: Number
-    limit: Number
-    unit: str
-
-
-class Note(Part):
-    image: str
-    note: str
-
-
 class LeftOut(Part):
-    files: list[FileLeftOut]
-    images: list[FileLeftOut]
-    circles: list[CircleLeftOut]
-    notes: list[Note]
+    files: list[Skipped]
+    images: list[Row]
+    circles: list[Row]
+    notes: list[Row]
 
 
 class ImageRow(Part):
@@ -221,16 +74,6 @@ class ImageRow(Part):
     name: str
     group: str
     circles: int
-
-
-class FocusRow(Part):
-    image: str
-    focused_mm: float | None
-    nearest_mm: float
-    farthest_mm: float
-    nearest_blur_px: float
-    farthest_blur_px: float
-    shift_px: float
 
 
 class CameraInSpace(Part):
@@ -253,14 +96,14 @@ class ReportFile(ResultFile):
     version: str = Field(description="of stcal")
     target: str = Field(description="name of the design")
     reference_face: str = Field(description="face id")
-    options: ReportOptions = Field(
+    options: Row = Field(
         description="`solve`, `frame`, `eccentricity`, `refine_camera`, `expect_faces`, `max_pair_angle_deg`"
     )
     camera: ReportCamera = Field(
         description="COLMAP `model`, `size_px`, `focal_px`, `centre_px` (OpenCV pixel origin), `distortion` k1, k2, "
         "p1, p2, k3 … k6, and s1 … s4 of a lens with thin prisms"
     )
-    summary: Summary = Field(
+    summary: Row = Field(
         description="counts: `files` (skipped ones included), `images`, `images_mapped`, `groups`, `faces`, "
         "`faces_not_seen`, `faces_expected` (by `--expect-faces`, or by the names of groups, where all are made of "
         "ids of faces), `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
@@ -280,51 +123,66 @@ class ReportFile(ResultFile):
         "printed face's size, `edge_share` the share of its variance that is due to the edges of tags (null "
         "without such faces); `printed_faces` the ids of faces with boards or tags"
     )
-    faces: dict[ByFace, FaceRow] = Field(
+    faces: dict[ByFace, Row] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
         "`rotation_sigma_mdeg` (x, y, z of the target frame; null with `chain`), `translation_sources_um`: what each "
         "kind of observation (`circles`, `dots` in the images, the `board`, `flatness`, adjusted `intrinsics`, "
         "`print`, `sizes`, `distances`) contributes to the first (empty with `chain`), `circles` of "
         "`circles_of_design`, `plane_rms_um`, `groups`, `images`"
     )
-    between_faces: list[BetweenFaces] = Field(
+    between_faces: list[Row] = Field(
         description="faces `a`, `b`, `distance_mm` of their origins and its σ `distance_sigma_um` (null with `chain`), "
         "`angle_deg` of their normals"
     )
-    chains: dict[ByFace, list[ChainRow]] = Field(
+    chains: dict[ByFace, list[FaceChain]] = Field(
         description="each way from the reference face through `faces` and `groups`; its distance from the result, "
-        "`translation_um`, `rotation_mdeg`"
+        "`translation_mm`, `rotation_rad`"
     )
-    checks: list[CheckRow] = Field(description="what residuals cannot show")
-    groups: list[GroupRow] = Field(
+    checks: list[Check] = Field(
+        description="what residuals cannot show: `key`, `title`; `verdict`: `passed`; `suspicious`: by chance in one "
+        "honest run of 1000, and `agreement` where the joint adjustment has not settled; `failed`: of 100 000; `not "
+        "possible` in this run (without a `remedy`: not applicable to what was photographed); its `reason` in words; "
+        "`measured`: at most 8 values, the worst first: `name` of what was tested (image, label, face, group, row …), "
+        "`value`, `limit` beyond which it is suspicious (null where there is none), `unit`, `probability` of as much "
+        "by chance before the number of things tested is allowed for (null where it is no test); `tested`: how many "
+        "things were; `names` of all that are beyond the limit, the worst first; `remedy`; `enlarges`: factor on the σ "
+        "of the result by which they cover what was found"
+    )
+    groups: list[Row] = Field(
         description="`name`, mapped `images`, `faces`, `points`; `seeded` how the initial pair was registered; "
-        "`rounds` of refinement; `pairs`, the chosen one first: `first`, `second`, `shared` labels, `median_angle_deg` "
-        "of the rays, `in_front` share, `forward` share of the baseline, `verdict`; `scale`"
+        "`rounds` of refinement; `pairs`, the chosen one first: `first`, `second`, `shared` labels, `median_angle_rad` "
+        "of the rays, `in_front` share, `forward` share of the baseline, `verdict`; `scale`: `mm_per_unit` by least "
+        "squares over all dots, `mm_per_unit_rows` from all pairs of the two `rows`, `difference_ppm`, `sigma_ppm`, "
+        "`dots`; residuals after the similarity, reconstructed minus design, board frame: `board_mean_um`, "
+        "`board_spread_um` (standard deviation), `board_rms_um` of their lengths, `board_residuals_um` label → "
+        "`[x, y, z]`; `source` of λ: `board`, `faces` of known shape, whose corners then stand for the dots, known "
+        "`distances`, or the `drawing`"
     )
     residuals_by_image: list[ImageResiduals] = Field(
         description="`image`, `group`, `observations`, `rms_px` per coordinate, `max_px` length, `worst` label"
     )
-    residuals_by_label: list[LabelResiduals] = Field(
+    residuals_by_label: list[Row] = Field(
         description="`label`, `group` (null for circles of the target: all groups together), `observations`, `rms_px`, "
         "`max_px`"
     )
     left_out: LeftOut = Field(
         description="`files` and `images`: `name`, `reason`; `circles`: `image`, `label`, `reason`, `unit`; all with "
-        "`gate` that stopped it, `value` measured and `limit`, null without a number; `notes`: `image`, `note`"
+        "`gate` that stopped it, `value` measured and `limit`, null without a number; `notes`: `image`, `note`, its "
+        "`code`, and the face or group, `place`, that it is about"
     )
-    notes: list[str] = Field(
-        description="faces of a group that got no frame, and why; rows and columns of the board that no image shows; a "
-        "joint adjustment that has not settled"
+    notes: list[Remark] = Field(
+        description="`note`, its `code`, `place`, `words` and `remedy`: faces of a group that got no frame, and why; "
+        "rows and columns of the board that no image shows; a joint adjustment that has not settled"
     )
     images: list[ImageRow] = Field(
         description="all images of the database in its order: `image_id`, `name`, `group`, `circles` labelled"
     )
-    focus: list[FocusRow] = Field(
+    focus: list[Focus] = Field(
         [],
         description="blur of each `image` with enough circles: `focused_mm` distance of the plane of focus (null "
-        "where the image does not tell it), depths of the `nearest_mm` and `farthest_mm` circle and the blur there, "
-        "`nearest_blur_px` and `farthest_blur_px` (σ); `shift_px`: largest correction of a centre for blur that varies "
-        "across its circle, 0 where none is needed",
+        "where the image does not tell it), depths of the nearest and the farthest circle, `depth_mm`, and the blur "
+        "there, `blur_px` (σ); `shift_px`: largest correction of a centre for blur that varies across its circle, 0 "
+        "where none is needed; `note`",
     )
     scene: Space = Field(
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
@@ -372,3 +230,309 @@ class ReportRead(Part):
             if not {pairs[group].first, pairs[group].second} <= images_of_group:
                 raise ValueError(f"group {group}: its initial pair is not of its images")
         return names
+
+
+def report_of(result: RunResult) -> ReportFile:
+    """Returns the report of a run."""
+    models, calibration = _final_models(result), result.calibration
+    residual = {name: model.residuals_px(calibration.camera) for name, model in models.items()}
+    options, camera = result.options, calibration.camera
+    content = {
+        "format": "stcal report 1",
+        "version": stcal.__version__,
+        "target": result.target_design.name,
+        "reference_face": result.target.reference_face,
+        "options": {
+            "solve": options.solve,
+            "frame": options.frame,
+            "eccentricity": options.eccentricity,
+            "refine_camera": options.refine_camera,
+            "expect_faces": list(options.expect_faces),
+            "max_pair_angle_deg": round(float(np.degrees(options.pairs.limit_rad())), 9),
+        },
+        "camera": {
+            "model": result.camera.colmap_model,
+            "size_px": [result.camera.width, result.camera.height],
+            "focal_px": camera.focal,
+            "centre_px": camera.centre,
+            "distortion": camera.coefficients(),
+        },
+        "summary": _summary(result, models, np.concatenate(list(residual.values()))),
+        "faces": {face: face_row(result, face) for face in result.target.target_from_face},
+        "between_faces": _between(result),
+        "chains": {face: list(chains) for face, chains in result.chains.items()},
+        "checks": result.checks,
+        "groups": [_group(result, solution) for solution in result.solutions],
+        "residuals_by_image": _by_image(models, residual),
+        "residuals_by_label": _by_label(models, residual),
+        "left_out": _left_out(result),
+        "notes": [note if isinstance(note, Note) else Note(note) for note in result.notes],
+        "images": [
+            {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
+            for i, image in enumerate(result.observations(), start=1)
+        ],
+        "focus": [image.focus for image in result.labelled if image.focus is not None],
+        "scene": _scene(result),
+    }
+    return ReportFile.model_validate(content | ({} if result.comparison is None else {"comparison": result.comparison}))
+
+
+def _summary(result: RunResult, models: dict[str, GroupModel], residuals: np.ndarray) -> Row:
+    """Returns the counts and the factors; ``residuals`` : (n, 2) of all models, px."""
+    calibration, target, design = result.calibration, result.target, result.target_design
+    joint, factors, sources = calibration.joint, calibration.sigma_factors, result.scale_from()
+    printed = max(faces_of_known_shape(result.board_design), key=lambda face: face.size_sigma, default=None)
+    of_print = joint if "faces" in sources else None
+    rims = list(calibration.rim_mm.values())
+    groups = {image.file.group for image in result.detection.images} | set(lost_groups(result.notes))
+    return {
+        "files": len(result.detection.images) + len(result.detection.skipped),
+        "images": len(result.labelled),
+        "images_mapped": sum(len(model.images) for model in models.values()),
+        "groups": len(models),
+        "faces": len(target.target_from_face),
+        "faces_not_seen": [face.id for face in design.faces if face.id not in target.target_from_face],
+        "faces_expected": result.options.faces_expected(groups, design),
+        "observations": len(residuals),
+        "residual_rms_px": rms(residuals),
+        "centre_sigma_rms_px": rms(np.concatenate([model.sigma_px() for model in models.values()])),
+        "sigma_factor": factors.all,
+        "circle_sigma_factor": factors.circles,
+        "dot_sigma_factor": factors.dots,
+        "printed_sigma_factor": factors.printed if design.has_printed else None,
+        "scale_sigma_ppm": None if target.scale_sigma is None or design.up_to_scale else 1e6 * target.scale_sigma,
+        "sigma0": joint.sigma0 if joint else None,
+        "redundancy": joint.redundancy if joint else None,
+        "last_move_px": joint.last_move_px if joint else None,
+        "photographs_differ": joint.differ if joint else None,
+        "sigma_enlarged": joint.enlarged if joint else None,
+        "rim_mm": float(np.mean(rims)) if rims else None,
+        "rim_sigma_mm": calibration.rim_sigma_mm if rims else None,
+        "dot_rim_mm": result.board_design.rim_mm or None,
+        "scale_from": sources,
+        "print_factor": of_print.print_factor if of_print else None,
+        "bend_factor": of_print.bend_factor if of_print else None,
+        "camera_given": result.camera_given,
+        "circle_sigma_px": calibration.circle_sigma_px,
+        "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
+        "edge_share": printed.edge_share if printed else None,
+        "printed_faces": sorted(design.printed_ids()),
+    }
+
+
+def residuals_px(result: RunResult) -> list[np.ndarray]:
+    """Returns corrected minus projected keypoints of every image, (k, 2); NaN for keypoints not in the result."""
+    models = _final_models(result)
+    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations()}
+    for model in models.values():
+        residual = model.residuals_px(result.calibration.camera)
+        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+            by_image[name][model.keypoint[rows]] = residual[rows]
+    return list(by_image.values())
+
+
+def unadjusted(result: RunResult) -> dict[str, frozenset[Label]]:
+    """Returns the labels of the keypoints that are not in the result, by image."""
+    return {
+        image.name: frozenset(image.labels[k] for k in np.flatnonzero(np.isnan(residual).any(axis=1)))
+        for image, residual in zip(result.observations(), residuals_px(result), strict=True)
+    }
+
+
+def _final_models(result: RunResult) -> dict[str, GroupModel]:
+    """Returns the models that the result rests on, by group."""
+    if result.calibration.joint:
+        return {model.group: model for model in result.calibration.joint.models}
+    return {solution.model.group: solution.model for solution in result.solutions}
+
+
+def face_row(result: RunResult, face_id: str) -> Row:
+    pose = result.target.target_from_face[face_id]
+    labels = [label for label in result.target.circles if label.face == face_id]
+    members = [member for member in result.calibration.faces if member.face == face_id]
+    covariance = result.target.face_covariance.get(face_id)
+    sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    return {
+        "target_from_face": pose.matrix().tolist(),
+        "translation_mm": pose.translation.tolist(),
+        "angle_to_reference_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1, 1)))),
+        "translation_sigma_um": None if sigma is None else (MICRO * sigma[3:]).tolist(),
+        "rotation_sigma_mdeg": None if sigma is None else (MICRO * np.degrees(sigma[:3])).tolist(),
+        "translation_sources_um": {
+            kind: (MICRO * sigma_mm).tolist()
+            for kind, sigma_mm in result.target.position_sources_mm.get(face_id, {}).items()
+        },
+        "circles": len(labels),
+        "circles_of_design": len(result.target_design.face(face_id).ids),
+        "plane_rms_um": MICRO * fit_plane(np.array([result.target.circles[label] for label in labels])).rms,
+        "groups": [member.group for member in members],
+        "images": sum(member.images for member in members),
+    }
+
+
+def _between(result: RunResult) -> list[Row]:
+    rows = []
+    poses, sigma = result.target.target_from_face, result.target.distance_sigma_mm
+    for a, b in combinations(poses, 2):
+        cosine = poses[a].rotation[:, 2] @ poses[b].rotation[:, 2]
+        rows.append(
+            {
+                "a": a,
+                "b": b,
+                "distance_mm": float(np.linalg.norm(poses[a].translation - poses[b].translation)),
+                "distance_sigma_um": MICRO * sigma[a, b] if (a, b) in sigma else None,
+                "angle_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            }
+        )
+    return rows
+
+
+def _group(result: RunResult, solution) -> Row:
+    name = solution.model.group
+    scale = result.calibration.scales[name]
+    return {
+        "name": name,
+        "images": list(solution.model.images),
+        "faces": [face.face for face in result.calibration.faces if face.group == name],
+        "points": len(solution.model.labels),
+        "seeded": solution.seeded,
+        "rounds": solution.rounds,
+        "pairs": [PairRow.model_validate(pair).model_dump() for pair in solution.pairs],
+        "scale": {
+            "mm_per_unit": scale.mm_per_unit,
+            "mm_per_unit_rows": scale.rows_mm_per_unit,
+            "rows": list(scale.rows),
+            "difference_ppm": 1e6 * (scale.rows_mm_per_unit / scale.mm_per_unit - 1),
+            "sigma_ppm": 1e6 * scale.sigma_mm_per_unit / scale.mm_per_unit,
+            "dots": len(scale.labels),
+            "board_mean_um": MICRO * scale.mean_mm(),
+            "board_spread_um": MICRO * scale.spread_mm(),
+            "board_rms_um": MICRO * scale.rms_mm(),
+            "board_residuals_um": {
+                str(label): (MICRO * residual).tolist()
+                for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)
+            },
+            "source": scale.source,
+        },
+    }
+
+
+def _by_image(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) -> list[Row]:
+    rows = []
+    for name, model in models.items():
+        length = np.linalg.norm(residual[name], axis=1)
+        for i, image in enumerate(model.images):
+            indices = np.flatnonzero(model.image_index == i)
+            worst = indices[np.argmax(length[indices])]
+            rows.append(
+                {
+                    "image": image,
+                    "group": name,
+                    "observations": len(indices),
+                    "rms_px": rms(residual[name][indices]),
+                    "max_px": float(length[worst]),
+                    "worst": model.labels[model.point_index[worst]],
+                }
+            )
+    return rows
+
+
+def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) -> list[Row]:
+    """Returns residuals by label: of the target's circles over all groups, of the board's dots group by group."""
+    gathered: dict[tuple[str, str], list[np.ndarray]] = {}
+    for name, model in models.items():
+        for k, r in zip(model.point_index, residual[name], strict=True):
+            label = model.labels[k]
+            gathered.setdefault((name if isinstance(label, DotLabel) else "", label), []).append(r)
+    return [
+        {
+            "label": str(label),
+            "group": group or None,
+            "observations": len(rows),
+            "rms_px": rms(np.array(rows)),
+            "max_px": float(np.linalg.norm(rows, axis=1).max()),
+        }
+        for (group, label), rows in sorted(gathered.items())
+    ]
+
+
+def _left_out(result: RunResult) -> Row:
+    observed = {image.observations.name: image for image in result.labelled}
+    images, circles = [], []
+    for solution in result.solutions:
+        mapped = set(solution.model.labels)
+        for name, reason in solution.left_out.items():
+            known = len(mapped & set(observed[name].observations.labels))
+            few = known < MIN_POINTS
+            images.append(
+                {
+                    "name": name,
+                    "reason": reason,
+                    "gate": "known_circles" if few else "fitting_circles",
+                    "value": known if few else None,
+                    "limit": MIN_POINTS,
+                }
+            )
+        circles += [
+            {
+                "image": o.image,
+                "label": str(o.label),
+                "reason": f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the others; "
+                "look for glare, dirt, a part hidden, or something that moved",
+                "gate": "residual",
+                "value": o.residual_px,
+                "limit": o.limit_px,
+                "unit": "px",
+            }
+            for o in solution.outliers
+        ]
+        mapped_images = [observed[name].observations for name in solution.model.images]
+        circles += _without_point(solution.model, mapped_images, {(o.image, o.label) for o in solution.outliers})
+    return {
+        "files": result.detection.skipped,
+        "images": images,
+        "circles": circles,
+        "notes": [
+            {"image": name, "note": str(note), "code": getattr(note, "code", ""), "place": getattr(note, "place", "")}
+            for name, image in observed.items()
+            for note in image.notes
+        ],
+    }
+
+
+def _without_point(model: GroupModel, images: list[ImageObservations], outliers: set[tuple[str, str]]) -> list[Row]:
+    """Returns labelled circles of mapped images that are no points of the model: seen once, or from one direction."""
+    rays: dict[str, list[tuple[str, np.ndarray]]] = {}
+    for image, pose in zip(images, model.camera_from_model, strict=True):
+        for k in range(len(image)):
+            if image.labels[k] not in model.labels and (image.name, image.labels[k]) not in outliers:
+                ray = pose.rotation.T @ np.append(image.centre[k], 1.0)
+                rays.setdefault(image.labels[k], []).append((image.name, ray / np.linalg.norm(ray)))
+    circles = []
+    for label, sightings in rays.items():
+        direction = np.array([ray for _, ray in sightings])
+        angle = float(np.degrees(np.arccos(np.clip(direction @ direction.T, -1, 1)).max()))
+        needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
+        if len(sightings) == 1:
+            gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
+            reason = "seen in one mapped image of its group only, 2 needed; photograph it from another place too"
+        else:
+            gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
+            reason = (
+                f"{len(sightings)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
+            )
+        circles += [{"image": name, "label": str(label), "reason": reason} | gate for name, _ in sightings]
+    return circles
+
+
+def _scene(result: RunResult) -> Row:
+    """Returns cameras, board dots and circles in the target frame, for the picture in space."""
+    cameras, boards = [], {}
+    for model in result.calibration.models:
+        for image, pose in zip(model.images, model.camera_from_model, strict=True):
+            position_mm = pose.inverse().translation
+            cameras.append({"image": image, "group": model.group, "position_mm": position_mm, "axes": pose.rotation})
+        dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
+        if dots:
+            boards[model.group] = model.xyz_model[dots]
+    return {"cameras": cameras, "boards": boards, "circles": result.target.circles}

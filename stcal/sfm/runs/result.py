@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -18,6 +17,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.json import ByFace, Part
 from stcal.labels import Label
+from stcal.report.document import html
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
 from stcal.sfm.adjust.refine import projection_jacobians
@@ -49,12 +49,12 @@ class FaceOff(Part):
 
 class ComparedRow(Part):
     method: str
-    faces: dict[ByFace, FaceOff]
-    missing: list[str]
-    board_mean_um: float | None
-    board_spread_um: float | None
-    residual_rms_px: float | None
-    reason: str | None
+    faces: dict[ByFace, FaceOff] = Field(default={})
+    missing: list[str] = Field(default=[])
+    board_mean_um: float | None = None
+    board_spread_um: float | None = None
+    residual_rms_px: float | None = None
+    reason: str | None = None
 
 
 class Comparison(Part):
@@ -206,31 +206,15 @@ class RunResult(ByValue):
         return self.calibration.target
 
     def __repr__(self) -> str:
-        faces = "; ".join(", ".join(row) for row in self._summary())
         place = f" in {self.out}" if self.out else ""
-        verdict = self._verdict().removesuffix(".")
-        return f"<RunResult{place}: {verdict}; face, largest σ along an axis µm, about one mdeg: {faces or 'no face'}>"
+        return f"<RunResult{place}: {'not judged' if self.judgement is None else self.judgement.use.removesuffix('.')}>"
 
     def _repr_html_(self) -> str:
-        """Returns verdict, faces and σ as HTML, which notebooks show."""
-        rows = [f"<tr><td>{'</td><td>'.join(map(escape, row))}</td></tr>" for row in self._summary()]
-        head = "<tr><th>face</th><th>largest σ along an axis, µm</th><th>about an axis, mdeg</th></tr>"
-        return f"<p>{escape(self._verdict())}</p><table>{head}{''.join(rows)}</table>"
+        """Returns verdict, faces and checks as HTML, which notebooks show."""
+        from stcal.sfm.runs.text import document_of
 
-    def _verdict(self) -> str:
-        return "not judged" if self.judgement is None else f"may I use it? {self.judgement.use}"
-
-    def _summary(self) -> list[tuple[str, str, str]]:
-        """Returns each face with its largest σ along an axis and about one."""
-        rows = []
-        for face in self.target.target_from_face:
-            covariance = self.target.face_covariance.get(face)
-            if face == self.target.reference_face or covariance is None:
-                rows.append((face, "reference" if face == self.target.reference_face else "", ""))
-                continue
-            sigma = np.sqrt(np.diag(covariance))
-            rows.append((face, f"{1e3 * sigma[3:].max():.1f}", f"{1e3 * np.degrees(sigma[:3].max()):.2f}"))
-        return rows
+        document = document_of(self)
+        return html(document.about, *document.banner, *document.sections[0].blocks)
 
     def circles(self) -> TargetCircles:
         """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""

@@ -257,7 +257,11 @@ def as_written(file: Path | str) -> Iterator[None]:
     """Raises InputError that names the file if it is not as a run of this version writes it."""
     try:
         yield
-    except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
+    except OSError as error:
+        raise InputError(
+            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the run needs it, run it again"
+        ) from error
+    except (LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise InputError("E-RUN-DAMAGED", f"{file}: damaged, or of another version ({reason}); run it again") from error
 

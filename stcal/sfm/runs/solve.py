@@ -29,6 +29,7 @@ from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
 from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, Check, moved_apart
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group, detections_csv
+from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
 from stcal.sfm.detect.labels import (
@@ -38,14 +39,13 @@ from stcal.sfm.detect.labels import (
     label_boards,
     label_images,
     label_once,
-    leaves_a_board_out,
 )
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
-from stcal.sfm.report.judgement import LEFT_OUT_WHOLE, OF_WHOLE_SET
+from stcal.sfm.report.judgement import OF_WHOLE_SET
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.transaction import RunFolder
 
@@ -159,10 +159,10 @@ def usable_groups(
     for file in skipped:
         # A folder that holds only copies is not a group.
         group = file.name.rpartition("/")[0] or TOP_GROUP
-        if file.name.lower().endswith(SUFFIXES) and (group in groups or not file.reason.startswith("the same image")):
+        if file.name.lower().endswith(SUFFIXES) and (group in groups or file.gate != "copy"):
             lost.setdefault(group, []).append(file)
     usable: dict[str, list[ImageObservations]] = {}
-    errors: list[MappingError] = []
+    errors: list[tuple[str, MappingError]] = []
     for name in sorted(groups.keys() | lost.keys()):
         group, first = groups.get(name, []), lost.get(name, [])[:1]
         try:
@@ -179,14 +179,14 @@ def usable_groups(
                 raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
             require_usable(group, board_alone, needs_board)
         except MappingError as error:
-            errors.append(error)
+            errors.append((name, error))
         else:
             usable[name] = group
     if not usable:
         deeper = [f"; {file.name}: {file.reason}" for file in skipped if HOLDS_IMAGES in file.reason]
-        errors[0].append("".join(deeper[:1]))
-        raise errors[0]
-    return usable, [_left_out(error) for error in errors]
+        errors[0][1].append("".join(deeper[:1]))
+        raise errors[0][1]
+    return usable, [Note.of_group(name, error) for name, error in errors]
 
 
 def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
@@ -194,7 +194,11 @@ def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
     images = [image for image in labelled if image.observations.group == TOP_GROUP]
     if not images:
         return []
-    dropped = [image.observations.name for image in images if any(map(leaves_a_board_out, image.notes))]
+    dropped = [
+        image.observations.name
+        for image in images
+        if any(isinstance(note, Note) and note.code == BOARD_LEFT_OUT for note in image.notes)
+    ]
     remark = (
         f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
         "more than one group"
@@ -220,10 +224,6 @@ def unknown_face_notes(groups: Iterable[str], target: TargetDesign) -> list[str]
 def _listed(names: Iterable[str], most: int = 4) -> str:
     all_names = list(names)
     return ", ".join(all_names[:most]) + (", …" if len(all_names) > most else "")
-
-
-def _left_out(error: StcalError) -> str:
-    return f"{LEFT_OUT_WHOLE}{error}"
 
 
 def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
@@ -422,9 +422,9 @@ def solve_body(
     """Maps and refines the groups of a body that its faces have placed; returns the solutions, and why groups have
     none. If there is no solution, the error of the first group is raised."""
     solutions: list[GroupSolution] = []
-    errors: list[StcalError] = []
+    errors: list[tuple[str, StcalError]] = []
     groups = by_group(observations)
-    for done, group in enumerate(groups.values(), 1):
+    for done, (name, group) in enumerate(groups.items(), 1):
         try:
             model = model_of_body(body, group, camera)
             gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
@@ -433,7 +433,7 @@ def solve_body(
             refined = refine_or_explain(model.without(is_gross), camera, target, board, eccentricity)
             find_scale(refined.model, board)
         except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
-            errors.append(error)
+            errors.append((name, error))
         else:
             missing = left_out(group, refined.model, SHOW_MORE) | left_out(group, model, SHOW_MORE)
             pair = pair_of_model(refined.model)
@@ -441,8 +441,8 @@ def solve_body(
             solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers))
         progress("map", done, len(groups))
     if not solutions:
-        raise errors[0]
-    return solutions, [_left_out(error) for error in errors]
+        raise errors[0][1]
+    return solutions, [Note.of_group(name, error) for name, error in errors]
 
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
@@ -511,7 +511,7 @@ def solve_groups(
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     solutions: list[GroupSolution] = []
-    errors: list[StcalError] = []
+    errors: list[tuple[str, StcalError]] = []
     for group, solution in zip(groups, (each for each in found if each is not None), strict=True):
         try:
             if isinstance(solution, StcalError):
@@ -519,12 +519,12 @@ def solve_groups(
             find_scale(solution.model, board)
         except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
             error.append(pitch_hint(group.images, board))
-            errors.append(error)
+            errors.append((group.images[0].group, error))
         else:
             solutions.append(solution)
     if not solutions:
-        raise errors[0]
-    return solutions, [_left_out(error) for error in errors]
+        raise errors[0][1]
+    return solutions, [Note.of_group(name, error) for name, error in errors]
 
 
 def _pairs_within(group: str, observations: Sequence[ImageObservations], graph: ImageGraph) -> np.ndarray:

@@ -6,17 +6,19 @@ from pathlib import Path
 
 import pytest
 
+from stcal.errors import MappingError
 from stcal.sfm import checks
+from stcal.sfm.data.note import ELSEWHERE, Note
 from stcal.sfm.report.judgement import (
     CAUSE,
     INVALIDATES,
-    LEFT_OUT_WHOLE,
     OF_WHOLE_SET,
     judged,
     judgement_of,
 )
 from stcal.sfm.report.page import report_html
 from stcal.sfm.report.sections import count_verdicts
+from stcal.sfm.runs.report import Remark
 from tests.sfm.report.test_report import make
 
 KEYS = re.compile(r'(?:judge|impossible)\(\s*"([a-z-]+)"|key(?:, title)? = "([a-z-]+)"')
@@ -159,7 +161,7 @@ def test_without_sigma():
     assert (found.verdict, found.position_sigma_um, found.position_face) == ("with care", None, None)
     assert "--solve joint" in found.next
     (way,) = own["chains"]["2"]
-    own["chains"]["2"] = [way, way | {"translation_um": 20.04}]
+    own["chains"]["2"] = [way, way | {"translation_mm": 0.02004}]
     assert "up to 20.0 µm and 7.25 mdeg off" in judgement_of(own).quality
 
 
@@ -187,11 +189,11 @@ def test_sigma_that_are_larger_than_pixels_explain_are_said():
 
 def test_blur_that_limits_is_said_before_more_images():
     own = report()
-    own["focus"] = [{"nearest_blur_px": 2.5, "farthest_blur_px": 1.5}]
+    own["focus"] = [{"blur_px": [2.5, 1.5]}]
     told = judgement_of(own)
     assert told.limit.startswith("The sharpness: edges are blurred by 2.0 px")
     assert "Nothing has to be done" not in told.next
-    own["focus"][0] |= {"nearest_blur_px": 0.9, "farthest_blur_px": 0.8}
+    own["focus"] = [{"blur_px": [0.9, 0.8]}]
     assert "sharpness" not in judgement_of(own).limit
 
 
@@ -249,8 +251,7 @@ def test_a_missing_face_that_was_expected_is_named():
 def test_a_face_that_was_read_and_left_out_is_missing():
     own = report()
     own["summary"]["faces_not_seen"] = ["5"]
-    note = "a pattern like face 5: not where other groups see that face against the others; left out"
-    own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "note": note} for i in range(3)]
+    own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "code": ELSEWHERE, "place": "5"} for i in range(3)]
     told = judgement_of(own)
     assert (told.verdict, "face 5 was read in 3 images" in told.use) == ("part", True)
     assert "Read why face 5 was left out" in told.next
@@ -262,11 +263,12 @@ def test_a_face_that_was_read_and_left_out_is_missing():
 def test_a_group_that_was_left_out_calls_for_care_and_says_why():
     """In place of what limits the rest, which is not what the user should look at first."""
     own = report()
-    own["notes"] = [LEFT_OUT_WHOLE + "group 25: no board recognised in 4 images; keep it in view"]
+    note = Note.of_group("25", MappingError("E-GROUP-NO-BOARD", "group 25: no board in 4 images; keep it in view"))
+    own["notes"] = [Remark.model_validate(note).model_dump()]
     told = judgement_of(own)
     assert (told.verdict, told.missing) == ("with care", ["group 25"])
     assert "group 25" in told.use
-    assert (told.limit, told.next) == ("Left out: group 25: no board recognised in 4 images.", "Keep it in view.")
+    assert (told.limit, told.next) == ("Left out: group 25: no board in 4 images.", "Keep it in view.")
     own["checks"][0] = check("a", "suspicious")
     assert judgement_of(own).use.count("With care: ") == 1
 

@@ -44,11 +44,7 @@ def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_
     assert code == 0
     assert {"faces: 4 of 4", "check: 20 of 20"} <= set(err.splitlines())
     assert "µm" not in next(line for line in out.splitlines() if line.startswith("How good is it?"))
-    assert "σ position µm" not in out
-    lines = out.splitlines()
-    (counts,) = (i for i, line in enumerate(lines) if line.startswith("checks: "))
-    assert lines[counts + 1] == "  (a check is suspicious by chance in one run in 1,000, failed in one in 100,000)"
-    assert lines[counts + 2].startswith("  failed: ")
+    assert "(a check is suspicious by chance in one run in 1,000, failed in one in 100,000)" in " ".join(out.split())
     assert f"--exclude {STRAY}" in " ".join(out.split()).split(" failed: ")[1]
 
     outcome = stcal_sfm(*small.arguments(*files(small)))
