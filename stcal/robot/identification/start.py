@@ -380,6 +380,8 @@ def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
     q = data.q
     in_degrees = replace(data, q=q * np.where(robot.prismatic, 1.0, 180 / np.pi))
     yield "joint values are radians in columns of degrees", "call the columns q1_rad …", robot, in_degrees
+    in_radians = replace(data, q=q / np.where(robot.prismatic, 1.0, 180 / np.pi))
+    yield "joint values are degrees in columns of radians", "call the columns q1_deg …", robot, in_radians
     lengths = {"distances": data.distances, "positions": data.positions}
     for unit, words in UNIT_WORDS.items():
         there = words, "mm", unit, LENGTHS[unit]
