@@ -117,6 +117,10 @@ def _end(code: int, output: str) -> str:
     return f"{ending}: {' '.join(output.split())[-LAST_WORDS:] or 'no message'}"
 
 
+LISTENED_S = 2.0
+"""How long the output of an ended program is waited for, s: a child of its own session may hold the pipe open."""
+
+
 def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int | None, str]:
     """Exit code of a command, None after the time limit, and its last output; no child process outlives it."""
     try:
@@ -135,9 +139,10 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
     output = bytearray()
 
     def listen() -> None:
-        while chunk := os.read(pipe.fileno(), 1 << 16):
-            output.extend(chunk)
-            del output[:-MAX_OUTPUT]
+        with contextlib.suppress(OSError, ValueError):  # closed below, where another session still holds the pipe
+            while chunk := os.read(pipe.fileno(), 1 << 16):
+                output.extend(chunk)
+                del output[:-MAX_OUTPUT]
 
     with process.stdout as pipe:  # type: ignore[union-attr]  # as stdout=PIPE
         listener = threading.Thread(target=listen, daemon=True)
@@ -150,7 +155,7 @@ def _run(command: list[str], timeout_s: float, **environment: str) -> tuple[int 
             with contextlib.suppress(ProcessLookupError, PermissionError):  # macOS: not permitted for an ended process
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-            listener.join()
+            listener.join(LISTENED_S)
     return code, output.decode(errors="replace")
 
 
