@@ -3,7 +3,6 @@ alone."""
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from statistics import median
 from typing import Literal
 
@@ -52,6 +51,13 @@ OF_WHOLE_SET = "Cause of the whole set: "
 EVERY_SIGMA = "every σ"
 DISTANCES = "all distances and the size"
 UNKNOWN_SIZE = "nothing of known size is in view, and its size is that of the drawing"
+SIZES = {
+    "board": "the board's pitch",
+    "faces": "the printed size of the faces",
+    "distances": "the known distances",
+    "drawing": "a length of the drawing",
+}
+"""What the size of a result rests on."""
 PLACES = "the places of all faces"
 CENTRES = "all centres of circles"
 INVALIDATES: dict[str, tuple[str, ...]] = {
@@ -101,12 +107,8 @@ class Judgement(Part):
         return [(question, getattr(self, key)) for key, question in QUESTIONS.items()]
 
 
-@dataclass(frozen=True, slots=True)
-class _Cause:
-    """Cause that limits a result, and its remedy."""
-
-    limit: str
-    remedy: str
+Cause = tuple[str, str]
+"""What limits a result, and the remedy."""
 
 
 def judged(report: dict) -> dict:
@@ -118,9 +120,11 @@ def judgement_of(report: dict) -> Judgement:
     """Returns the judgement of a run from the content of ``report.json``."""
     verdict, use = _use(report)
     failed = [check["key"] for check in report.get("checks", []) if check["verdict"] == "failed"]
-    lost = None if failed else _by_lost_group(report)  # what is only suspicious comes after it
-    by_result = _control(report) or lost or _by_checks(report) or _by_gaps(report)
-    cause = by_result or _by_drawing(report) or _by_lost_group(report) or _by_size(report) or _by_sigma(report)
+    lost = _of_notes(report, GROUP_LEFT_OUT, "Left out")
+    before = None if failed else lost  # what is only suspicious comes after it
+    by_result = _control(report) or before or _by_checks(report) or _by_gaps(report)
+    drawing = _of_notes(report, NOT_AS_DRAWN, "The drawing") if report["faces"] else None
+    cause = by_result or drawing or lost or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
@@ -129,8 +133,8 @@ def judgement_of(report: dict) -> Judgement:
         verdict=verdict,
         use=use,
         quality=_unknown(report, invalid) if verdict == "no" else _quality(report, position, rotation),
-        limit=cause.limit,
-        next=" ".join([*([cause.remedy] if cause.remedy else []), *_more(report, verdict)]),
+        limit=cause[0],
+        next=" ".join([*filter(None, cause[1:]), *_more(report, verdict)]),
         position_sigma_um=position and position[0],
         position_face=position and position[1],
         rotation_sigma_mdeg=rotation and rotation[0],
@@ -169,50 +173,37 @@ def not_first(keys: Iterable[str]) -> set[str]:
 # --- may I use it -----------------------------------------------------------------------------------------------------
 
 
+BEGINNINGS = {"yes": "Yes", "with care": "With care", "no": "No"}
+
+
 def _use(report: dict) -> tuple[Use, str]:
-    verdict, answer = _by_result(report)
+    verdict, words = _by_result(report)
+    begin, reasons, gaps = "", [words], _gaps(report) if report["faces"] else []
     if verdict != "no" and "drawing" in report["summary"].get("scale_from", []):
-        verdict, answer = "with care", f"With care, for its shape alone: {UNKNOWN_SIZE}; {answer.partition(': ')[2]}"
-    if drawn := _drawn(report):
-        answer = f"With care: {answer.removeprefix('Yes: ')}" if verdict == "yes" else answer
-        verdict = "with care" if verdict == "yes" else verdict
-        answer = f"{answer.removesuffix('.')}; {drawn[0][0]}."
-    gaps = _gaps(report)
-    if not gaps or not report["faces"]:
-        return verdict, answer
-    if verdict == "yes" and _lost_groups(report):
-        verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
-    if verdict != "no" and (absent := _lacking(report)):
-        care, (_, _, reasons) = ", with care" if verdict == "with care" else "", answer.partition(": ")
-        n, of = len(report["faces"]), len(report["faces"]) + len(absent)
-        verdict, answer = "part", f"Part{care}: {n} of {of} faces; {reasons}"
-    return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
+        verdict, begin, reasons = "with care", "With care, for its shape alone", [UNKNOWN_SIZE, words]
+    drawn = _notes(report, NOT_AS_DRAWN) if report["faces"] else []
+    reasons += [note["words"] for note in drawn[:1]]
+    if verdict == "yes" and (drawn or (gaps and _lost_groups(report))):
+        verdict = "with care"
+    if verdict != "no" and gaps and (absent := _lacking(report)):
+        begin = "Part, with care" if verdict == "with care" else "Part"
+        verdict, n = "part", len(report["faces"])
+        reasons.insert(0, f"{n} of {n + len(absent)} faces")
+    return verdict, f"{begin or BEGINNINGS[verdict]}: {'; '.join([*reasons, *gaps])}."
 
 
 def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
 
 
-def _drawn(report: dict) -> list[tuple[str, str]]:
-    """Returns in which ways the faces are not where they were drawn, and what to do about each."""
-    notes = _notes(report, NOT_AS_DRAWN) if report["faces"] else []
-    return [(note["words"], note["remedy"]) for note in notes]
-
-
-def _by_drawing(report: dict) -> _Cause | None:
-    for what, remedy in _drawn(report):
-        return _Cause(f"The drawing: {what}.", f"{_capital(remedy)}.")
-    return None
-
-
 def _by_result(report: dict) -> tuple[Use, str]:
-    """Returns verdict and answer by what is in the result."""
+    """Returns verdict and reason by what is in the result."""
     checks = [check for check in report.get("checks", []) if check["key"] != CAUSE]
     counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
     if not report["faces"]:
-        return "no", "No: there is no face in it, only λ and residuals of the board."
+        return "no", "there is no face in it, only λ and residuals of the board"
     if _control(report):
-        return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
+        return "no", "it was made for comparison, and its faces are biased by tens of µm"
     made = len(checks) - counts["not possible"]
     missing = sum(c["verdict"] == "not possible" and applies(c["verdict"], c["remedy"]) for c in checks)
     n = counts["failed"]
@@ -220,36 +211,36 @@ def _by_result(report: dict) -> tuple[Use, str]:
     name = cause[0]["title"].removeprefix(OF_WHOLE_SET) if cause else ""
     if cause and cause[0]["verdict"] == "failed":
         of = f"; that is the likely cause of {n} of {made} checks that failed" if n else ""
-        return "no", f"No: {name}{of}."
+        return "no", f"{name}{of}"
     if n:
-        return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
+        return "no", f"{n} of {made} checks failed, the first: {_first(report, 'failed')['title']}"
     if different := report.get("crosscheck", {}).get("differences"):
-        return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
+        return "with care", f"the native COLMAP comes to other faces ({different[0]})"
     if words := _larger(report, checks):
-        return "with care", f"With care: {words}{f'; the likely cause: {name}' if cause else ''}."
+        return "with care", f"{words}{f'; the likely cause: {name}' if cause else ''}"
     if cause:
-        return "with care", f"With care: {name}, though no check failed."
+        return "with care", f"{name}, though no check failed"
     if n := counts["suspicious"]:
         message = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
         first = _first(report, "suspicious")
         # A residual beyond its limit that was left out is none by chance, and has no probability.
         chance = all(value["probability"] is not None for value in first["measured"][:1])
         by_chance = f"; of {made} checks one is so by chance in one sound run of {round(TESTS_OF_CHANCE / made)}"
-        return "with care", f"With care: {message}{first['title']}{by_chance if chance else ''}."
+        return "with care", f"{message}{first['title']}{by_chance if chance else ''}"
     if report["summary"]["sigma0"] is None:
         return (
             "with care",
-            "With care: groups were solved one by one; there are no σ, and there are fewer checks.",
+            "groups were solved one by one; there are no σ, and there are fewer checks",
         )
     testing = [check["verdict"] for check in checks if check["key"] in TESTED_BY]
     if testing and set(testing) == {"not possible"}:
         return (
             "with care",
-            f"With care: the photographs are too few to test one another, {missing} checks were not possible.",
+            f"the photographs are too few to test one another, {missing} checks were not possible",
         )
     passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
     open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
-    return "yes", f"Yes: {passed}{open_}."
+    return "yes", f"{passed}{open_}"
 
 
 def _larger(report: dict, checks: list[dict]) -> str:
@@ -408,13 +399,10 @@ def _relative(ppm: float) -> str:
 
 
 def _premise(report: dict) -> str:
-    refined = report["options"].get("refine_camera")
-    sizes = {"board": "the board's pitch", "faces": "the printed size of the faces", "distances": "the known distances"}
-    sizes["drawing"] = "a length of the drawing"
-    premises = [sizes[source] for source in report["summary"].get("scale_from", ["board"])]
-    premises = premises if refined else ["the intrinsics", *premises]
-    single = len(premises) == 1 and not premises[0].endswith("distances")
-    return f"{' and '.join(premises)} {'is' if single else 'are'}"
+    premises = [] if report["options"].get("refine_camera") else ["the intrinsics"]
+    sources = report["summary"].get("scale_from", ["board"])
+    single = len(premises) + len(sources) == 1 and sources != ["distances"]
+    return f"{' and '.join([*premises, *(SIZES[source] for source in sources)])} {'is' if single else 'are'}"
 
 
 def _largest(report: dict, key: str) -> tuple[float, str] | None:
@@ -426,23 +414,25 @@ def _largest(report: dict, key: str) -> tuple[float, str] | None:
 # --- what limits it, what next ----------------------------------------------------------------------------------------
 
 
-def _control(report: dict) -> _Cause | None:
+def _control(report: dict) -> Cause | None:
     """Returns the cause of a result without faces, or of one made for comparison; None for other results."""
     options = report["options"]
     if not report["faces"]:
-        return _Cause(
+        return (
             f"No face of the target was recognised in {report['summary']['images']} images.",
             "Look at the overlays; where a face is in view, give its design with --target.",
         )
     if options["solve"] == "paper":
-        return _Cause("The published method: contours with equal weights, without the eccentricity of circles.",
-                      "Run it without --solve paper.")  # fmt: skip
+        return (
+            "The published method: contours with equal weights, without the eccentricity of circles.",
+            "Run it without --solve paper.",
+        )
     if not options["eccentricity"]:
-        return _Cause("The eccentricity of circles is not corrected.", "Run it without --no-eccentricity.")
+        return "The eccentricity of circles is not corrected.", "Run it without --no-eccentricity."
     return None
 
 
-def _by_checks(report: dict) -> _Cause | None:
+def _by_checks(report: dict) -> Cause | None:
     """Returns the cause by the first failed check, a suspicious one that limits the result, or the cross-check."""
     verdicts = {check["verdict"] for check in report.get("checks", [])}
     for verdict in ("failed", "suspicious"):
@@ -451,55 +441,54 @@ def _by_checks(report: dict) -> _Cause | None:
             remedy = f"{_capital(check['remedy'] or 'look at what the check names')}."
             found = f"{check['title']}: {check['reason']}."
             if verdict == "failed":
-                return _Cause(found, remedy)
+                return found, remedy
             limits = _by_gaps(report) or _by_size(report) or _by_sigma(report)
-            return _Cause(limits.limit, f"{found} {remedy}")  # what is suspicious is to be looked at; σ still tell
+            return limits[0], f"{found} {remedy}"  # what is suspicious is to be looked at; σ still tell
     if different := report.get("crosscheck", {}).get("differences"):
         remedy = "Look at the cross-check to see which of the two is right."
-        return _Cause(f"The native COLMAP differs: {different[0]}.", remedy)
+        return f"The native COLMAP differs: {different[0]}.", remedy
     return None
 
 
-def _by_gaps(report: dict) -> _Cause | None:
+def _by_gaps(report: dict) -> Cause | None:
     """Returns the cause where faces are missing that were to be there; None if all are."""
     if missing := _missing_faces(report):
-        return _Cause(
+        return (
             f"Face {join(missing)} should have been photographed, and is not in the result.",
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
     if report["faces"] and (absent := _lacking(report)):
         n, of = len(report["faces"]), len(report["faces"]) + len(absent)
-        return _Cause(f"The photographs: they give {n} of the {of} faces of the design.", "")
+        return f"The photographs: they give {n} of the {of} faces of the design.", ""
     return None
 
 
-def _by_lost_group(report: dict) -> _Cause | None:
-    """Returns why the first group that was left out could not be solved; None if all could."""
-    for note in _notes(report, GROUP_LEFT_OUT):
-        remedy = f"{_capital(note['remedy'])}." if note["remedy"] else "Take it again."
-        return _Cause(f"Left out: {note['words']}.", remedy)
+def _of_notes(report: dict, code: str, begin: str) -> Cause | None:
+    """Returns what the first note of this kind says limits the result; None if there is none."""
+    for note in _notes(report, code)[:1]:
+        return f"{begin}: {note['words']}.", f"{_capital(note['remedy'] or 'take it again')}."
     return None
 
 
-def _by_size(report: dict) -> _Cause | None:
+def _by_size(report: dict) -> Cause | None:
     """Returns the cause where no size is known; None where one is."""
     if "drawing" not in report["summary"].get("scale_from", []):
         return None
-    return _Cause(
+    return (
         "Its size: nothing of known size is in view.",
         "Measure the distance of two points and state it with scale in target.toml, or photograph the board of dots "
         "with it; if one is in view, give its file with --board.",
     )
 
 
-def _by_sigma(report: dict) -> _Cause:
+def _by_sigma(report: dict) -> Cause:
     """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
     if len(report["faces"]) == 1:
         remedy = "Photograph it together with other faces."
-        return _Cause("There is only one face, and nothing links it to others.", remedy)
+        return "There is only one face, and nothing links it to others.", remedy
     found = _largest(report, "translation_sigma_um")
     if found is None:
-        return _Cause("What limits it is unknown without σ.", "Run it with --solve joint.")
+        return "What limits it is unknown without σ.", "Run it with --solve joint."
     sigma, worst = found
     face = report["faces"][worst]
     axis = face["translation_sigma_um"].index(sigma)
@@ -509,7 +498,7 @@ def _by_sigma(report: dict) -> _Cause:
     of_all = f"% of the variance of face {worst} along {'xyz'[axis]} (σ {number(sigma, 1)} µm)"
     if source and variance[source] > photographs:
         name, remedy = _source(report, source)
-        return _Cause(f"{name}: {number(100 * variance[source] / sigma**2, 0)} {of_all}.", remedy)
+        return f"{name}: {number(100 * variance[source] / sigma**2, 0)} {of_all}.", remedy
     others = [
         max(row["translation_sigma_um"])
         for name, row in report["faces"].items()
@@ -517,7 +506,7 @@ def _by_sigma(report: dict) -> _Cause:
     ]
     if others and sigma > TAIL * median(others):
         of_groups = "" if face["groups"] == [TOP_GROUP] else f", of group {join(face['groups'])}"
-        return _Cause(
+        return (
             f"Face {worst}: {number(sigma, 1)} µm along {'xyz'[axis]}, where the others have "
             f"{number(median(others), 1)} µm; {face['images']} images show it{of_groups}.",
             f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
@@ -525,22 +514,22 @@ def _by_sigma(report: dict) -> _Cause:
     return _by_images(report, sigma, photographs, of_all)
 
 
-def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cause:
+def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> Cause:
     """Returns the cause where photographs limit the result; ``variance``: their part of ``sigma``², 0 if unknown."""
     summary, advice = report["summary"], "`stcal-sfm advise RUN` says which do most."
     if not variance:
-        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}")
+        return "What limits it is not in this report.", f"`stcal-sfm budget RUN` shows it, and {advice}"
     centre = summary.get("circle_sigma_px")
     of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
     blurs = [sum(row["blur_px"]) / 2 for row in report.get("focus", [])]
     if blurs and (blur := median(blurs)) > SHARP_PX:
-        return _Cause(
+        return (
             f"The sharpness: edges are blurred by {number(blur, 1)} px, half of that is usual, and σ of centres grow "
             f"with it; they are {number(100 * variance / sigma**2, 0)} {of_all}.",
             f"Focus on the middle of target and board, close the aperture, or stand farther away; then {advice}",
         )
     fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
-    return _Cause(
+    return (
         f"The centring of circles{of_centres} in {summary['images_mapped']} images: "
         f"{number(100 * variance / sigma**2, 0)} {of_all}; no face stands out.",
         f"Nothing has to be done; four times the images would make {number(fewer, 1)} µm of these {number(sigma, 1)} "

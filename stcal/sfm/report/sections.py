@@ -6,15 +6,13 @@ from stcal.labels import parse_label
 from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import CHANCE, Judgement, applies
+from stcal.sfm.report.judgement import CHANCE, SIZES, Judgement, applies
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
     "chain": "chain: group by group, then combined",
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
-SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
-SCALES |= {"drawing": "unknown: the drawing defines the unit"}
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -36,15 +34,6 @@ class Words:
     def points(self) -> str:
         """Returns the plural of ``point``."""
         return f"{self.point}s"
-
-
-SIZES = {
-    "board": "the given pitch of the board",
-    "faces": "the stated size of the printed faces",
-    "distances": "the stated distances",
-    "drawing": "the drawing as the unit of length",
-}
-"""What gives the scale, in words."""
 
 
 def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
@@ -117,7 +106,7 @@ def settings(report: dict, words: Words) -> list[list[str]]:
             f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
             f"{len(left_out['circles']) - single} {words.points}; {single} more that one image of a group alone shows",
         ],
-        ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
+        ["Scale", join([SIZES[source] for source in summary.get("scale_from", ["board"])])],
         [
             "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
             f"{camera['model']}, {sizes} px",

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -45,14 +46,14 @@ def require_comparable(options: AdjustOptions) -> None:
 def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
     """Compares faces, board and residuals of the published method, and of each step of this package added in turn, as
     three-point frames. ``published``: of ``--solve paper`` on the same photographs, or the error that prevents it."""
-    joint, scales = result.calibration.joint, result.calibration.scales
+    joint = result.calibration.joint
     if joint is None:
         raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
     whole = calibrated_target(joint, result.target, result.target_design, "three-point")
     steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
     rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
-    rms = residual_rms_px(joint.models, result.calibration.camera)
-    rows.append(_compared(f"+ {STEPS[-1]}", {}, [], scales, rms, None))
+    last = _residuals(joint.models, result.calibration.camera, result.calibration.scales)
+    rows.append(ComparedRow(method=f"+ {STEPS[-1]}", **last))
     sigma = {
         face: FaceOff(
             translation_um=MICRO * float(np.sqrt(np.trace(c[3:, 3:]))),
@@ -61,7 +62,8 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
         for face, c in whole.face_covariance.items()
         if face != whole.reference_face
     }
-    return Comparison.model_validate({"with": "paper", "rows": rows, "sigma": sigma})
+    filled = [row.model_dump() for row in rows]
+    return Comparison.model_validate({"with": "paper", "rows": filled, "sigma": sigma})
 
 
 def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
@@ -105,42 +107,28 @@ def _chained(result: RunResult, models: Sequence[WorldModel], eccentricity: bool
 
 
 def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera: Camera) -> ComparedRow:
+    """Returns how far an answer is from the whole one."""
     others = [face for face in whole.target_from_face if face != whole.reference_face]
     if isinstance(found, StcalError):
-        return _compared(name, {}, others, None, None, str(found))
+        return ComparedRow(method=name, missing=others, reason=str(found))
     faces = {}
-    for face in others:
-        if face in found.target.target_from_face:
-            pose, reference_pose = found.target.target_from_face[face], whole.target_from_face[face]
+    for face, pose in found.target.target_from_face.items():
+        if face in others:
+            known = whole.target_from_face[face]
             faces[face] = FaceOff(
-                translation_um=MICRO * float(np.linalg.norm(pose.translation - reference_pose.translation)),
-                rotation_mdeg=MICRO * float(np.degrees((pose @ reference_pose.inverse()).angle_rad())),
+                translation_um=MICRO * float(np.linalg.norm(pose.translation - known.translation)),
+                rotation_mdeg=MICRO * float(np.degrees((pose @ known.inverse()).angle_rad())),
             )
     missing = [face for face in others if face not in faces]
-    return _compared(name, faces, missing, found.scales, residual_rms_px(found.models, camera), None)
+    return ComparedRow(method=name, faces=faces, missing=missing, **_residuals(found.models, camera, found.scales))
 
 
-def residual_rms_px(models: Sequence[GroupModel], camera: Camera) -> float:
-    """Returns the RMS of the residuals per coordinate."""
-    return rms(np.concatenate([model.residuals_px(camera) for model in models]))
-
-
-def _compared(
-    name: str,
-    faces: dict[str, FaceOff],
-    missing: list[str],
-    scales: dict[str, Scale] | None,
-    rms_px: float | None,
-    reason: str | None,
-) -> ComparedRow:
-    lengths = [np.linalg.norm(scale.residuals_mm, axis=1) for scale in scales.values()] if scales else []
-    board = MICRO * np.concatenate(lengths) if lengths else None
-    return ComparedRow(
-        method=name,
-        faces=faces,
-        missing=missing,
-        board_mean_um=None if board is None else float(board.mean()),
-        board_spread_um=None if board is None else float(board.std()),
-        residual_rms_px=rms_px,
-        reason=reason,
-    )
+def _residuals(models: Sequence[GroupModel], camera: Camera, scales: dict[str, Scale]) -> dict[str, Any]:
+    """Returns the lengths of the board's residuals, and the RMS of the images' per coordinate."""
+    board = MICRO * np.concatenate([np.linalg.norm(scale.residuals_mm, axis=1) for scale in scales.values()])
+    residuals = np.concatenate([model.residuals_px(camera) for model in models])
+    return {
+        "board_mean_um": float(board.mean()),
+        "board_spread_um": float(board.std()),
+        "residual_rms_px": rms(residuals),
+    }

@@ -49,12 +49,12 @@ class FaceOff(Part):
 
 class ComparedRow(Part):
     method: str
-    faces: dict[ByFace, FaceOff]
-    missing: list[str]
-    board_mean_um: float | None
-    board_spread_um: float | None
-    residual_rms_px: float | None
-    reason: str | None
+    faces: dict[ByFace, FaceOff] = Field(default={})
+    missing: list[str] = Field(default=[])
+    board_mean_um: float | None = None
+    board_spread_um: float | None = None
+    residual_rms_px: float | None = None
+    reason: str | None = None
 
 
 class Comparison(Part):

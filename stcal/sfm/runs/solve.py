@@ -159,7 +159,7 @@ def usable_groups(
     for file in skipped:
         # A folder that holds only copies is not a group.
         group = file.name.rpartition("/")[0] or TOP_GROUP
-        if file.name.lower().endswith(SUFFIXES) and (group in groups or not file.reason.startswith("the same image")):
+        if file.name.lower().endswith(SUFFIXES) and (group in groups or file.gate != "copy"):
             lost.setdefault(group, []).append(file)
     usable: dict[str, list[ImageObservations]] = {}
     errors: list[tuple[str, MappingError]] = []
