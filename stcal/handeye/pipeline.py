@@ -18,7 +18,7 @@ from stcal.handeye.judge.remarks import of_setup
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions
-from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits, widened_by_scatter
+from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
@@ -52,21 +52,18 @@ def validated(
     ``prior`` : of intrinsics that may be solved for; ``rows`` : (s, k) poses to hold out; ``choosing`` : among all
     ways. Raises StcalError: as :func:`stcal.handeye.handeye`.
     """
-    notes: tuple[str, ...] = ()
-    if choosing and len(rows):
-        try:
+    try:
+        if choosing and len(rows):
             choice = choose(pairs, setup, views, options, prior, rows, workers, progress)
             return Validated(choice.result, choice.held_out, choice.chosen.options(options, prior), choice)
-        except DegenerateError as error:
-            notes = (f"no errors on poses held out: {error}",)
-    result = solve.handeye(pairs, setup, method, views, options)
-    if not len(rows) or notes:
-        return Validated(result, None, options, notes=notes)
-    try:
+        result = solve.handeye(pairs, setup, method, views, options)
+        if not len(rows):
+            return Validated(result, None, options)
         held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
-    except DegenerateError as error:
+        return Validated(held_out.widened(result), held_out, options)
+    except DegenerateError as error:  # if not of all poses, then of those besides some
+        result = solve.handeye(pairs, setup, method, views, options)
         return Validated(result, None, options, notes=(f"no errors on poses held out: {error}",))
-    return Validated(widened_by_scatter(result, held_out), held_out, options)
 
 
 @overload

@@ -43,64 +43,6 @@ def join(values: Iterable) -> str:
     return ", ".join(str(value) for value in values) or NONE
 
 
-def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
-    """Return short names that remain distinct.
-
-    The beginning and end that all names share are removed, but words and numbers stay whole. Names that are still too
-    long keep both ends, or a part between, with an ellipsis for the rest. If the results are not distinct, they are
-    numbers from 1.
-
-    ``most`` : largest number of characters
-    """
-    if len(set(names)) < 2:
-        return [_shortened(name, most) for name in names]
-    start, end = _common(names), _common([name[::-1] for name in names])
-    shortest = min(map(len, names))
-    end = min(end, shortest - start) if start < shortest else 0
-    # Words and numbers stay whole: 10 and 11 of a10.png and a11.png, not 0 and 1.
-    while start and any(_within_word(name, start) for name in names):
-        start -= 1
-    while end and any(_within_word(name, len(name) - end) for name in names):
-        end -= 1
-    distinctive = [name[start : len(name) - end] for name in names]
-    if not all(distinctive):
-        distinctive = [name[start:] for name in names] if all(name[start:] for name in names) else list(names)
-    for head in (most // 2, 2, most - 3):
-        short = [_shortened(name, most, head) for name in distinctive]
-        if len(set(short)) == len(set(names)):
-            return short
-    windows = [
-        [_window(name, at, most) for name in distinctive] for at in range(1, max(map(len, distinctive)) - most + 2)
-    ]
-    different = [short for short in windows if all(short) and len(set(short)) == len(set(names))]
-    return different[len(different) // 2] if different else [str(i) for i in range(1, len(names) + 1)]
-
-
-def _window(name: str, at: int, most: int) -> str:
-    """Return the part of a name from index ``at`` on, with ellipses for omitted characters."""
-    middle = name[at : at + most - 2]
-    return name if len(name) <= most else f"…{middle}{'…' * (at + len(middle) < len(name))}" if middle else ""
-
-
-def _common(names: Sequence[str]) -> int:
-    """Return the number of leading characters that all names share."""
-    first, last = min(names), max(names)
-    return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last)))
-
-
-def _within_word(text: str, at: int) -> bool:
-    """Return True if a cut before this character would split a word or a number."""
-    pair = text[max(at - 1, 0) : at + 1]
-    return 0 < at < len(text) and (pair.isdigit() or pair.isalpha())
-
-
-def _shortened(name: str, most: int, head: int | None = None) -> str:
-    if len(name) <= most:
-        return name
-    head = most // 2 if head is None else head
-    return f"{name[:head]}…{name[len(name) - (most - 1 - head) :]}"
-
-
 def wrapped(line: str, width: int = WIDTH) -> list[str]:
     """Return a sentence in lines of at most this width, the further ones indented; a row of a table stays whole."""
     start = line[: len(line) - len(line.lstrip())]
