@@ -150,9 +150,9 @@ def _readings(
     for side, role in SIDES[: 1 if by_images else 2]:
         read = _stated(loop, side)
         for one, other in permutations(ANGLES, 2):
-            option = f"--rotation {role}={other}-deg (or -rad) if they were read as {one}"
+            words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad) if they were read as {one}"
             changed = partial(lambda *of: _with_stated(loop, of[0], _with_angles(*of[1:])), side, read, one, other)
-            yield Candidate(f"with the {side}'s angles in another convention: {option}", changed, 1)
+            yield Candidate(words, changed, 1)
         for names, places in other_axes(read.translation) if rotations_agree else ():
             words = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
             changed = partial(_with_stated, loop, side, Poses(read.rotation, places))
