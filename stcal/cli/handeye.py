@@ -16,7 +16,6 @@ from stcal.errors import InputError
 
 if TYPE_CHECKING:
     from stcal.handeye.methods.evolution import Bounds
-    from stcal.handeye.report.outcome import Outcome
     from stcal.robot import Robot
     from stcal.workflows.handeye_inputs import Files
     from stcal.workflows.robot_at_images import Timing
@@ -186,11 +185,13 @@ def handeye(
     strict: shared.Strict = False,
 ) -> None:
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
+    from stcal.geometry.camera import Camera
     from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
     from stcal.handeye.report import export as forms
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_report
+    from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
     from stcal.io.poses.programs import messages
     from stcal.robot import load_robot, save_robot
@@ -324,7 +325,13 @@ def handeye(
             require_same(path, partial(path.read_text, "utf-8"), content)
     write_if(report, document.page)
     if camera_out:
-        _save_camera(camera_out, outcome)
+        if (adjusted := result.reprojection) is None:
+            method = result.method
+            raise InputError(wrong_method, f"--camera-out: {method} does not adjust the camera; leave --method out")
+        camera_out.parent.mkdir(parents=True, exist_ok=True)
+        camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
+        save_camera(camera_out, camera, "colmap")
+        say(f"written: {camera_out}")
     if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
@@ -347,20 +354,6 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
         return Bounds(half_width, (x, y, z))
     except ValueError as error:
         raise InputError("E-OPTION-VALUE", f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
-
-
-def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.geometry.camera import Camera
-    from stcal.io.cameras.read import save_camera
-
-    reprojection = outcome.result.reprojection
-    if reprojection is None:
-        raise InputError(
-            "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
-        )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_camera(path, Camera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance), "colmap")
-    say(f"written: {path}")
 
 
 def plan(

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Poses
 from stcal.handeye import solve
 from stcal.handeye.choose import Choice, choose
 from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
@@ -66,27 +64,6 @@ def validated(
         return Validated(result, None, options, notes=(f"no errors on poses held out: {error}",))
 
 
-@overload
-def handeye(
-    pairs: HandEyePoses,
-    camera_from_board: Setup = "eye-in-hand",
-    method: str | None = None,
-    views: Views | None = None,
-    options: HandEyeOptions | None = None,
-    *,
-    setup: Setup | None = None,
-) -> HandEye: ...
-@overload
-def handeye(
-    base_from_flange: Poses | ArrayLike,
-    camera_from_board: Poses | ArrayLike,
-    method: str | None = None,
-    views: Views | None = None,
-    options: HandEyeOptions | None = None,
-    *,
-    setup: Setup,
-    unit: LengthUnit = "mm",
-) -> HandEye: ...
 @require_arguments
 @one_thread()
 def handeye(

@@ -196,8 +196,8 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     if word != GOOD:
         promise = f"where the residuals of {fitted:.3g} mm promise {fitted * np.sqrt(expected):.3g} mm"
     said = f"poses held out are missed by {error:.3g} mm (RMS), {promise}"
-    remedy = "take more poses, and look for poses that do not belong to the others" if word != GOOD else ""
-    return Finding(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
+    remedy = "take more poses, and look for poses that do not belong to the others"
+    return _graded(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
 
 
 def _of_share(outcome: Outcome) -> Finding | None:
@@ -213,8 +213,8 @@ def _of_share(outcome: Outcome) -> Finding | None:
         f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was ({distance:.0f} mm "
         f"away), the error of a single pose {shift:.2g} mm (RMS)"
     )
-    remedy = "take more poses, and turn the flange more, about two axes" if word != GOOD else ""
-    return Finding("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
+    remedy = "take more poses, and turn the flange more, about two axes"
+    return _graded("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
 
 
 def _of_common_errors(outcome: Outcome) -> Finding | None:
@@ -234,8 +234,8 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
         f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
         f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
     )
-    remedy = "calibrate the camera better, or solve from the images: more poses do not help" if word != GOOD else ""
-    return Finding(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
+    remedy = "calibrate the camera better, or solve from the images: more poses do not help"
+    return _graded(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
 
 
 def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
@@ -275,8 +275,8 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
-    remedy = observability.missing() if word != GOOD else ""
-    return Finding("Motions of the flange", word, said, f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}", remedy)
+    value = f"{ratio:.2f} × σ of a pose"
+    return _graded("Motions of the flange", word, said, value, f"{AS_ONE:g}", observability.missing())
 
 
 def _of_size(outcome: Outcome) -> Finding | None:
@@ -329,6 +329,10 @@ def of_notes(notes: Iterable[str]) -> list[Finding]:
             said, _, remedy = note.partition(": ")
             findings.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
     return findings
+
+
+def _graded(title: str, word: Word, said: str, value: str, limit: str, remedy: str) -> Finding:
+    return Finding(title, word, said, value, limit, remedy if word != GOOD else "")
 
 
 def _word(value: float, care: float, bad: float) -> Word:
