@@ -85,14 +85,14 @@ def timed_handeye(scratch: Path) -> dict[str, dict]:
     import handeye_shared
 
     from stcal.handeye import HandEyeOptions
-    from stcal.workflows.handeye_inputs import read_input
+    from stcal.workflows.handeye_inputs import read_handeye
     from stcal.workflows.handeye_run import Splits, calibrate
 
     rows = {}
     folder = photographed_chessboards(scratch / "chessboards", VIEWS, 1.0)
     files = (folder / name for name in ("images", "poses.csv", "cameras.txt", "board.toml"))
     start = time.perf_counter()
-    given = read_input(*files)
+    given = read_handeye(*files)
     calibrate(given, "eye-in-hand", None, HandEyeOptions(intrinsics=given.prior), Splits())
     rows[HANDEYE] = {"seconds": time.perf_counter() - start}
     for title, name in (("ChArUco, 16 of 1.9 Mpx", "charuco"), ("dot boards, 15 of 0.3 Mpx", "dots")):

@@ -45,7 +45,7 @@ from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_par
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.measurement.target import read_target
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
-from stcal.workflows.handeye_inputs import read_input
+from stcal.workflows.handeye_inputs import read_handeye
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 CAMERAS = {
@@ -195,7 +195,7 @@ def of_use(draws: int) -> None:
         folder = DATA / "charuco_handeye" / "test_set_charuco"
         (scratch / "board.toml").write_text(CHARUCO)
         table = robot_table(folder / "poses", scratch / "poses.csv")
-        given = read_input(folder / "images", table, folder / "cal_data.yaml", scratch / "board.toml", 1)
+        given = read_handeye(folder / "images", table, folder / "cal_data.yaml", scratch / "board.toml", workers=1)
         assert given.views is not None
         values = []
         for parts in drawn_halves(len(given.pairs), draws):

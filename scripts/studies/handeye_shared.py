@@ -22,7 +22,7 @@ from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_report
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
-from stcal.workflows.handeye_inputs import read_input
+from stcal.workflows.handeye_inputs import read_handeye
 from stcal.workflows.handeye_run import ALL, Splits, calibrate
 
 CHARUCO = """type = "charuco"
@@ -108,7 +108,7 @@ def _handeye(
     scratch.mkdir(parents=True, exist_ok=True)
     (scratch / "board.toml").write_text(board)
     poses = robot_table(folder / "poses", scratch / "poses.csv")
-    given = read_input(folder / "images", poses, camera, scratch / "board.toml", splits.workers)
+    given = read_handeye(folder / "images", poses, camera, scratch / "board.toml", workers=splits.workers)
     options = HandEyeOptions(intrinsics=given.prior if adjust else None, with_scale=adjust, symmetries=given.symmetries)
     outcome = calibrate(given, setup, method, options, splits)
     return HandEyeFile.of(outcome, whole=True).content(), outcome_report(outcome).text()
@@ -116,7 +116,7 @@ def _handeye(
 
 def by_split(data: dict) -> np.ndarray:
     """3-D error at the board of each split, mean over the poses held out, mm."""
-    return np.array([np.mean(split["board_mm"]) for split in data["splits"]])
+    return np.mean(data["splits"]["board_mm"], axis=1)
 
 
 def _side_by_side(rows: dict[str, dict]) -> None:

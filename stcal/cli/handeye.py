@@ -3,6 +3,7 @@ poses of the robot to take next."""
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,13 +15,9 @@ from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.handeye import EvolutionOptions
-    from stcal.handeye.data.record import Said
     from stcal.handeye.methods.evolution import Bounds
-    from stcal.handeye.report.outcome import Outcome
-    from stcal.parallel import Progress
     from stcal.robot import Robot
-    from stcal.workflows.handeye_inputs import HandEyeInput, Source
+    from stcal.workflows.handeye_inputs import Files
     from stcal.workflows.robot_at_images import Timing
 
 
@@ -70,51 +67,18 @@ class PoseFiles:
     quaternions: shared.Quaternions = "wxyz"
     workers: shared.Workers = None
 
-    def statements(self) -> "Said":
-        """Returns the user's statements about what the files do not state."""
-        from stcal.handeye.data.record import Said
-
-        return Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
-
-    def pairs(self, timing: "Timing") -> "Source":
+    def given(self, timing: "Timing", robot: "Robot | None" = None) -> "Files":
         """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
-        from stcal.workflows.handeye_inputs import one_source
+        from stcal.handeye.data.record import Said
+        from stcal.workflows.handeye_inputs import Files, one_source
 
+        said = Said.of_options(self.rotation or [], self.length_unit or [], self.poses_are or [], self.setup)
         if self.source is None and self.first is not None and self.second is not None:
-            said = self.statements()
-            told, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing)
+            source, notes = one_source(self.first, self.second, self.key, said, self.quaternions, timing)
             print_each("note", notes)
-            return told
-        return shared.Joined(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
-
-    def understood(self, pairs: "Source", timing: "Timing", robot: "Robot | None") -> list[str]:
-        """Returns in lines how the files are understood, without solving anything."""
-        from stcal.workflows.handeye_inputs import dry_run
-
-        images = self.poses, self.camera, self.board
-        return dry_run(pairs, *images, self.quaternions, self.statements(), timing, robot)
-
-    def read(self, pairs: "Source", timing: "Timing", robot: "Robot | None", progress: "Progress") -> "HandEyeInput":
-        """Returns the poses, from :meth:`pairs`."""
-        from stcal.workflows.handeye_inputs import read_handeye
-
-        return read_handeye(
-            pairs,
-            self.poses,
-            self.camera,
-            self.board,
-            setup=self.setup,
-            rotation=self.rotation or (),
-            length_unit=self.length_unit or (),
-            poses_are=self.poses_are or (),
-            quaternions=self.quaternions,
-            tolerance_s=timing.tolerance_s,
-            image_times=timing.image_times,
-            time_offset=timing.offset,
-            robot=robot,
-            workers=self.workers,
-            progress=progress,
-        )
+        else:
+            source = shared.Joined(self.first, self.second, self.key).table(self.source, "POSES|IMAGES")
+        return Files(source, self.poses, self.camera, self.board, said, self.quaternions, timing, robot)
 
 
 POSE_FILES = PoseFiles()
@@ -221,46 +185,103 @@ def handeye(
     strict: shared.Strict = False,
 ) -> None:
     """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
-    from stcal.handeye import HandEyeOptions, Noise
+    from stcal.geometry.camera import Camera
+    from stcal.handeye import METHODS, EvolutionOptions, HandEyeOptions, Noise
     from stcal.handeye.report import export as forms
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_report
+    from stcal.io.cameras.read import save_camera
     from stcal.io.files import require_same
-    from stcal.io.poses.programs import messages, read_messages
+    from stcal.io.poses.programs import messages
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye_inputs import without_flips
-    from stcal.workflows.handeye_run import calibrate_handeye
+    from stcal.workflows.handeye_run import ALL, calibrate_handeye
     from stcal.workflows.robot_at_images import Timing
 
-    robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
-    noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
+    turns = (None if each is None else math.radians(each) for each in (sigma_robot_deg, sigma_camera_deg))
+    noise = Noise(next(turns), sigma_robot_mm, next(turns), sigma_camera_mm, sigma_px, sigma_board_mm)
     timing = Timing(time_tolerance, image_times, time_offset)
-    pairs, folder = files.pairs(timing), files.source is not None and files.source.is_dir()
-    _require_compatible(folder, method, refine_camera, camera_out, four_dof, with_kinematics, robot_out)
-    robot_model = load_robot(with_kinematics) if with_kinematics else None
     exports = shared.exports_of(export or [], forms.FORMS)
-    if (parent or child or camera_frame != "optical") and not (ros or urdf or exports):
-        raise InputError(
-            "E-OPTION-NEEDS",
+    given, folder = files.given(timing), files.source is not None and files.source.is_dir()
+    needs, wrong_method, conflict = "E-OPTION-NEEDS", "E-OPTION-METHOD", "E-OPTION-CONFLICT"
+    for refused, code, message in (
+        (
+            camera_out and not (refine_camera or with_kinematics),
+            needs,
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
+        ),
+        (
+            refine_camera and not folder,
+            needs,
+            "--refine-camera: only with images; poses do not determine the intrinsics",
+        ),
+        (
+            camera_out and method not in (None, ALL, "reprojection"),
+            wrong_method,
+            f"--camera-out: {method} does not adjust the camera; leave --method out",
+        ),
+        (
+            method not in (None, ALL, *METHODS),
+            wrong_method,
+            f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed",
+        ),
+        (
+            robot_out and not with_kinematics,
+            needs,
+            "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file",
+        ),
+        (
+            with_kinematics and not folder,
+            needs,
+            "--with-kinematics: only with a folder of images, which show the arm's errors",
+        ),
+        (
+            with_kinematics and method not in (None, "reprojection"),
+            wrong_method,
+            f"--with-kinematics: {method} does not solve for the arm; leave --method out",
+        ),
+        (
+            with_kinematics and four_dof,
+            conflict,
+            "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
+        ),
+        (
+            (parent or child or camera_frame != "optical") and not (ros or urdf or exports),
+            needs,
             "--parent, --child, --camera-frame: only with --ros, --urdf or --export, whose frames they name",
-        )
-    forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
-    if not folder and (sigma_px is not None or sigma_board_mm is not None):
-        raise InputError(
-            "E-OPTION-NEEDS",
+        ),
+        (
+            not folder and (sigma_px is not None or sigma_board_mm is not None),
+            needs,
             "--sigma-px, --sigma-board-mm: only with images; give --sigma-camera-mm and --sigma-camera-deg",
-        )
-    if folder and sigma_camera_mm is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px"
-        )
-    evolved = _evolution(method, de_bounds_deg, de_bounds_mm)
+        ),
+        (
+            folder and sigma_camera_mm is not None,
+            needs,
+            "--sigma-camera-mm, --sigma-camera-deg: only with poses; with images give --sigma-px",
+        ),
+        (
+            (de_bounds_deg or de_bounds_mm) and method not in (ALL, "de", "de-polished"),
+            needs,
+            f"--de-bounds-…: only with --method de, de-polished or {ALL}",
+        ),
+    ):
+        if refused:
+            raise InputError(code, message)
+    forms.frame_names(files.setup or "eye-in-hand", parent, child, camera_frame)  # refused before the work
+    if with_kinematics:
+        given = replace(given, robot=load_robot(with_kinematics))
+    shift, turn = (
+        _bounds("--de-bounds-mm", de_bounds_mm, 1.0),
+        _bounds("--de-bounds-deg", de_bounds_deg, math.radians(1)),
+    )
+    evolved = EvolutionOptions(bounds_mm=shift) if turn is None else EvolutionOptions(bounds_rad=turn, bounds_mm=shift)
     if dry_run:
-        say("\n".join(files.understood(pairs, timing, robot_model)))
+        say("\n".join(given.dry_run()))
         return
     with StageProgress() as progress:
-        inputs = files.read(pairs, timing, robot_model, progress)
+        inputs = given.read(files.workers, progress)
         for line in inputs.understood:
             say(line)
         options = HandEyeOptions(
@@ -292,82 +313,30 @@ def handeye(
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     write_if(out, lambda: HandEyeFile.of(outcome))
-    both, transforms = forms.named(result), forms.tree(result, parent, child, camera_frame)
-    for path, text, read, held in (
-        (ros, messages(transforms), read_messages, transforms),
-        (urdf, forms.urdf_joint(transforms), forms.read_urdf, transforms),
-        (opencv, forms.opencv_yaml(result), forms.read_opencv, both),
+    transforms = forms.tree(result, parent, child, camera_frame)
+    for path, text in (
+        (ros, lambda: messages(transforms)),
+        (urdf, lambda: forms.urdf_joint(transforms)),
+        (opencv, lambda: forms.opencv_yaml(result)),
+        *((path, partial(forms.exported, result, transforms, form, path.stem)) for form, path in exports),
     ):
         if path:
-            write(path, text)
-            forms.require_export_written(path, read, held)
+            write(path, content := text())
+            require_same(path, partial(path.read_text, "utf-8"), content)
     write_if(report, document.page)
-    for form, path in exports:
-        write(path, text := forms.exported(result, transforms, form, path.stem))
-        require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
-        _save_camera(camera_out, outcome)
+        if (adjusted := result.reprojection) is None:
+            method = result.method
+            raise InputError(wrong_method, f"--camera-out: {method} does not adjust the camera; leave --method out")
+        camera_out.parent.mkdir(parents=True, exist_ok=True)
+        camera = Camera.of(adjusted.camera, outcome.colmap_model, adjusted.camera_covariance)
+        save_camera(camera_out, camera, "colmap")
+        say(f"written: {camera_out}")
     if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
     shared.require_passed(strict, judged(outcome).failed(), report, judged(outcome).doubt())
-
-
-def _require_compatible(
-    folder: bool,
-    method: str | None,
-    refine_camera: bool,
-    camera_out: Path | None,
-    four_dof: bool,
-    with_kinematics: Path | None,
-    robot_out: Path | None,
-) -> None:
-    """Checks that the options of camera, method and arm are compatible."""
-    from stcal.handeye import METHODS
-    from stcal.workflows.handeye_run import ALL
-
-    if camera_out and not (refine_camera or with_kinematics):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
-        )
-    if refine_camera and not folder:
-        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
-    if camera_out and method not in (None, ALL, "reprojection"):
-        raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
-    if method not in (None, ALL, *METHODS):
-        raise InputError("E-OPTION-METHOD", f"--method {method}: unknown; {ALL} or one of {', '.join(METHODS)} needed")
-    if robot_out and not with_kinematics:
-        raise InputError(
-            "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file"
-        )
-    if with_kinematics and not folder:
-        raise InputError(
-            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
-        )
-    if with_kinematics and method not in (None, "reprojection"):
-        raise InputError(
-            "E-OPTION-METHOD", f"--with-kinematics: {method} does not solve for the arm; leave --method out"
-        )
-    if with_kinematics and four_dof:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
-        )
-
-
-def _evolution(method: str | None, bounds_deg: str | None, bounds_mm: str | None) -> "EvolutionOptions":
-    """Returns the options of differential evolution, with the defaults for bounds that were not given."""
-    from stcal.handeye import EvolutionOptions
-    from stcal.workflows.handeye_run import ALL
-
-    turn = _bounds("--de-bounds-deg", bounds_deg, math.radians(1))
-    shift = _bounds("--de-bounds-mm", bounds_mm, 1.0)
-    if (turn or shift) and method not in (ALL, "de", "de-polished"):
-        raise InputError("E-OPTION-NEEDS", f"--de-bounds-…: only with --method de, de-polished or {ALL}")
-    options = EvolutionOptions(bounds_mm=shift)
-    return replace(options, bounds_rad=turn) if turn else options
 
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
@@ -385,24 +354,6 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
         return Bounds(half_width, (x, y, z))
     except ValueError as error:
         raise InputError("E-OPTION-VALUE", f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
-
-
-def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.geometry.camera import Camera
-    from stcal.io.cameras.read import save_camera
-
-    reprojection = outcome.result.reprojection
-    if reprojection is None:
-        raise InputError(
-            "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
-        )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_camera(path, Camera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance), "colmap")
-    say(f"written: {path}")
-
-
-def _radians(degrees: float | None) -> float | None:
-    return None if degrees is None else math.radians(degrees)
 
 
 def plan(
@@ -424,10 +375,10 @@ def plan(
     from stcal.workflows.handeye_run import plan_handeye
     from stcal.workflows.robot_at_images import Timing
 
-    robot, timing = load_robot(robot_file) if robot_file else None, Timing()
-    pairs = files.pairs(timing)
+    robot = load_robot(robot_file) if robot_file else None
+    given = files.given(Timing())
     with StageProgress() as progress:
-        inputs = files.read(pairs, timing, None, progress)
+        inputs = given.read(files.workers, progress)
     for line in inputs.understood:
         say(line)
     planned = plan_handeye(inputs, count, robot, seed)

@@ -4,15 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.errors import StcalError
 from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
+from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge.mistakes import repair
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions, solved
@@ -20,8 +19,8 @@ from stcal.handeye.validate import (
     HeldOutPoses,
     deciding_error,
     predicted,
+    repaired,
     require_solvable_without,
-    widened_by_scatter,
     with_common_errors,
     with_jackknife,
 )
@@ -86,6 +85,9 @@ BY_VIEWS = (
 """Candidates that are tried with corners; those that trust the files come first."""
 
 
+NO_ERRORS = np.zeros((0, 0))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Tried:
     """A candidate and its errors: ``error_mm`` : (s, k) on held-out poses, (0, 0) if it fails, and then ``reason``."""
@@ -94,8 +96,9 @@ class Tried:
     error_mm: np.ndarray
     reason: str = ""
 
+    @property
     def mean_mm(self) -> float:
-        """Returns the mean of all errors, or NaN if there are none."""
+        """Mean of all errors, or NaN if there are none."""
         return float(self.error_mm.mean()) if self.error_mm.size else float("nan")
 
 
@@ -252,9 +255,7 @@ def choose(
 
     Raises StcalError: the first candidate, which trusts all files, fails.
     """
-    if options.symmetries:
-        repaired = repair(pairs, setup, options.symmetries, views)
-        pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
+    pairs, views, options = repaired(pairs, setup, views, options)
     for out in rows:
         require_solvable_without(pairs, setup, options, out)
     candidates = [
@@ -272,14 +273,13 @@ def choose(
         finished[i] = outcome
         progress(len(finished), len(jobs))
     outcomes = {candidate: finished[i] for i, candidate in enumerate(candidates)}
-    succeeded = {candidate: outcome for candidate, outcome in outcomes.items() if isinstance(outcome, _Outcome)}
-    trial = _Trial(succeeded, rows)
+    trial = _Trial({each: outcome for each, outcome in outcomes.items() if isinstance(outcome, _Outcome)}, rows)
     chosen = trial.best()
     try:  # of a closed form the σ cost a solution for each pose: they are made for the chosen one alone
         result = _with_sigma(trial.outcomes[chosen].result, pairs, setup, views, chosen.options(options, prior))
     except StcalError as error:
         outcomes[chosen] = error
-        trial = _Trial({candidate: own for candidate, own in succeeded.items() if candidate not in CLOSED_FORMS}, rows)
+        trial = _Trial({each: own for each, own in trial.outcomes.items() if each not in CLOSED_FORMS}, rows)
         chosen = trial.best()
         result = trial.outcomes[chosen].result
     best_of_splits = [trial.outcomes[trial.best(k)].partial[k] for k in range(len(rows))]
@@ -290,10 +290,8 @@ def choose(
     ]
     held_out = HeldOutPoses.of_splits(rows, errors)
     tried = tuple(
-        Tried(candidate, outcome.error_mm)
-        if isinstance(outcome, _Outcome)
-        else Tried(candidate, np.zeros((0, 0)), str(outcome))
-        for candidate, outcome in outcomes.items()
+        Tried(candidate, NO_ERRORS, str(each)) if isinstance(each, StcalError) else Tried(candidate, each.error_mm)
+        for candidate, each in outcomes.items()
     )
     rivals = {
         candidate: outcome.result
@@ -302,46 +300,42 @@ def choose(
     }
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
     of_splits = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
-    result = widened_by_scatter(result, replace(held_out, mount_from_camera=of_splits))
+    result = replace(held_out, mount_from_camera=of_splits).widened(result)
     result, notes = _widened(result, chosen, rivals)
-    measure = "translation_mm" if views is None else "board_mm"
-    return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, measure), notes)
+    where = "of the board's origin" if views is None else "at the board"
+    return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, where), notes)
 
 
 def _widened(result: HandEye, chosen: Candidate, rivals: dict[Candidate, HandEye]) -> tuple[HandEye, tuple[str, ...]]:
     """Widens σ until they cover the rivals, which predict as well. Returns the result, and notes on distant rivals."""
-    if result.covariance is None:
-        return result, ()
-    factor, notes = 1.0, []
+    factor, notes, pose = 1.0, [], Poses.of([result.mount_from_camera])
     for candidate, rival in rivals.items():
-        if rival.covariance is None:
+        if result.covariance is None or rival.covariance is None:
             continue
-        pose, rival_pose = result.mount_from_camera, rival.mount_from_camera
-        turn = Rotation.from_matrix(rival_pose.rotation @ pose.rotation.T).as_rotvec()
-        gap = np.concatenate([turn, rival_pose.translation - pose.translation])
+        gap = Poses.of([rival.mount_from_camera]).difference(pose)[0]
         squared = float(gap @ np.linalg.lstsq(result.covariance + rival.covariance, gap)[0])
         if squared > chi2.ppf(1 - CONTRADICT, 6):
             ratio = np.sqrt(squared / 6)
             factor = max(factor, ratio)
+            turn, shift = np.degrees(np.linalg.norm(gap[:3])), np.linalg.norm(gap[3:])
             notes.append(
-                f"{candidate.name} predicts as well as {chosen.name} and is {np.degrees(np.linalg.norm(turn)):.2g}° "
-                f"and {np.linalg.norm(gap[3:]):.2g} mm off, {ratio:.2g} times what their σ allow: σ are widened by that"
+                f"{candidate.name} predicts as well as {chosen.name} and is {turn:.2g}° and {shift:.2g} mm off, "
+                f"{ratio:.2g} times what their σ allow: σ are widened by that"
             )
     return result.widened(factor), tuple(notes)
 
 
-def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, measure: str) -> str:
+def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, where: str) -> str:
     """Returns the choice, its gain, and what it says about camera file, board and robot, in one sentence."""
     by_candidate = {each.candidate: each for each in tried}
-    chosen_mm, plain = by_candidate[chosen].mean_mm(), tried[0]
-    where = "at the board" if measure == "board_mm" else "of the board's origin"
+    chosen_mm, plain = by_candidate[chosen].mean_mm, tried[0]
     parts = [
         f"{len(tried)} ways of solving were compared by poses held out; the best, {chosen.in_words()}, errs by "
         f"{chosen_mm:.3g} mm {where}"
     ]
     if plain.candidate != chosen:
-        parts[0] += f", {plain.candidate.in_words()} by {plain.mean_mm():.3g} mm" if plain.error_mm.size else ""
-    filed_mm = [each.mean_mm() for each in tried if chosen.camera and not each.candidate.camera and each.error_mm.size]
+        parts[0] += f", {plain.candidate.in_words()} by {plain.mean_mm:.3g} mm" if plain.error_mm.size else ""
+    filed_mm = [each.mean_mm for each in tried if chosen.camera and not each.candidate.camera and each.error_mm.size]
     if filed_mm:
         parts.append(f"the camera file costs {min(filed_mm) - chosen_mm:.2g} mm")
     if chosen.scale and result.sigma_scale is not None:

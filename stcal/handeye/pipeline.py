@@ -2,14 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.rigid import Poses
 from stcal.handeye import solve
 from stcal.handeye.choose import Choice, choose
 from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
@@ -18,7 +16,7 @@ from stcal.handeye.judge.remarks import of_setup
 from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions
-from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits, widened_by_scatter
+from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
@@ -52,44 +50,20 @@ def validated(
     ``prior`` : of intrinsics that may be solved for; ``rows`` : (s, k) poses to hold out; ``choosing`` : among all
     ways. Raises StcalError: as :func:`stcal.handeye.handeye`.
     """
-    notes: tuple[str, ...] = ()
-    if choosing and len(rows):
-        try:
+    try:
+        if choosing and len(rows):
             choice = choose(pairs, setup, views, options, prior, rows, workers, progress)
             return Validated(choice.result, choice.held_out, choice.chosen.options(options, prior), choice)
-        except DegenerateError as error:
-            notes = (f"no errors on poses held out: {error}",)
-    result = solve.handeye(pairs, setup, method, views, options)
-    if not len(rows) or notes:
-        return Validated(result, None, options, notes=notes)
-    try:
+        result = solve.handeye(pairs, setup, method, views, options)
+        if not len(rows):
+            return Validated(result, None, options)
         held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
-    except DegenerateError as error:
+        return Validated(held_out.widened(result), held_out, options)
+    except DegenerateError as error:  # if not of all poses, then of those besides some
+        result = solve.handeye(pairs, setup, method, views, options)
         return Validated(result, None, options, notes=(f"no errors on poses held out: {error}",))
-    return Validated(widened_by_scatter(result, held_out), held_out, options)
 
 
-@overload
-def handeye(
-    pairs: HandEyePoses,
-    camera_from_board: Setup = "eye-in-hand",
-    method: str | None = None,
-    views: Views | None = None,
-    options: HandEyeOptions | None = None,
-    *,
-    setup: Setup | None = None,
-) -> HandEye: ...
-@overload
-def handeye(
-    base_from_flange: Poses | ArrayLike,
-    camera_from_board: Poses | ArrayLike,
-    method: str | None = None,
-    views: Views | None = None,
-    options: HandEyeOptions | None = None,
-    *,
-    setup: Setup,
-    unit: LengthUnit = "mm",
-) -> HandEye: ...
 @require_arguments
 @one_thread()
 def handeye(

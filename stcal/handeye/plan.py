@@ -15,7 +15,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.result import HandEye
-from stcal.io.json import Part, Pose, ResultFile
+from stcal.io.json import Pose, ResultFile, Vector
 from stcal.io.table import POSE, csv_text, pose_cells
 from stcal.report.document import Document, Section, Table
 from stcal.report.text import NONE, number
@@ -245,14 +245,6 @@ JOINT_DIGITS = 3
 """Number of digits of joint values (deg or mm) on the terminal."""
 
 
-class PlannedPose(Part):
-    base_from_flange: Pose
-    camera_from_board: Pose
-    worst_sigma_mm: float
-    turn_rad: float
-    joints: dict[str, float] | None
-
-
 class HandEyePlanFile(ResultFile):
     """Result file of ``handeye plan``."""
 
@@ -260,11 +252,15 @@ class HandEyePlanFile(ResultFile):
     setup: str = Field(description="`eye-in-hand` or `eye-to-hand`")
     method: str = Field(description="that solved for the poses taken")
     taken: list[str] = Field(description="names of the poses taken that the solution rests on")
-    worst_sigma_mm: float = Field(description="largest σ, in any direction, of a point at the board: now")
-    poses: list[PlannedPose] = Field(
-        description="to take, in order: `base_from_flange`, `camera_from_board` (how the board is seen there), "
-        "`worst_sigma_mm` with this pose and those before, `turn_rad` against the nearest pose taken, `joints` by "
-        "column (deg or mm; null without a robot file)"
+    sigma_mm: Vector = Field(
+        description="largest σ, in any direction, of a point at the board: now, and with each of the poses and those "
+        "before"
+    )
+    base_from_flange: list[Pose] = Field(description="poses to take, in order")
+    camera_from_board: list[Pose] = Field(description="how the board is seen there")
+    turn_rad: Vector = Field(description="of each pose against the nearest pose taken")
+    joints: dict[str, Vector] = Field(
+        description="values of the poses by column, deg or mm; empty without a robot file"
     )
 
 
@@ -324,24 +320,14 @@ def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None)
 
 def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
     """Returns the file of the planned poses, for programs."""
-    rows = [
-        {
-            "base_from_flange": planned.base_from_flange[k].matrix(),
-            "camera_from_board": planned.camera_from_board[k].matrix(),
-            "worst_sigma_mm": planned.sigma_mm[k + 1],
-            "turn_rad": turn,
-            "joints": {name: of[k] for name, of in joints.items()} or None,
-        }
-        for k, turn in enumerate(planned.turn_rad)
-    ]
-    taken = [name for name, out in zip(result.names, result.outliers, strict=True) if not out]
-    return HandEyePlanFile.model_validate(
-        {
-            "format": "stcal handeye plan 1",
-            "setup": result.setup,
-            "method": result.method,
-            "taken": taken,
-            "worst_sigma_mm": planned.sigma_mm[0],
-            "poses": rows,
-        }
+    poses = {name: list(getattr(planned, name)) for name in ("base_from_flange", "camera_from_board")}
+    return HandEyePlanFile(
+        format="stcal handeye plan 1",
+        setup=result.setup,
+        method=result.method,
+        taken=[name for name, out in zip(result.names, result.outliers, strict=True) if not out],
+        sigma_mm=planned.sigma_mm,
+        turn_rad=planned.turn_rad,
+        joints=joints,
+        **poses,
     )

@@ -125,9 +125,10 @@ class HandEye(Brief):
 
     def widened(self, factor: float) -> "HandEye":
         """Returns the result with all σ of the two unknowns multiplied by ``factor``."""
-        square, stand = factor**2, self.stand_covariance
-        mount = None if self.covariance is None else square * self.covariance
-        return replace(self, covariance=mount, stand_covariance=None if stand is None else square * stand)
+        if self.covariance is None or self.stand_covariance is None:
+            return self
+        square = factor**2
+        return replace(self, covariance=square * self.covariance, stand_covariance=square * self.stand_covariance)
 
     def rms(self) -> tuple[float, float]:
         """Returns the RMS lengths of the residuals of all poses except outliers: rad, mm."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.stats import chi2
@@ -252,33 +252,38 @@ def _by_equations(task: _Task, method: str) -> HandEye:
     if method in (*AX_XB, *AX_ZB):
         x, z = solve_closed_form(loop, method, unit_mm)
     else:
-        x = _by_motions(loop, method, unit_mm, task.options.evolution)
+        motions, options = Motions.consecutive(loop), task.options.evolution
+        if method == "zhao":
+            x = convex(motions, unit_mm)
+        else:
+            objective = Objective(motions.with_log(method), unit_mm, options.weight)
+            known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
+            places = np.vstack([loop.camera_from_board.translation, loop.stand_from_mount.translation])
+            x = evolve(objective, options, float(np.linalg.norm(places, axis=1).max()), known_x)
+            x = polish(objective, x) if method == "de-polished" else x
         if method == "de":
-            notes = (*notes, Aside(task.options.evolution.in_words(unit_mm)))
+            notes = (*notes, Aside(options.in_words(unit_mm)))
         z = closed_form.mean_pose(task.loop.chain(x))
-    return HandEye(
-        method=method,
-        setup=task.setup,
-        mount_from_camera=x,
-        stand_from_board=z,
-        residuals=task.loop.residuals(x, z),
-        names=task.pairs.names,
-        outliers=np.zeros(len(task.loop), bool),
-        observability=task.seen,
-        notes=notes,
-    )
+    none = np.zeros(len(task.loop), bool)
+    return _result(task, method, x, z, task.loop.residuals(x, z), none, notes)
 
 
-def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptions) -> Rigid:
-    """Returns X from the motions between consecutive poses."""
-    motions = Motions.consecutive(loop)
-    if method == "zhao":
-        return convex(motions, unit_mm)
-    objective = Objective(motions.with_log(method), unit_mm, options.weight)
-    farthest = max(np.linalg.norm(p.translation, axis=1).max() for p in (loop.camera_from_board, loop.stand_from_mount))
-    known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
-    x = evolve(objective, options, float(farthest), known_x)
-    return polish(objective, x) if method == "de-polished" else x
+def _result(
+    task: _Task,
+    method: str,
+    x: Rigid,
+    z: Rigid,
+    residuals: np.ndarray,
+    outliers: np.ndarray,
+    notes: tuple[str, ...],
+    covariance: np.ndarray | None = None,
+    **more: Any,
+) -> HandEye:
+    """Returns the result; ``covariance`` : (12, 12) or more, of X and Z first; ``more`` : further fields."""
+    if covariance is not None:
+        more |= {"covariance": covariance[:6, :6], "stand_covariance": covariance[6:12, 6:12]}
+    names, seen = task.pairs.names, task.seen
+    return HandEye(method, task.setup, x, z, residuals, names, outliers, observability=seen, notes=notes, **more)
 
 
 def _by_poses(task: _Task) -> Solved:
@@ -316,22 +321,19 @@ def _by_poses(task: _Task) -> Solved:
         error = of_poses(task.loop, solution, task.views, options.camera)
         covariance = covariance + error.covariance(inverse) - inverse
     stated = {name: getattr(noise, name) for name in (*ROBOT, "camera_rad", "camera_mm")}
-    result = HandEye(
-        method="pose",
-        setup=task.setup,
-        mount_from_camera=x,
-        stand_from_board=z,
-        residuals=solution.residuals,
-        names=task.pairs.names,
-        outliers=solution.outliers,
-        covariance=covariance[:6, :6],
-        stand_covariance=covariance[6:12, 6:12],
+    result = _result(
+        task,
+        "pose",
+        x,
+        z,
+        solution.residuals,
+        solution.outliers,
+        notes + remarks.of_rounds(solution.settled),
+        covariance,
         scale=state.scale,
         sigma_scale=sigma_scale,
         sigma={name: value for name, value in stated.items() if value} | solution.sigma,
         estimated=tuple(solution.sigma),
-        observability=task.seen,
-        notes=notes + remarks.of_rounds(solution.settled),
         common_covariance=common,
     )
     return Solved(task, result, solution)
@@ -368,40 +370,30 @@ def _by_views(task: _Task, views: Views) -> Solved:
             if sigma_scale is not None:
                 sigma_scale = float(np.sqrt(sigma_scale**2 + added[12, 12]))
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
-    notes += _of_camera_file(solution.camera_gain, solution.sigma)
-    result = HandEye(
-        method="reprojection",
-        setup=task.setup,
-        mount_from_camera=x,
-        stand_from_board=z,
-        residuals=residuals,
-        names=names,
-        outliers=outliers,
-        covariance=covariance[:6, :6],
-        stand_covariance=covariance[6:12, 6:12],
+    if solution.camera_gain > CAMERA_GAIN:
+        notes += (
+            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera again",
+        )
+    doubted = {name: factor for name, factor in solution.sigma.items() if name in FACTORS and factor > WIDENED}
+    if doubted:
+        which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
+        notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
+    result = _result(
+        task,
+        "reprojection",
+        x,
+        z,
+        residuals,
+        outliers,
+        notes + remarks.of_rounds(solution.settled),
+        covariance,
         scale=state.scale,
         sigma_scale=sigma_scale,
         sigma=solution.sigma,
         estimated=solution.estimated,
         reprojection=reprojection,
-        observability=task.seen,
-        notes=notes + remarks.of_rounds(solution.settled),
     )
     return Solved(task, result, solution)
-
-
-def _of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
-    """Returns notes on a camera file that corners contradict; ``sigma`` : has factors of its widened σ."""
-    notes: tuple[str, ...] = ()
-    if camera_gain > CAMERA_GAIN:
-        notes += (
-            "the camera file does not fit the corners: solve for the intrinsics too, or calibrate the camera again",
-        )
-    doubted = {name: factor for name, factor in sigma.items() if name in FACTORS and factor > WIDENED}
-    if doubted:
-        which = ", ".join(f"{FACTORS[name]} {factor:.2g} times" for name, factor in doubted.items())
-        notes += (f"the corners contradict the camera file: its σ were widened ({which}); calibrate the camera",)
-    return notes
 
 
 def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, tuple[str, ...]]:

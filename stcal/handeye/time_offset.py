@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup, rms_of
 from stcal.handeye.data.stream import Stream
 from stcal.handeye.methods import closed_form
-from stcal.handeye.methods.noise import Noise
+from stcal.handeye.methods.noise import UNKNOWNS, Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
 from stcal.handeye.result import HandEye
 
@@ -36,8 +36,6 @@ LEAST_KEPT = 2 / 3
 """Least share of the images that must lie within the stream for an offset to be tried."""
 LEAST_POSES = 4
 """Least number of poses: three of six numbers each leave too little redundancy for σ beside thirteen unknowns."""
-UNKNOWNS = 12
-"""Number of unknowns of X and Z."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,10 +71,11 @@ class TimeOffset:
 
     def carried(self, result: HandEye) -> HandEye:
         """Returns ``result``, which was solved at the offset, with the offset's σ propagated into its covariances."""
+        if result.covariance is None or result.stand_covariance is None:
+            return result
         shift = self.sigma_s**2 * np.outer(self.slope, self.slope)
-        mount, stand = result.covariance, result.stand_covariance
-        mount = None if mount is None else mount + shift[:6, :6]
-        return replace(result, covariance=mount, stand_covariance=None if stand is None else stand + shift[6:, 6:])
+        mount, stand = result.covariance + shift[:6, :6], result.stand_covariance + shift[6:, 6:]
+        return replace(result, covariance=mount, stand_covariance=stand)
 
 
 def estimate_offset(

@@ -1,6 +1,7 @@
 """Validation of a hand-eye calibration on poses and motions that were held out, and the scatter of its solutions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,9 @@ SETUP_BETTER = 4.0
 """Factor by which the product of rotation and translation error must be smaller in the other setup."""
 LEAST_LEFT = 3
 """Least number of poses that must remain to solve with."""
+SCATTERED = 1.5
+"""Scatter, in units of what σ predict, from which on there is a note. One in a hundred sets of twelve simulated poses
+scatters as much if the poses err as assumed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -80,6 +84,48 @@ class HeldOutPoses(Brief):
         if not mask.any():
             return {}
         return {name: float(getattr(self, name)[mask].mean()) for name in names if getattr(self, name) is not None}
+
+    def summary(self, outliers: np.ndarray | None = None) -> dict:
+        """Returns the numbers of splits and of poses in each, and the means, of all poses and without outliers."""
+        splits, poses = self.rows.shape
+        agreeing = self.means(~outliers) if outliers is not None and outliers.any() else None
+        return {"splits": splits, "poses": poses, **self.means(), "agreeing": agreeing or None}
+
+    def scatter(self, result: HandEye) -> float:
+        """Returns how much solutions without some poses scatter about that of all, relative to its σ, RMS over splits
+        and six parameters: 1 is expected; NaN without covariance or solutions.
+
+        If k of m poses with independent errors are held out, the difference has the covariance C k / (m − k), where C
+        is that of the solution (the delete-k jackknife of Shao & Wu, Ann. Statist. 17, 1989); a little more if few
+        poses are left, as their information varies (the mean of an inverse Wishart matrix exceeds the inverse of the
+        mean). Errors that are correlated, or differ in size, make it larger.
+        """
+        matrices, seen = self.mount_from_camera, result.observability
+        if result.covariance is None or matrices is None or not len(self.rows):
+            return float("nan")
+        m, out = len(result.names), self.rows.shape[1] / len(result.names)
+        all_poses = Poses.of([result.mount_from_camera] * len(matrices))
+        differences, told = Poses(matrices[:, :3, :3], matrices[:, :3, 3]).difference(all_poses), np.eye(6)
+        if seen is not None and seen.one_axis:  # along it X is set, not estimated
+            told = null_space(np.concatenate([np.zeros(3), seen.mount_axis])[None])
+        differences = differences @ told
+        inverse = generalised_inverse(told.T @ result.covariance @ told)
+        squared = np.einsum("sa,ab,sb->s", differences, inverse, differences)
+        dof = 6 * m * (1 - out) - UNKNOWNS - 1
+        return float(np.sqrt(squared.mean() / differences.shape[1] * dof / (6 * m * out)))
+
+    def widened(self, result: HandEye) -> HandEye:
+        """Returns the result with σ widened by the :meth:`scatter`, if that exceeds 1, and a note if it is large."""
+        factor = self.scatter(result)
+        if not factor > 1:
+            return result
+        notes = result.notes
+        if factor > SCATTERED:
+            notes += (
+                f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not "
+                "err independently and alike: σ of both transforms are widened by that",
+            )
+        return replace(result.widened(factor), notes=notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -174,14 +220,21 @@ def cross_validate(
     StcalError
         A split cannot be solved; see :func:`~stcal.handeye.handeye`.
     """
-    options = options or HandEyeOptions()
-    if options.symmetries:
-        repaired = repair(pairs, setup, options.symmetries, views)
-        pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
+    pairs, views, options = repaired(pairs, setup, views, options or HandEyeOptions())
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
     slow = views is not None and method in (None, "reprojection")
     return HeldOutPoses.of_splits(rows, run_in_order(errors_without, jobs, workers if slow else 1, progress))
+
+
+def repaired(
+    pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions
+) -> tuple[HandEyePoses, Views | None, HandEyeOptions]:
+    """Returns poses, views and options with the numberings of a symmetric board corrected."""
+    if not options.symmetries:
+        return pairs, views, options
+    mended = repair(pairs, setup, options.symmetries, views)
+    return mended.pairs, mended.views, replace(options, symmetries=())
 
 
 def errors_without(
@@ -194,13 +247,9 @@ def errors_without(
 ) -> dict[str, np.ndarray]:
     """Solves without the poses ``out``, (k,). Returns the fields of :class:`HeldOutPoses` for these poses, by name."""
     remaining, arm = np.setdiff1d(np.arange(len(pairs)), out), options.arm
-    if arm is not None:
-        options = replace(options, arm=arm[remaining])
-    try:
-        own_views = None if views is None else views[remaining]
-        result = handeye(pairs[remaining], setup, method, own_views, options, part=True)
-    except DegenerateError as error:
-        raise _without(pairs, out, error) from error
+    own = options if arm is None else replace(options, arm=arm[remaining])
+    with _naming_held_out(pairs, out):
+        result = handeye(pairs[remaining], setup, method, None if views is None else views[remaining], own, part=True)
     unseen = pairs[out]
     if arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
         unseen = replace(unseen, base_from_flange=arm[out].poses(result.reprojection.arm))
@@ -208,18 +257,20 @@ def errors_without(
     return errors | {"mount_from_camera": result.mount_from_camera.matrix()}
 
 
-def _without(pairs: HandEyePoses, out: np.ndarray, error: DegenerateError) -> DegenerateError:
-    return DegenerateError(error.code, f"without {', '.join(pairs.names[i] for i in out)}: {error}")
+@contextmanager
+def _naming_held_out(pairs: HandEyePoses, out: np.ndarray) -> Iterator[None]:
+    """Adds to a DegenerateError the names of the poses ``out``, (k,), that were held out."""
+    try:
+        yield
+    except DegenerateError as error:
+        raise DegenerateError(error.code, f"without {', '.join(pairs.names[i] for i in out)}: {error}") from error
 
 
 def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, out: np.ndarray) -> None:
-    """Raises DegenerateError if the poses besides ``out``, (k,), which the message names, do not determine the
-    answer."""
-    remaining = np.setdiff1d(np.arange(len(pairs)), out)
-    try:
-        check(Loop.of(pairs[remaining], setup), setup, pairs.where, options.four_dof)
-    except DegenerateError as error:
-        raise _without(pairs, out, error) from error
+    """Raises DegenerateError if the poses besides ``out``, (k,), do not determine the answer."""
+    with _naming_held_out(pairs, out):
+        remaining = pairs[np.setdiff1d(np.arange(len(pairs)), out)]
+        check(Loop.of(remaining, setup), setup, pairs.where, options.four_dof)
 
 
 def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
@@ -247,20 +298,18 @@ def poses_by_robot(result: HandEye, loop: Loop) -> Poses:
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
     """Returns the errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views unknown to the result."""
     loop, x, z = Loop.of(pairs, result.setup), result.mount_from_camera, result.stand_from_board
-    if views is None:
-        turns, shifts = np.split(loop.residuals(x, z, result.scale), 2, axis=1)
-        at_board = {}
-    else:
+    scale, at_board = result.scale, {}
+    if views is not None:
         camera, adjusted_views = as_adjusted(result, views)
-        pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
-        turns, shifts = np.split(replace(loop, camera_from_board=pose_by_view).residuals(x, z), 2, axis=1)
+        by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
         pose_mm = [
             np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean()
-            for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), pose_by_view, strict=True)
+            for view, first, second in zip(adjusted_views, poses_by_robot(result, loop), by_view, strict=True)
         ]
         at_board = {"board_mm": deciding_error(result, pairs, views), "pose_mm": np.array(pose_mm)}
-    lengths = {"rotation_rad": np.linalg.norm(turns, axis=1), "translation_mm": np.linalg.norm(shifts, axis=1)}
-    return lengths | at_board
+        loop, scale = replace(loop, camera_from_board=by_view), 1.0
+    turn, shift = np.linalg.norm(loop.residuals(x, z, scale).reshape(-1, 2, 3), axis=2).T
+    return {"rotation_rad": turn, "translation_mm": shift, **at_board}
 
 
 @one_thread()
@@ -320,10 +369,7 @@ def compare(
     DegenerateError
         No method can solve these poses.
     """
-    options = options or HandEyeOptions()
-    if options.symmetries:
-        repaired = repair(pairs, setup, options.symmetries, views)
-        pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
+    pairs, views, options = repaired(pairs, setup, views, options or HandEyeOptions())
     handeye(pairs, setup, "pose", views, options)  # raises if the poses themselves are at fault, whatever the method
     rows = splits(len(pairs)) if rows is None else rows
     compared = []
@@ -392,51 +438,6 @@ def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, optio
         common_covariance=covariances["covariance"],
         notes=(*result.notes, Aside(IN_COMMON)),
     )
-
-
-SCATTERED = 1.5
-"""Scatter, in units of what σ predict, from which on there is a note. One in a hundred sets of twelve simulated poses
-scatters as much if the poses err as assumed."""
-
-
-def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
-    """Returns how much solutions without some poses scatter about that of all, relative to its σ, RMS over splits and
-    six parameters: 1 is expected; NaN without covariance or solutions.
-
-    If k of m poses with independent errors are held out, the difference has the covariance C k / (m − k), where C is
-    that of the solution (the delete-k jackknife of Shao & Wu, Ann. Statist. 17, 1989); a little more if few poses are
-    left, as their information varies (the mean of an inverse Wishart matrix exceeds the inverse of the mean). Errors
-    that are correlated, or differ in size, make it larger.
-    """
-    if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
-        return float("nan")
-    m, k = len(result.names), held_out.rows.shape[1]
-    matrices = held_out.mount_from_camera
-    solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
-    differences, told = solutions.difference(Poses.of([result.mount_from_camera] * len(solutions))), np.eye(6)
-    seen = result.observability
-    if seen is not None and seen.one_axis:  # along it X is set, not estimated
-        told = null_space(np.concatenate([np.zeros(3), seen.mount_axis])[None])
-    differences = differences @ told
-    inverse = generalised_inverse(told.T @ result.covariance @ told)
-    squared = np.einsum("sa,ab,sb->s", differences, inverse, differences)
-    out = k / m
-    dof = 6 * m * (1 - out) - UNKNOWNS - 1
-    return float(np.sqrt(squared.mean() / differences.shape[1] * dof / (6 * m * out)))
-
-
-def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
-    """Returns the result with σ widened by the :func:`scatter`, if that exceeds 1, and a note if it is large."""
-    factor = scatter(result, held_out)
-    if not factor > 1:
-        return result
-    notes = result.notes
-    if factor > SCATTERED:
-        notes += (
-            f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
-            "independently and alike: σ of both transforms are widened by that",
-        )
-    return replace(result.widened(factor), notes=notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

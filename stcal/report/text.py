@@ -2,10 +2,8 @@
 
 import io
 import math
-import re
 import textwrap
 from collections.abc import Iterable, Sequence
-from itertools import takewhile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,24 +41,6 @@ def cells(row: dict, spec: str) -> list:
 
 def join(values: Iterable) -> str:
     return ", ".join(str(value) for value in values) or NONE
-
-
-def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
-    """Return short names that remain distinct: without the words and numbers at both ends that all share, and with an
-    ellipsis for the middle of one of more than ``most`` characters; else numbers from 1."""
-    parts = [re.findall(r"\d+|[^\W\d_]+|[\W_]", name) for name in names]
-    start = _alike(parts)
-    end = _alike([part[start:][::-1] for part in parts])
-    own = ["".join(part[start : len(part) - end]) for part in parts]
-    own = own if all(own) else names
-    short = [name if len(name) <= most else f"{name[: most // 2]}…{name[len(name) - most // 2 + 1 :]}" for name in own]
-    return short if len(set(short)) == len(set(names)) else [str(i) for i in range(1, len(names) + 1)]
-
-
-def _alike(lists: Sequence[Sequence[str]]) -> int:
-    return (
-        sum(1 for _ in takewhile(lambda each: len(set(each)) == 1, zip(*lists, strict=False))) if len(lists) > 1 else 0
-    )
 
 
 def wrapped(line: str, width: int = WIDTH) -> list[str]:

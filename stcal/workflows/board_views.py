@@ -90,59 +90,34 @@ def symmetries(board: Board) -> list[Rigid]:
 def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
     """Returns the view of the board, or of all that are seen of a set, in a grey image, or why there is none."""
     if not isinstance(board, BoardSet):
-        return _find_or_why(image, name, camera, board)
+        try:
+            return _find_flat(image, name, camera, board)
+        except StcalError as error:
+            return None, str(error)
     views, reasons = [], []
     places = zip(board.names, board.common_from_board, board.first_ids(), strict=True)
-    for single, (board_name, place, first) in zip(board.boards, places, strict=True):
-        view, why = _find_or_why(image, name, camera, single)
+    for single, (own, place, first) in zip(board.boards, places, strict=True):
+        view, why = find_board(image, name, camera, single)
         if view is None:
-            reasons.append(f"{board_name}: {why}")
-        else:
-            views.append(_placed(view, board_name, place, first))
+            reasons.append(f"{own}: {why}")
+            continue
+        xyz, normal = place @ view.xyz_board, np.tile(place.rotation[:, 2], (len(view), 1))
+        unused = tuple(f"{own}: {reason}" for reason in view.unused)
+        views.append(replace(view, ids=view.ids + first, xyz_board=xyz, normal=normal, unused=unused))
     if not views:
         return None, "; ".join(reasons)
-    return _together(name, views, tuple(reasons)), ""
-
-
-def _find_or_why(
-    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
-) -> tuple[BoardView | None, str]:
-    try:
-        return _find_flat(image, name, camera, board)
-    except StcalError as error:
-        return None, str(error)
-
-
-def _placed(view: BoardView, own: str, common_from_board: Rigid, first: int) -> BoardView:
-    """Returns a view of one board of a set in the frame of the set."""
-    return BoardView(
-        view.image,
-        view.ids + first,
-        common_from_board @ view.xyz_board,
-        view.xy_px,
-        view.covariance_px2,
-        np.tile(common_from_board.rotation[:, 2], (len(view), 1)),
-        tuple(f"{own}: {reason}" for reason in view.unused),
-    )
-
-
-def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> BoardView:
-    """Returns the views of several boards as one view."""
     # A board whose detector states no covariances gets the default, since the other boards have theirs.
-    default_px2 = CORNER_SIGMA_PX**2 * np.eye(2)
     covariances = [
-        np.tile(default_px2, (len(view), 1, 1)) if view.covariance_px2 is None else view.covariance_px2
+        np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
+        if view.covariance_px2 is None
+        else view.covariance_px2
         for view in views
     ]
-    return BoardView(
-        name,
-        np.concatenate([view.ids for view in views]),
-        np.concatenate([view.xyz_board for view in views]),
-        np.concatenate([view.xy_px for view in views]),
-        np.concatenate(covariances),
-        np.concatenate([view.normal for view in views if view.normal is not None]),
-        (*(reason for view in views for reason in view.unused), *reasons),
+    ids, xyz, xy, normals = (
+        np.concatenate([getattr(view, part) for view in views]) for part in ("ids", "xyz_board", "xy_px", "normal")
     )
+    unused = (*(reason for view in views for reason in view.unused), *reasons)
+    return BoardView(name, ids, xyz, xy, np.concatenate(covariances), normals, unused), ""
 
 
 def _find_flat(
@@ -212,11 +187,8 @@ def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesi
         return None
     near = candidates.tree.query(candidates.xy, k=NEAREST + 1)[1][:, 1:]
     # In oblique views, the circle that looks nearest may not be nearest: lengths are in units of the circle's image.
-    apart = np.linalg.solve(candidates.shape[:, None], (candidates.xy[near] - candidates.xy[:, None])[..., None])[
-        ..., 0
-    ]
-    steps = np.median(np.linalg.norm(apart, axis=2).min(1))
-    return board.nearest_mm() / steps
+    apart = np.linalg.solve(candidates.shape[:, None], (candidates.xy[near] - candidates.xy[:, None])[..., None])
+    return board.nearest_mm() / np.median(np.linalg.norm(apart[..., 0], axis=2).min(1))
 
 
 def _find_circles(

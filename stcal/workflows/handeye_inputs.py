@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -28,10 +28,16 @@ from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
 from stcal.workflows.board_views import Board, detect_boards, kind_of
-from stcal.workflows.robot_at_images import Arm, AtImages, Timing, read_arm, read_robot_poses, robot_at_images
+from stcal.workflows.robot_at_images import (
+    Arm,
+    AtImages,
+    RobotPoses,
+    Timing,
+    read_arm,
+    read_robot_poses,
+    robot_at_images,
+)
 
-NOTHING_SAID = Said()
-WITHOUT_OPTIONS = Timing()
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
 OF_IMAGES = ("--poses", "--camera", "--board")
@@ -45,9 +51,9 @@ class HandEyeInput:
 
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : where the user or a file states it; ``folder`` : of the images;
-    ``arm`` : at the joint values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the
-    pairs in the robot's stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
+    file that is not a table of the package; ``setup`` : where the user or a file states it; ``arm`` : at the joint
+    values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's
+    stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
     """
 
     where: str
@@ -59,7 +65,6 @@ class HandEyeInput:
     left_out: tuple[tuple[str, str], ...] = ()
     understood: tuple[str, ...] = ()
     setup: Setup | None = None
-    folder: Path | None = None
     arm: Arm | None = None
     timed: Timed | None = None
     notes: tuple[str, ...] = ()
@@ -71,7 +76,7 @@ def one_source(
     key: str,
     statements: Said,
     quaternions: Order = "wxyz",
-    timing: Timing = WITHOUT_OPTIONS,
+    timing: Timing | None = None,
 ) -> tuple[Source, tuple[str, ...]]:
     """Returns the poses of two files, the robot's and the camera's, or of one, as one source; and notes on rows left
     out.
@@ -80,6 +85,7 @@ def one_source(
     """
     if second is None:
         return source, ()
+    timing = timing or Timing()
     told = read_two(source, second, statements, key, quaternions, timing.tolerance_s, timing.offset)
     if told is not None:
         return told, ()
@@ -174,92 +180,104 @@ def read_handeye(
     """
     statements = Said.of_options(rotation, length_unit, poses_are, setup)
     timing = Timing(tolerance_s, _path(image_times), time_offset)
-    place, told, notes = Path(source) if isinstance(source, str) else source, progress or (lambda *_: None), ()
+    place, notes = Path(source) if isinstance(source, str) else source, ()
     if isinstance(place, Path) and not place.is_dir():
         place, notes = one_source(place, _path(second), key, statements, quaternions, timing)
-    files = _path(poses), _path(camera), _path(board)
-    return replace(read_input(place, *files, workers, told, quaternions, statements, timing, robot), notes=notes)
+    files = Files(place, _path(poses), _path(camera), _path(board), statements, quaternions, timing, robot)
+    return replace(files.read(workers, progress), notes=notes)
 
 
 def _path(path: str | Path | None) -> Path | None:
     return None if path is None else Path(path)
 
 
-@one_thread()
-def read_input(
-    source: Source,
-    poses: Path | None = None,
-    camera: Path | None = None,
-    board: Path | None = None,
-    workers: int | None = None,
-    progress: Progress = lambda *_: None,
-    quaternions: Order = "wxyz",
-    statements: Said = NOTHING_SAID,
-    timing: Timing = WITHOUT_OPTIONS,
-    robot: Robot | None = None,
-) -> HandEyeInput:
-    """Returns pose pairs from their files, or from a folder of images with ``poses``, ``camera`` and ``board``.
+@dataclass(frozen=True, slots=True, eq=False)
+class Files:
+    """Files of poses, or a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``statements`` :
-    the user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose
+    ``statements`` : the user's statements about what files do not state; ``quaternions`` : ``xyzw`` where their columns
+    hold x, y, z, w in the order in which they stand; ``timing`` : of poses by time; ``robot`` : the robot at whose
     joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
     """
-    if isinstance(source, Path) and source.is_dir():
-        files = _all_three(source, poses, camera, board)
-        photographs = _photographs(source, files, quaternions, statements, timing, robot)
-        return _from_images(source, files[0], photographs, statements, workers, progress)
-    if robot is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
+
+    source: Source
+    poses: Path | None = None
+    camera: Path | None = None
+    board: Path | None = None
+    statements: Said = field(default_factory=Said)
+    quaternions: Order = "wxyz"
+    timing: Timing = field(default_factory=Timing)
+    robot: Robot | None = None
+
+    @one_thread()
+    def read(self, workers: int | None = None, progress: Progress | None = None) -> HandEyeInput:
+        """Returns the pairs of poses, and the views of the board if there are images."""
+        if isinstance(self.source, Path) and self.source.is_dir():
+            return _Photographs.of(self, self.source).pairs(workers, progress or (lambda *_: None))
+        self._require_no_images()
+        source, statements = self.source, self.statements
+        if isinstance(source, Table):
+            return HandEyeInput(source.where, read_poses(source, self.quaternions), setup=statements.setup)
+        if isinstance(source, Told):
+            told = source
+        elif (told := read_pairs(source, statements, quaternions=self.quaternions)) is None:
+            pairs = read_poses(source, self.quaternions)  # first: a table that is not understood states nothing
+            _require_unsaid(statements, str(source))
+            return HandEyeInput(source.name, pairs, setup=statements.setup)
+        where, stated = told.pairs.where, statements.setup
+        if stated and told.setup and stated != told.setup:
+            raise InputError(
+                "E-OPTION-CONTRADICTS", f"{where}: of a setup {told.setup}, --setup {stated}; leave the option out"
+            )
+        known = {name: getattr(told, name) for name in ("left_out", "understood", "timed")}
+        return HandEyeInput(where, told.pairs, setup=stated or told.setup, **known)
+
+    def _require_no_images(self) -> None:
+        """Refuse options of images, and of times where the poses of both sides are not in files of their own."""
+        source, of_images = self.source, zip(OF_IMAGES, (self.poses, self.camera, self.board), strict=True)
+        place = (
+            source.pairs.where if isinstance(source, Told) else source.where if isinstance(source, Table) else source
         )
-    _require_no_images(source, poses, camera, board)
-    _require_timed(source, timing)
-    if isinstance(source, Table):
-        return HandEyeInput(source.where, read_poses(source, quaternions), setup=statements.setup)
-    if isinstance(source, Told):
-        return _from_told(source, statements)
-    told = read_pairs(source, statements, quaternions=quaternions)
-    if told is not None:
-        return _from_told(told, statements)
-    pairs = read_poses(source, quaternions)  # first: a table that is not understood is no table whose columns say all
-    _require_unsaid(statements, str(source))
-    return HandEyeInput(source.name, pairs, setup=statements.setup)
+        if self.robot is not None:
+            raise InputError(
+                "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
+            )
+        if isinstance(source, Path) and not source.exists():
+            raise InputError(
+                "E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed"
+            )
+        if extra := [name for name, path in of_images if path is not None]:
+            held = "is a file of poses" if isinstance(source, Path) else "are poses"
+            raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {place} {held}")
+        if self.timing.image_times is not None:
+            raise InputError(
+                "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
+            )
+        if self.timing.offset and not (isinstance(source, Told) and source.timed is not None):
+            raise InputError(
+                "E-OPTION-NEEDS",
+                f"{place}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or images "
+                "and --poses, each with times",
+            )
 
-
-def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Path | None) -> tuple[Path, Path, Path]:
-    missing = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is None]
-    if poses is None or camera is None or board is None:
-        raise InputError("E-OPTION-MISSING", f"image folder {source}: {', '.join(missing)} needed with images")
-    return poses, camera, board
-
-
-def _place(source: Source) -> str:
-    if isinstance(source, Path):
-        return str(source)
-    return source.where if isinstance(source, Table) else source.pairs.where
-
-
-def _require_no_images(source: Source, poses: Path | None, camera: Path | None, board: Path | None) -> None:
-    extra = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is not None]
-    if isinstance(source, Path) and not source.exists():
-        raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed")
-    if extra:
-        held = "is a file of poses" if isinstance(source, Path) else "are poses"
-        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {_place(source)} {held}")
-
-
-def _require_timed(source: Source, timing: Timing) -> None:
-    """Refuse options of times without images or without poses of both sides in files of their own."""
-    if timing.image_times is not None:
-        raise InputError(
-            "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
-        )
-    if timing.offset and not (isinstance(source, Told) and source.timed is not None):
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"{_place(source)}: --time-offset needs the robot's poses as a stream with times; give --a and --b, or "
-            "images and --poses, each with times",
-        )
+    def dry_run(self) -> list[str]:
+        """Returns lines on how the inputs are understood, without looking for the board in images."""
+        source = self.source
+        if isinstance(source, Path) and source.is_dir():
+            own = _Photographs.of(self, source)
+            stated, flange = self.statements.setup, own.robot.base_from_flange[list(own.row_of.values())]
+            lines, left_out, with_pose = own.lines(), own.left_out, f"{len(own.row_of)} of {len(own.images)}"
+            count = f"images: {with_pose} with a pose of the robot; the board was not looked for"
+        else:
+            inputs = self.read()
+            stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
+            lines, count = list(inputs.understood), f"pairs: {len(inputs.pairs)}"
+            if not lines and not isinstance(source, Told):
+                lines = own_told(source, self.quaternions)
+        setup = stated or "eye-in-hand"
+        origin = "as you say" if self.statements.setup else "as the file says" if stated else "by default"
+        lines += [f"setup: {setup}, {origin}", count, *spread_text(flange, setup)]
+        return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 
 def _require_unsaid(statements: Said, where: str) -> None:
@@ -272,151 +290,107 @@ def _require_unsaid(statements: Said, where: str) -> None:
         )
 
 
-def _from_told(told: Told, statements: Said) -> HandEyeInput:
-    where, stated = told.pairs.where, statements.setup
-    if stated and told.setup and stated != told.setup:
-        raise InputError(
-            "E-OPTION-CONTRADICTS", f"{where}: of a setup {told.setup}, --setup {stated}; leave the option out"
-        )
-    setup = stated or told.setup
-    return HandEyeInput(
-        where, told.pairs, left_out=told.left_out, understood=told.understood, setup=setup, timed=told.timed
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Photographs:
-    """Images of a folder with the robot's poses, before the board is looked for.
+    """The ``images`` of a folder with the robot's poses, before the board is looked for.
 
-    ``row_of`` : row of the robot's pose by image; ``matching`` : how these were matched; ``skipped``, ``unpaired`` :
-    (image, why).
+    ``row_of`` : row of the robot's pose by image; ``matching`` : how these were matched; ``left_out`` : (image, why).
     """
 
+    files: Files
+    folder: Path
     design: Board
     model: CameraModel
-    files: list[ImageFile]
+    images: list[ImageFile]
     at_images: AtImages
     arm: Arm | None
     row_of: dict[str, int]
     matching: str
-    skipped: list[tuple[str, str]]
-    unpaired: list[tuple[str, str]]
+    left_out: tuple[tuple[str, str], ...]
+
+    @classmethod
+    def of(cls, files: Files, folder: Path) -> "_Photographs":
+        """Returns the images of a folder, matched with the poses in their file."""
+        poses, camera, board, timing, arm = files.poses, files.camera, files.board, files.timing, None
+        if poses is None or camera is None or board is None:
+            missing = [name for name, path in zip(OF_IMAGES, (poses, camera, board), strict=True) if path is None]
+            raise InputError("E-OPTION-MISSING", f"image folder {folder}: {', '.join(missing)} needed with images")
+        if files.robot is None:
+            robot = read_robot_poses(poses, files.quaternions, files.statements)
+        elif timing.offset or timing.image_times is not None:
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by "
+                "name; name the images in the column image",
+            )
+        else:
+            robot, arm = read_arm(poses, files.robot, files.quaternions)
+        design, model = load_boards(board), read_camera(camera)
+        images, skipped = find_images(folder)
+        at_images = robot_at_images(robot, [image.name for image in images], timing if arm is None else None)
+        robot, late = at_images.robot, dict(at_images.left_out)
+        names = [image.name for image in images if image.name not in late]
+        row_of, missing, matching = robot.pairing(names)
+        if not row_of:
+            raise InputError(
+                "E-POSES-UNMATCHED",
+                f"{robot.where}: no row is of an image in {folder}: {robot.images[0]} … there, {names[0]} … here; "
+                "correct them",
+            )
+        left_out = [(each.name, each.reason) for each in skipped]
+        left_out += [*late.items(), *((name, f"no row in {poses.name}") for name in names if name not in row_of)]
+        left_out += [(name, f"no such image, in a row of {poses.name}") for name in missing]
+        return cls(files, folder, design, model, images, at_images, arm, row_of, matching, tuple(left_out))
+
+    @property
+    def robot(self) -> RobotPoses:
+        return self.at_images.robot
+
+    def lines(self) -> list[str]:
+        """Returns lines on how the files were understood."""
+        (width, height), focal_px = (self.model.width, self.model.height), self.model.focal[0]
+        camera, board = (path.name if path else "" for path in (self.files.camera, self.files.board))
+        return [
+            *self.robot_lines(),
+            f"camera: {camera}: {width} × {height} px, focal length {focal_px:.6g} px",
+            f"board: {board}: {kind_of(self.design)}",
+        ]
 
     def robot_lines(self) -> tuple[str, ...]:
         """Returns lines on how the robot's poses were read and matched."""
         matched = (f"images matched {self.matching}",) if self.matching else ()
-        return f"robot: {self.at_images.robot.understood}", *matched
+        return f"robot: {self.robot.understood}", *matched
 
-
-def _photographs(
-    source: Path,
-    files_of: tuple[Path, Path, Path],
-    quaternions: Order,
-    statements: Said,
-    timing: Timing,
-    robot: Robot | None,
-) -> _Photographs:
-    """Returns the images of a folder, matched with the poses in the first of the files of :func:`_all_three`."""
-    (poses, camera, board), arm = files_of, None
-    if robot is None:
-        robot_poses = read_robot_poses(poses, quaternions, statements)
-    elif timing.offset or timing.image_times is not None:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            "--time-offset, --image-times: not with --with-kinematics, whose joint values belong to images by name; "
-            "name the images in the column image",
+    def pairs(self, workers: int | None, progress: Progress) -> HandEyeInput:
+        """Returns the pairs of all images that show the board and have a pose."""
+        with_pose = [image for image in self.images if image.name in self.row_of]
+        detections = detect_boards(with_pose, self.model, self.design, (), workers, partial(progress, "board"))
+        without_board = [(each.name, each.reason) for each in detections.skipped]
+        if not (found := detections.views()):
+            raise InputError(
+                "E-IMAGES-NO-BOARD",
+                f"image folder {self.folder}: the board is in none of {len(with_pose)} images: "
+                f"{': '.join(without_board[0])}",
+            )
+        views = (View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values())
+        views, rows = Views(detections.camera, tuple(views)), np.array([self.row_of[name] for name in found])
+        pairs = pairs_of_views(self.robot.base_from_flange[rows], views, tuple(found), str(self.folder))
+        if self.robot.covariance is not None:
+            pairs = replace(pairs, base_from_flange_covariance=self.robot.covariance[rows])
+        understood = () if self.robot.own else self.robot_lines()
+        return HandEyeInput(
+            f"{self.folder.name}, {self.files.poses.name if self.files.poses else ''}",
+            pairs,
+            views,
+            detections.symmetries,
+            camera_prior(refinable(self.model.calibrated(detections.camera.width, detections.camera.height))),
+            next((getattr(self.design, key) for key in PITCHES if hasattr(self.design, key)), None),
+            (*without_board, *self.left_out),
+            (*understood, *(f"board: {part}" for part in detections.unused())),
+            self.files.statements.setup,
+            arm=self.arm and self.arm[rows],
+            timed=self.at_images.timed(tuple(found)),
         )
-    else:
-        robot_poses, arm = read_arm(poses, robot, quaternions)
-    design, model = load_boards(board), read_camera(camera)
-    files, skipped = find_images(source)
-    at_images = robot_at_images(robot_poses, [file.name for file in files], timing if arm is None else None)
-    robot_poses, late = at_images.robot, dict(at_images.left_out)
-    names = [file.name for file in files if file.name not in late]
-    row_of, missing, matching = robot_poses.pairing(names)
-    if not row_of:
-        raise InputError(
-            "E-POSES-UNMATCHED",
-            f"{robot_poses.where}: no row is of an image in {source}: {robot_poses.images[0]} … there, {names[0]} … "
-            "here; correct them",
-        )
-    unpaired = list(late.items()) + [(name, f"no row in {poses.name}") for name in names if name not in row_of]
-    unpaired += [(name, f"no such image, in a row of {poses.name}") for name in missing]
-    reasons = [(each.name, each.reason) for each in skipped]
-    return _Photographs(design, model, files, at_images, arm, row_of, matching, reasons, unpaired)
-
-
-def _from_images(
-    source: Path, poses: Path, own: _Photographs, statements: Said, workers: int | None, progress: Progress
-) -> HandEyeInput:
-    """Returns the pairs of all images that show the board and have a pose."""
-    robot, with_pose = own.at_images.robot, [file for file in own.files if file.name in own.row_of]
-    detections = detect_boards(with_pose, own.model, own.design, (), workers, partial(progress, "board"))
-    without_board = [(each.name, each.reason) for each in detections.skipped]
-    if not (found := detections.views()):
-        raise InputError(
-            "E-IMAGES-NO-BOARD",
-            f"image folder {source}: the board is in none of {len(with_pose)} images: {': '.join(without_board[0])}",
-        )
-    views = Views(
-        detections.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in found.values())
-    )
-    rows = np.array([own.row_of[name] for name in found])
-    pairs = pairs_of_views(robot.base_from_flange[rows], views, tuple(found), str(source))
-    if robot.covariance is not None:
-        pairs = replace(pairs, base_from_flange_covariance=robot.covariance[rows])
-    understood = own.robot_lines() if not robot.own else ()
-    understood += tuple(f"board: {part}" for part in detections.unused())
-    return HandEyeInput(
-        f"{source.name}, {poses.name}",
-        pairs,
-        views,
-        detections.symmetries,
-        camera_prior(refinable(own.model.calibrated(detections.camera.width, detections.camera.height))),
-        next((getattr(own.design, key) for key in PITCHES if hasattr(own.design, key)), None),
-        (*own.skipped, *without_board, *own.unpaired),
-        understood,
-        statements.setup,
-        folder=source,
-        arm=own.arm and own.arm[rows],
-        timed=own.at_images.timed(tuple(found)),
-    )
-
-
-def dry_run(
-    source: Source,
-    poses: Path | None = None,
-    camera: Path | None = None,
-    board: Path | None = None,
-    quaternions: Order = "wxyz",
-    statements: Said = NOTHING_SAID,
-    timing: Timing = WITHOUT_OPTIONS,
-    robot: Robot | None = None,
-) -> list[str]:
-    """Returns lines on how the inputs are understood, without looking for the board in images."""
-    if isinstance(source, Path) and source.is_dir():
-        files = _all_three(source, poses, camera, board)
-        own = _photographs(source, files, quaternions, statements, timing, robot)
-        stated, flange = statements.setup, own.at_images.robot.base_from_flange[list(own.row_of.values())]
-        (width, height), focal_px = (own.model.width, own.model.height), own.model.focal[0]
-        lines = [
-            *own.robot_lines(),
-            f"camera: {files[1].name}: {width} × {height} px, focal length {focal_px:.6g} px",
-            f"board: {files[2].name}: {kind_of(own.design)}",
-        ]
-        count = f"images: {len(own.row_of)} of {len(own.files)} with a pose of the robot; the board was not looked for"
-        left_out = [*own.skipped, *own.unpaired]
-    else:
-        inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)
-        stated, flange, left_out = inputs.setup, inputs.pairs.base_from_flange, inputs.left_out
-        lines = list(inputs.understood)
-        if not lines and not isinstance(source, Told):
-            lines = own_told(source, quaternions)
-        count = f"pairs: {len(inputs.pairs)}"
-    setup = stated or "eye-in-hand"
-    origin = "as you say" if statements.setup else "as the file says" if stated else "by default"
-    lines += [f"setup: {setup}, {origin}", count, *spread_text(flange, setup)]
-    return lines + [f"left out {name}: {reason}" for name, reason in left_out]
 
 
 MOST_ROUNDS = 3

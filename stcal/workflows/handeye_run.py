@@ -29,8 +29,8 @@ from stcal.handeye.validate import (
     compare,
     cross_validate,
     predict_motions,
+    repaired,
     splits,
-    widened_by_scatter,
 )
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import Progress, one_thread
@@ -122,18 +122,6 @@ def calibrate_handeye(
     return outcome if offset is None else replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
 
 
-def _of_no_covariance(given: HandEyeInput, result: HandEye) -> tuple[str, ...]:
-    """Returns a note where the board's poses state no σ: what they all err by in common shows in no residual."""
-    if given.views is not None or given.pairs.camera_from_board_covariance is not None or result.covariance is None:
-        return ()
-    return (
-        Aside(
-            "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the "
-            "board's size, is not in σ; `measure` writes it (columns cov_… and common…)"
-        ),
-    )
-
-
 def calibrate(
     given: HandEyeInput,
     setup: Setup,
@@ -149,7 +137,7 @@ def calibrate(
     Raises StcalError: as :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     with naming_left_out(given.left_out):
-        pairs, views = given.pairs, given.views
+        pairs, views, workers = given.pairs, given.views, validation.workers
         if options.camera is None:
             options = replace(options, camera=given.prior)
         compared, rows = (), np.zeros((0, 0), int)
@@ -157,52 +145,52 @@ def calibrate(
             rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
         if method == ALL:
             result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
-            compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
+            compared = compare(pairs, setup, views, options, rows=rows, workers=workers, progress=done)
             held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
-            solution = Validated(
-                result if held_out is None else widened_by_scatter(result, held_out), held_out, options
-            )
+            solution = Validated(held_out.widened(result) if held_out else result, held_out, options)
         else:
             prior, done = given.prior if views is not None else None, partial(progress, "held out")
-            asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
-            solution = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
+            asked = None if method == AUTO else method
+            choosing = method == AUTO
+            solution = validated(pairs, setup, asked, views, options, prior, rows, workers, done, choosing)
         result, options, notes = solution.result, solution.options, solution.notes
         if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
             notes = (*notes, meant)
-        meant = () if given.setup else of_setup(result.mount_from_camera, result.stand_from_board, setup)
-        notes = (*notes, *meant, *_of_no_covariance(given, result))
+        if not given.setup:
+            notes = (*notes, *of_setup(result.mount_from_camera, result.stand_from_board, setup))
+        if views is None and pairs.camera_from_board_covariance is None and result.covariance is not None:
+            notes = (*notes, NO_COVARIANCE)
         if not offset_known:
             result, lagging = lag_tried(given, setup, options, result)
             notes = (*notes, *lagging)
-        motions = None
-        if validation.motions is not None:
-            motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
-        model = options.intrinsics.colmap_model if options.intrinsics else ""
-        own_sigmas = views is not None and all(view.covariance is not None for view in views.views)
-        if options.symmetries:
-            mended = repair(pairs, setup, options.symmetries, views)
-            pairs, views = mended.pairs, mended.views
+        last = validation.motions
+        motions = None if last is None else predict_motions(pairs, setup, result.method, views, options, last)
+        pairs, views, _ = repaired(pairs, setup, views, options)
         outcome = Outcome(
             given.where,
             result,
             solution.held_out,
             compared,
             given.pitch_mm,
-            model,
-            own_sigmas,
+            options.intrinsics.colmap_model if options.intrinsics else "",
+            views is not None and all(view.covariance is not None for view in views.views),
             given.left_out,
             notes,
             motions,
             solution.choice,
-            understood=given.understood,
-            pairs=pairs,
-            views=views,
-            folder=given.folder,
+            pairs,
+            views,
+            given.understood,
         )
         if given.arm is None:
             return outcome
-        done = partial(progress, "with the arm")
-        return with_arm(outcome, given.arm, options, given.prior, rows, validation.workers, done)
+        return with_arm(outcome, given.arm, options, given.prior, rows, workers, partial(progress, "with the arm"))
+
+
+NO_COVARIANCE = Aside(
+    "the board's poses state no covariance: what all of them err by in common, as by the intrinsics or the board's "
+    "size, is not in σ; `measure` writes it (columns cov_… and common…)"
+)
 
 
 def with_arm(
@@ -227,12 +215,13 @@ def with_arm(
     held_out, notes = None, outcome.notes
     if len(rows):
         held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
-        result = widened_by_scatter(result, held_out)
+        result = held_out.widened(result)
     adjusted = result.reprojection
     if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
         raise ValueError("reprojection with an arm has its parameters")
-    sigma = np.sqrt(np.diag(adjusted.arm_covariance))
-    arm_found = ArmFound(arm.robot.name, arm.names(), adjusted.arm, sigma, outcome.held_out)
+    values = (adjusted.arm.tolist(), np.sqrt(np.diag(adjusted.arm_covariance)).tolist())
+    parameters, sigma = (dict(zip(arm.names(), each, strict=True)) for each in values)
+    arm_found = ArmFound(arm.robot.name, parameters, sigma, outcome.held_out)
     if held_out is not None and outcome.held_out is not None:
         now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
         if now >= before:
@@ -330,17 +319,14 @@ def lag_tried(
     if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
+    with_which, ahead = f"with which residuals fall from {old} to {new}", lag.seconds > 0
     if given.timed is not None:
-        order = "ahead of" if lag.seconds > 0 else "behind"
-        said = (
-            f"by the motions the robot's clock is {1e3 * abs(lag.seconds):.3g} ± {1e3 * lag.sigma_s:.2g} ms {order} "
-            f"the camera's, with which residuals fall from {old} to {new}: solve with --time-offset"
-        )
+        clock = f"{1e3 * abs(lag.seconds):.3g} ± {1e3 * lag.sigma_s:.2g} ms {'ahead of' if ahead else 'behind'}"
+        said = f"by the motions the robot's clock is {clock} the camera's, {with_which}: solve with --time-offset"
     else:
-        order = "later" if lag.seconds > 0 else "earlier"
+        late = f"{abs(lag.seconds) / ROW_S:.2g} ± {lag.sigma_s / ROW_S:.1g} rows {'later' if ahead else 'earlier'}"
         said = (
-            f"by the motions the board's poses are {abs(lag.seconds) / ROW_S:.2g} ± {lag.sigma_s / ROW_S:.1g} rows "
-            f"{order} than the robot's, with which residuals fall from {old} to {new}: give both with times, and "
+            f"by the motions the board's poses are {late} than the robot's, {with_which}: give both with times, and "
             "--time-offset"
         )
     if not any(isinstance(note, SizeDoubt) for note in after.notes):

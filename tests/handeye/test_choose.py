@@ -54,7 +54,7 @@ def test_a_camera_file_that_is_wrong_is_found_out():
     found = chosen(truth, camera)
     assert found.chosen.camera
     plain = next(each for each in found.tried if each.candidate == Candidate("reprojection"))
-    assert plain.mean_mm() > 1.5 * found.held_out.board_mm.mean()
+    assert plain.mean_mm > 1.5 * found.held_out.board_mm.mean()
     assert "the camera file costs" in found.sentence
     pairs, views = filed(truth, camera)
     assert off_mm(found.result, truth) < off_mm(handeye(pairs, truth.setup, views=views), truth) / 2
@@ -163,7 +163,7 @@ def test_a_closed_form_is_taken_where_it_predicts_better():
     bent = flange.translation + (flange.translation - middle) @ np.random.default_rng(1).normal(0, 0.02, (3, 3))
     pairs = replace(truth.pairs, base_from_flange=replace(flange, translation=bent))
     found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(14, None, 6))
-    mean = {each.candidate: each.mean_mm() for each in found.tried}
+    mean = {each.candidate: each.mean_mm for each in found.tried}
     best = min(mean, key=mean.__getitem__)
     assert mean[found.chosen] <= 1.1 * mean[best]
     assert set(CLOSED_FORMS) <= set(mean)

@@ -19,7 +19,7 @@ from stcal.handeye import (
 )
 from stcal.handeye.data.pairs import Loop, Motions
 from stcal.handeye.solve import handeye
-from stcal.handeye.validate import predicted, scatter, widened_by_scatter
+from stcal.handeye.validate import predicted
 from tests.outcome import fails_with, refuses
 from tests.support.handeye import simulated, simulated_views
 
@@ -79,13 +79,13 @@ def test_solutions_of_parts_scatter_as_sigma_says():
         truth = simulated(np.random.default_rng(seed), 20, robot=(5e-4, 0.2), camera=(5e-4, 0.2))
         found = handeye(truth.pairs, truth.setup)
         held_out = cross_validate(truth.pairs, truth.setup, rows=splits(20, 5, 40))
-        ratios.append(scatter(found, held_out))
+        ratios.append(held_out.scatter(found))
         sure = replace(found, covariance=found.covariance / 9)
-        wide = widened_by_scatter(sure, held_out)
+        wide = held_out.widened(sure)
         assert np.allclose(wide.covariance, ratios[-1] ** 2 * found.covariance)
         assert any("solutions of parts of the poses scatter" in note for note in wide.notes)
     assert np.mean(ratios) == pytest.approx(1, abs=0.15)
-    assert np.isnan(scatter(handeye(truth.pairs, truth.setup, "li"), held_out))
+    assert np.isnan(held_out.scatter(handeye(truth.pairs, truth.setup, "li")))
 
 
 def test_a_method_that_fails_says_why():

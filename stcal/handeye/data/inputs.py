@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -122,31 +123,30 @@ def read_two(
                 raise _no_poses(table)
         sides.append(settled(content, role, path, statements))
     (robot, camera), where = sides, f"{first.name} with {second.name}"
-    setups: list[Setup] = [content.setup for content in contents if content is not None and content.setup]
-    setup = setups[0] if setups else None
-    if (told_by_time := _by_time(robot, camera, setup, where, tolerance_s, timed)) is not None:
-        return told_by_time
+    setup: Setup | None = next((each.setup for each in contents if each is not None and each.setup), None)
+    stamps = [stamps_of(side.names) if side.names else None for side in sides]
+    if timed and None in stamps:
+        without = sides[stamps.index(None)]
+        raise InputError(
+            "E-POSES-UNTIMED", f"{without.where}: no times of its poses; with --time-offset both files need them"
+        )
+    times, wanted = stamps
+    if times is not None and wanted is not None and (timed or not set(wanted) <= set(times)):
+        return _by_time(robot, camera, times, wanted, setup, where, tolerance_s)
     rows, how = matched(robot, camera, key)
-    notes = () if not how else (f"rows joined {how}",)
     a, b = [i for i, _ in rows], [j for _, j in rows]
-    names = tuple(robot.called(i) for i in a)
-    stamped = _stamped(robot, camera, b)
+    stream = None
+    if times is not None and wanted is not None and len(set(times)) >= max(len(times), len(rows) + 1):
+        stream = Stream.of(times, robot.poses, first.name)
+    stamped = None
+    if stream is not None and wanted is not None and stream.spacing_s() <= LONGEST_S:
+        stamped = Timed(stream, stream.after_origin([wanted[j] for j in b]))
     alone = sorted(set(range(len(robot))) - set(a)) if stamped is None else ()  # samples between images are no mistake
     left_out = [(robot.called(i), f"in {first.name} alone") for i in alone]
     left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
-    pairs = _pairs(robot, camera, a, b, names, where)
+    pairs = _pairs(robot, camera, a, b, tuple(robot.called(i) for i in a), where)
+    notes = (f"rows joined {how}",) if how else ()
     return Told(pairs, (*_both(robot, camera), *notes), setup, tuple(left_out), stamped)
-
-
-def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
-    """Returns the robot's stream and the times of these rows of the camera; None without times or a dense stream."""
-    times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
-    if times[0] is None or times[1] is None or len(set(times[0])) < max(len(times[0]), len(rows) + 1):
-        return None
-    stream = Stream.of(times[0], robot.poses, Path(robot.where).name)
-    if stream.spacing_s() > LONGEST_S:
-        return None
-    return Timed(stream, stream.after_origin([times[1][j] for j in rows]))
 
 
 def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
@@ -185,21 +185,17 @@ def _no_poses(table: Table) -> InputError:
 
 
 def _by_time(
-    robot: Posed, camera: Posed, setup: Setup | None, where: str, tolerance_s: float, always: bool
-) -> Told | None:
-    """Returns the robot's poses at the camera's times; None without, or, unless ``always``, with equal times."""
-    times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
-    if times[0] is None or times[1] is None:
-        if always:
-            without = (robot, camera)[times[0] is not None]
-            raise InputError(
-                "E-POSES-UNTIMED", f"{without.where}: no times of its poses; with --time-offset both files need them"
-            )
-        return None
-    if not always and set(times[1]) <= set(times[0]):
-        return None
-    stream = Stream.of(times[0], robot.poses, Path(robot.where).name)
-    seconds = stream.after_origin(times[1])
+    robot: Posed,
+    camera: Posed,
+    times: Sequence[Decimal],
+    wanted: Sequence[Decimal],
+    setup: Setup | None,
+    where: str,
+    tolerance_s: float,
+) -> Told:
+    """Returns the robot's poses at the camera's times."""
+    stream = Stream.of(times, robot.poses, Path(robot.where).name)
+    seconds = stream.after_origin(wanted)
     taken = taken_at(stream, seconds, tolerance_s)
     if not taken.kept.any():
         raise InputError(
@@ -207,16 +203,13 @@ def _by_time(
             f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
         )
     rows = np.flatnonzero(taken.kept)
-    names = tuple(camera.names[i] for i in rows)
     at_images = replace(robot, poses=taken.base_from_flange, covariance=None)
+    names = tuple(camera.names[i] for i in rows)
     pairs = _pairs(at_images, camera, range(len(rows)), rows.tolist(), names, where)
     left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
-    dropped = (
-        ("covariances of the robot's poses are not used: they are of other times",)
-        if robot.covariance is not None
-        else ()
-    )
-    lines = (*_both(robot, camera), taken.said, *dropped)
+    lines = (*_both(robot, camera), taken.said)
+    if robot.covariance is not None:
+        lines += ("covariances of the robot's poses are not used: they are of other times",)
     return Told(pairs, lines, setup, left_out, Timed(stream, seconds[rows]))
 
 
@@ -321,13 +314,13 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
     The description of the match is empty where the names are the same.
     """
     if not robot.names and not camera.names:
-        if len(robot) != len(camera):
-            raise InputError(
-                "E-POSES-COUNT",
-                f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times; as many "
-                "of each, or names, needed",
-            )
-        return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
+        if len(robot) == len(camera):
+            return [(i, i) for i in range(len(robot))], "by their order, for neither file has names or times"
+        raise InputError(
+            "E-POSES-COUNT",
+            f"{robot.where}, {camera.where}: {len(robot)} and {len(camera)} poses without names or times; as many "
+            "of each, or names, needed",
+        )
     if not robot.names or not camera.names:
         without, other = (robot, camera) if not robot.names else (camera, robot)
         raise InputError(
@@ -359,15 +352,11 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
     )
     for way, description in ways:
         keys = [[way(name) for name in names] for names in (first, second)]
-        places = []
-        for keys_of_list in keys:
-            known = [key for key in keys_of_list if key is not None]
-            if len(set(known)) < len(known) or not known:
-                break
-            places.append({key: i for i, key in enumerate(keys_of_list) if key is not None})
-        if len(places) < 2:
+        known = [[key for key in own if key is not None] for own in keys]
+        if not all(own and len(set(own)) == len(own) for own in known):
             continue
-        rows = [(i, places[1][key]) for key, i in places[0].items() if key in places[1]]
+        place = {key: j for j, key in enumerate(keys[1])}
+        rows = [(i, place[key]) for i, key in enumerate(keys[0]) if key is not None and key in place]
         if rows:
             i, j = rows[0]
             return rows, f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description

@@ -127,26 +127,21 @@ class Said:
         ``robot=`` and ``camera=``, and of ``--poses-are``.
         """
         whole: dict[str, str] = {}
-        by_role: list[tuple[Role, str, str]] = []
-        for option, values in (("rotation", rotation), ("length_unit", length_unit)):
-            for value in values:
-                role, equals, name = value.partition("=")
-                given = [entry for entry in by_role if entry[:2] == (role, option)] if equals else option in whole
-                if given:
-                    raise InputError(
-                        "E-OPTION-REPEATED",
-                        f"--{option.replace('_', '-')} {value}: given twice; one for each of robot and camera",
-                    )
-                if not equals:
-                    whole[option] = role
-                elif role in ROLES:
-                    by_role.append(("robot" if role == "robot" else "camera", option, name))
-                else:
-                    raise InputError(
-                        "E-OPTION-VALUE",
-                        f"--{option.replace('_', '-')} {value}: robot= or camera= needed before the name",
-                    )
-        return cls(whole.get("rotation"), whole.get("length_unit"), tuple(frames), setup, tuple(by_role))
+        by_role: dict[tuple[Role, str], str] = {}
+        for option, value in (*(("rotation", v) for v in rotation), *(("length_unit", v) for v in length_unit)):
+            role, equals, name = value.partition("=")
+            typed = f"--{option.replace('_', '-')} {value}"
+            if equals and role not in ROLES:
+                raise InputError("E-OPTION-VALUE", f"{typed}: robot= or camera= needed before the name")
+            own_role: Role = "robot" if role == "robot" else "camera"
+            if (equals and (own_role, option) in by_role) or (not equals and option in whole):
+                raise InputError("E-OPTION-REPEATED", f"{typed}: given twice; one for each of robot and camera")
+            if equals:
+                by_role[own_role, option] = name
+            else:
+                whole[option] = role
+        own: tuple[tuple[Role, str, str], ...] = tuple((*place, name) for place, name in by_role.items())
+        return cls(whole.get("rotation"), whole.get("length_unit"), tuple(frames), setup, own)
 
     def of(self, role: Role) -> "Said":
         """Returns the statements that hold for poses of this role."""
@@ -161,15 +156,13 @@ class Said:
         return [name for name, value in every.items() if value or name in of_one_role]
 
     def __post_init__(self):
-        unknown = [name for name in self.frames if name not in EVERY_FRAME]
-        if unknown:
-            raise InputError("E-OPTION-VALUE", f"--poses-are {unknown[0]}: unknown; {', '.join(EVERY_FRAME)} needed")
-        units = [value for value in (self.length_unit, *(v for _, n, v in self.own if n == "length_unit")) if value]
-        wrong = [value for value in units if value not in LENGTHS]
-        if wrong:
-            raise InputError("E-OPTION-VALUE", f"--length-unit {wrong[0]}: unknown; {', '.join(LENGTHS)} needed")
-        roles = [Frames(name, "").role for name in self.frames]
-        if len(set(roles)) < len(roles):
+        for name in self.frames:
+            if name not in EVERY_FRAME:
+                raise InputError("E-OPTION-VALUE", f"--poses-are {name}: unknown; {', '.join(EVERY_FRAME)} needed")
+        for unit in (self.length_unit, *(value for _, name, value in self.own if name == "length_unit")):
+            if unit and unit not in LENGTHS:
+                raise InputError("E-OPTION-VALUE", f"--length-unit {unit}: unknown; {', '.join(LENGTHS)} needed")
+        if len({Frames(name, "").role for name in self.frames}) < len(self.frames):
             raise InputError(
                 "E-OPTION-VALUE", f"--poses-are {', '.join(self.frames)}: one of each of robot and camera at most"
             )

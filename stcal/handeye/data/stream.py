@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from itertools import permutations
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -121,10 +122,8 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Returns weights (k, w) of values at nodes (k, w) for the polynomial through them, evaluated at (k,)."""
     width = nodes.shape[1]
     weight = np.ones(nodes.shape)
-    for i in range(width):
-        for j in range(width):
-            if i != j:
-                weight[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
+    for i, j in permutations(range(width), 2):
+        weight[:, i] *= (at - nodes[:, j]) / (nodes[:, i] - nodes[:, j])
     return weight
 
 
@@ -164,19 +163,12 @@ def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE
     at = np.where(inside & ~same, seconds, samples[nearest])
     why = []
     for k, time in enumerate(seconds):
-        if kept[k]:
-            why.append("")
-        elif samples[0] <= time <= samples[-1]:
-            gap = samples[after[k]] - samples[before[k]]
-            why.append(
-                f"in a gap of {gap:.3g} s of {stream.where}, {LONGEST_S:g} s allowed; the nearest sample is "
-                f"{gap_s[k]:.3g} s away, {tolerance_s:g} s allowed (--time-tolerance)"
-            )
-        else:
-            side = "before" if time < samples[0] else "after"
-            why.append(
-                f"{gap_s[k]:.4g} s {side} the samples of {stream.where}, {tolerance_s:g} s allowed (--time-tolerance)"
-            )
+        away, gap = f"{gap_s[k]:.4g} s", samples[after[k]] - samples[before[k]]
+        reason = f"{away} {'before' if time < samples[0] else 'after'} the samples of {stream.where}"
+        if samples[0] <= time <= samples[-1]:
+            allowed = f"{LONGEST_S:g} s allowed; the nearest sample is {away} away"
+            reason = f"in a gap of {gap:.3g} s of {stream.where}, {allowed}"
+        why.append("" if kept[k] else f"{reason}, {tolerance_s:g} s allowed (--time-tolerance)")
     counts = int(same.sum()), int((inside & ~same).sum()), int((kept & ~inside & ~same).sum())
     parts = [f"{counts[0]} at a sample"] if counts[0] else []
     if counts[1]:

@@ -13,7 +13,6 @@ from stcal.handeye.data.record import (
     MATRICES,
     Content,
     Frames,
-    Role,
     Said,
     Side,
     Unit,
@@ -240,10 +239,8 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
         )
     sides = []
     for name, item in parts.items():
-        if len(item) == 2:
-            side = _of_rotations(item, where, named[name])
-        else:
-            side = _side_of(next(iter(item.values())), where, named[name])
+        [first, *more] = item.values()
+        side = _of_rotations(item, where, named[name]) if more else _side_of(first, where, named[name])
         if side is None:
             raise InputError(
                 "E-POSES-NOT-FOUND",
@@ -253,7 +250,8 @@ def _of_keys(value: Mapping, form: str, where: str) -> Content | None:
     if names and len(names) != len(sides[0]):
         raise InputError("E-NAMES-COUNT", f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
     if names:
-        sides = [_renamed(side, names, where) for side in sides]
+        require_each_once(names, sides[0].places, where)
+        sides = [replace(side, names=names) for side in sides]
     opencv = any("2" in key for item in parts.values() for key in item)
     return Content("OpenCV's hand-eye arrays" if opencv else form, _same_count(sides, where), None, tuple(others))
 
@@ -288,47 +286,26 @@ def _flat(value: Any) -> Any:
 
 def _of_pairs(value: Sequence[Mapping], form: str, where: str) -> Content | None:
     """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
-    sides: dict[Role, tuple[str, Frames]] = {}
-    others = []
+    stacks: dict[str, Any] = {}
     for key, entry in value[0].items():
-        frames = frames_of(key)
-        role = role_of(key) if frames is None else frames.role
-        if role is None or _matrix(entry) is None:
-            others.append(str(key))
+        if (frames_of(key) is None and role_of(key) is None) or _matrix(entry) is None:
             continue
-        if role in sides:
+        if without := [i for i, other in enumerate(value, 1) if key not in other]:
             raise InputError(
-                "E-POSE-REPEATED",
-                f"{where}: {sides[role][0]} and {key}: poses of one side twice; leave one in the file",
+                "E-POSE-INCOMPLETE",
+                f"{where}: pose {without[0]}: {key} is missing, which pose 1 has; add it, or take the pose out",
             )
-        sides[role] = (key, frames or Frames(FRAMES[role][0], "by default", False))
-    if not sides:
+        stacks[key] = [other[key] for other in value]
+    if not stacks:
         return None
-    names = tuple(_name_in(entry) for entry in value)
-    read = []
-    for key, frames in sides.values():
-        for i, entry in enumerate(value, 1):
-            if key not in entry:
-                raise InputError(
-                    "E-POSE-INCOMPLETE",
-                    f"{where}: pose {i}: {key} is missing, which pose 1 has; add it, or take the pose out",
-                )
-        side = _side_of([entry[key] for entry in value], where, frames)
-        if side is None:
-            raise InputError("E-POSE-VALUE", f"{where}: {key}: not a pose in every entry; correct it")
-        read.append(_renamed(side, names, where) if all(names) else side)
-    moveit = {key for key, _ in sides.values()} == MOVEIT
-    if moveit:
-        read = [replace(side, unit=ROS) for side in read]
-    unused = tuple(
-        key for key in others if not (all(names) and key in ("image", "name", "header", "timestamp", "stamp", "id"))
-    )
-    return Content("MoveIt hand-eye samples" if moveit else form, tuple(read), None, unused)
-
-
-def _renamed(side: Side, names: tuple[str, ...], where: str) -> Side:
-    require_each_once(names, side.places, where)
-    return replace(side, names=names)
+    moveit, names = stacks.keys() == MOVEIT, [_name_in(entry) for entry in value]
+    naming = ("image", "name", "header", "timestamp", "stamp", "id") if all(names) else ()
+    unused = tuple(key for key in value[0] if key not in stacks and key not in naming)
+    content = _of_keys(stacks | ({"names": names} if all(names) else {}), form, where)
+    if content is None:
+        return None
+    sides = tuple(replace(side, unit=ROS) for side in content.sides) if moveit else content.sides
+    return Content("MoveIt hand-eye samples" if moveit else content.form, sides, None, unused)
 
 
 def _same_count(sides: list[Side], where: str) -> tuple[Side, ...]:

@@ -5,14 +5,17 @@ belong to other poses. A symmetric board may be numbered from another end, and a
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import permutations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
+from stcal.explain import Candidate, explain
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
@@ -30,17 +33,16 @@ FAR_BETTER, BETTER = 30.0, 3.0
 median residual in translation, before the poses are refused."""
 DOUBTFUL = 1.5
 """Factor by which the other setup must reduce the same product before a note says that it fits better."""
-INVERTED = "with one side inverted"
 WELL = np.radians(0.5), 5.0
 """Median residuals (rad, mm) up to which poses are not suspected."""
 LOST = 0.25
 """Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
 nothing in common."""
-NAMED = "rename them in the file, or give --poses-are where the file does not name them"
-NAMED_ORDER = "name the columns so; for a file without names of columns give --rotation {side}={order}"
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
+SIDES = (("robot", "robot"), ("board", "camera"))
+"""What messages and options call the two sides."""
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
 
@@ -53,66 +55,65 @@ def check_conventions(
     ``guess`` : returns X, Z and scale of a loop; ``by_images`` : the board's poses come from images, so that only the
     robot's can be named wrongly. Raises InputError: the message says what is mixed up, and the remedy.
     """
-    as_read, notes = _typical(loop, guess, with_scale), ()
-    if as_read[0] > WELL[0] or as_read[1] > WELL[1]:
-        size = f"{np.degrees(as_read[0]):.3g}° and {as_read[1]:.3g} mm (median)"
+    turn, shift = as_read = _typical(loop, guess, with_scale)
+    notes: tuple[str, ...] = ()
+    if turn > WELL[0] or shift > WELL[1]:
+        size = f"{np.degrees(turn):.3g}° and {shift:.3g} mm (median)"
         contradict = f"{pairs.where}: the poses contradict each other by {size}"
         for still in of_still(pairs):
             if isinstance(still, Grave):
                 raise InputError("E-POSES-IDENTICAL", f"{contradict}, as {still}")
-        variants = _variants(loop, setup, by_images)
-        typical_of_variant = _typical_of(variants, guess, with_scale)
-        gain, convention = _best(as_read, typical_of_variant)
-        if convention is None:
-            more = _other_angles(loop, by_images)
-            more |= _other_places(loop, by_images) if as_read[0] <= WELL[0] else {}
-            typical_of_variant |= _typical_of(more, guess, with_scale)
-            convention = _best(as_read, typical_of_variant)[1]
-        if convention is None and as_read[0] > WELL[0]:
-            other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
-            other_loop = Loop.of(pairs, other)
-            both = {"": other_loop, **_variants(other_loop, other, by_images)}
-            with_setup = {f"with --setup {other}{' and ' if k else ''}{k}": each for k, each in both.items()}
-            typical_of_variant |= _typical_of(with_setup, guess, with_scale)
-            convention = _best(as_read, typical_of_variant)[1]
-        if convention is not None:
-            turn, shift = typical_of_variant[convention]
-            but = f"{contradict}, but by {np.degrees(turn):.2g}° and {shift:.2g} mm "
-            raise InputError("E-HANDEYE-CONVENTION", f"{but}{_with_its_like(convention, typical_of_variant)}")
-        if (row := _other_from(loop, guess, with_scale, as_read)) is not None:
+
+        def misfit(variant: Loop) -> float:
+            again = _typical(variant, guess, with_scale)
+            share = np.prod(np.maximum(again, 1e-12)) / np.prod(as_read)
+            return float(f"{share:.3g}") if shift > BETTER * again[1] else np.inf  # equal but for rounding
+
+        readings = _readings(pairs, loop, setup, by_images, turn <= WELL[0])
+        if best := explain(readings, misfit, 1 / FAR_BETTER, ALIKE):
+            less = _typical(best[0][0].change(), guess, with_scale)
+            words = "; or ".join(each.words for each, _ in best)
+            but = f"{contradict}, but by {np.degrees(less[0]):.2g}° and {less[1]:.2g} mm"
+            raise InputError("E-HANDEYE-CONVENTION", f"{but} {words}")
+
+        def apart(parts: tuple[Loop, Loop]) -> float:
+            return float(np.max(np.divide([_typical(part, guess, with_scale, np.mean) for part in parts], as_read)))
+
+        rows = range(LEAST_PART, len(loop) - LEAST_PART + 1)
+        halves = [Candidate(pairs.names[row], partial(lambda row: (loop[:row], loop[row:]), row)) for row in rows]
+        if best := explain(halves, apart, 1 / PART_BETTER):
+            first = best[0][0].words
             raise InputError(
                 "E-HANDEYE-CONVENTION",
-                f"{contradict}, but those before {pairs.names[row]}, and those from it on, fit by themselves: another "
-                "tool (TCP) or base was set in the controller there, or camera or board were moved; solve them "
-                "separately",
+                f"{contradict}, but those before {first}, and those from it on, fit by themselves: another tool (TCP) "
+                "or base was set in the controller there, or camera or board were moved; solve them separately",
             )
-        inverted = next(each for each in variants if each.startswith(INVERTED))
-        if gain[inverted] > DOUBTFUL and as_read[1] > typical_of_variant[inverted][1]:
-            turn, shift = typical_of_variant[inverted]
-            than = f"by {np.degrees(turn):.2g}° and {shift:.2g} mm {inverted}"
-            notes = (Grave(f"the poses contradict each other by {size}, but {than}"),)
+        inverted = _inverted(loop, setup, by_images)
+        with suppress(DegenerateError):
+            less = _typical(inverted.change(), guess, with_scale)
+            if turn * shift > DOUBTFUL * less[0] * less[1] and shift > less[1]:
+                than = f"by {np.degrees(less[0]):.2g}° and {less[1]:.2g} mm {inverted.words}"
+                notes = (Grave(f"the poses contradict each other by {size}, but {than}"),)
         spread = _differ(loop)
-        turn, shift = np.divide(_typical(loop, guess, True), spread)
-        if max(turn, shift) > LOST:
+        if np.divide(_typical(loop, guess, True), spread).max() > LOST:
             remedy = "pair each pose of the board with that of the flange at the same moment"
             if radians := _as_of_radians(loop, by_images):
                 remedy = (
                     f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that "
                     f"ends in -rad; if not, {remedy}"
                 )
-            elif as_read[0] <= WELL[0]:
+            elif turn <= WELL[0]:
                 remedy = (
                     "as rotations agree, rows and conventions of rotation are right: check units, signs and order of "
                     "the columns of positions"
                 )
             else:
-                remedy += (
-                    f", and {'check the camera file' if by_images else 'look for another convention of rotations'}"
-                )
+                other = "check the camera file" if by_images else "look for another convention of rotations"
+                remedy += f", and {other}"
             raise InputError(
                 "E-HANDEYE-CONVENTION",
                 f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if {'positions' if as_read[0] <= WELL[0] else 'poses'} of robot and camera did not belong together; "
+                f"if {'positions' if turn <= WELL[0] else 'poses'} of robot and camera did not belong together; "
                 f"{remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
@@ -134,65 +135,34 @@ def check_conventions(
 
 LEAST_PART, PART_BETTER = 6, 10.0
 """Least number of poses that fit by themselves, and how much better than all together, in rotation and translation."""
-
-
-def _other_from(loop: Loop, guess: Guess, with_scale: bool, as_read: tuple[float, float]) -> int | None:
-    """Returns the row from which on poses fit by themselves, as those before it do; None if there is no such row."""
-
-    def misfit(row: int) -> float:
-        parts = [_typical_or_far(part, guess, with_scale, np.mean) for part in (loop[:row], loop[row:])]
-        return float(np.max(np.divide(parts, as_read)))
-
-    each = {row: misfit(row) for row in range(LEAST_PART, len(loop) - LEAST_PART + 1)}
-    best = min(each, key=each.__getitem__, default=None)
-    return best if best is not None and each[best] < 1 / PART_BETTER else None
-
-
-def _typical_of(variants: dict[str, Loop], guess: Guess, with_scale: bool) -> dict[str, tuple[float, float]]:
-    """Returns :func:`_typical_or_far` of each loop."""
-    return {convention: _typical_or_far(variant, guess, with_scale) for convention, variant in variants.items()}
-
-
-def _best(as_read: tuple[float, float], typical: dict[str, tuple[float, float]]) -> tuple[dict[str, float], str | None]:
-    """Returns by how much each variant reduces the product of residuals; and the best, None if it is not far better."""
-    gain = {
-        convention: as_read[0] / max(turn, 1e-12) * as_read[1] / max(shift, 1e-12)
-        for convention, (turn, shift) in typical.items()
-    }
-    # Readings that give the same residuals, but for rounding, are told by the first of them.
-    best = max(gain, key=lambda each: float(f"{gain[each]:.3g}"))
-    better = gain[best] > FAR_BETTER and as_read[1] > BETTER * typical[best][1]
-    return gain, best if better else None
-
-
-def _with_its_like(convention: str, typical: dict[str, tuple[float, float]]) -> str:
-    """Returns the convention, and readings of angles with the same residuals: how they were read tells which it is."""
-    start, angles, first = convention.partition(OTHER_ANGLES)
-    if not angles:
-        return convention
-    residuals = np.array(typical[convention])
-    like = [
-        each.removeprefix(start + angles)
-        for each, other in typical.items()
-        if each.startswith(start + angles) and np.allclose(other, residuals, rtol=1e-3) and each != convention
-    ]
-    return start + angles + ", ".join([first, *like])
-
-
+ALIKE = 1.001
+"""Ratio of misfits up to which two readings cannot be told apart: they give the same residuals."""
 ANGLES = ("xyz", "ZYX", "XYZ", "zyx", "ZYZ", "rotvec")
 """Orders of axes, fixed (xyz …) or turned (ZYX …), whose angles are mixed up with one another or with rotation vectors,
 by the names that --rotation has for them; the most frequent first."""
-OTHER_ANGLES = " angles in another convention: "
 
 
-def _other_angles(loop: Loop, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop with angles that were read in one sequence, and meant in another."""
-    variants = {}
-    for side, role in (("robot", "robot"),) if by_images else (("robot", "robot"), ("board", "camera")):
+def _readings(
+    pairs: HandEyePoses, loop: Loop, setup: Setup, by_images: bool, rotations_agree: bool
+) -> Iterator[Candidate]:
+    """Yields the loop in each other convention: of one setup, of angles or places, of the other setup."""
+    yield from _variants(loop, setup, by_images)
+    for side, role in SIDES[: 1 if by_images else 2]:
+        read = _stated(loop, side)
         for one, other in permutations(ANGLES, 2):
-            key = f"with the {side}'s{OTHER_ANGLES}--rotation {role}={other}-deg (or -rad) if they were read as {one}"
-            variants[key] = _with_stated(loop, side, _with_angles(_stated(loop, side), one, other))
-    return variants
+            words = f"with the {side}'s angles by --rotation {role}={other}-deg (or -rad) if they were read as {one}"
+            changed = partial(lambda *of: _with_stated(loop, of[0], _with_angles(*of[1:])), side, read, one, other)
+            yield Candidate(words, changed, 1)
+        for names, places in other_axes(read.translation) if rotations_agree else ():
+            words = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
+            changed = partial(_with_stated, loop, side, Poses(read.rotation, places))
+            yield Candidate(words, changed, 1)
+    if not rotations_agree:
+        opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+        other_loop, words = Loop.of(pairs, opposite), f"with --setup {opposite}"
+        yield Candidate(words, lambda: other_loop, 2)
+        for each in _variants(other_loop, opposite, by_images):
+            yield Candidate(f"{words} and {each.words}", each.change, 2)
 
 
 def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
@@ -203,17 +173,6 @@ def _with_angles(poses: Poses, read: str, meant: str) -> Poses:
         angles = rotation.as_rotvec() if read == ROTATION_VECTOR else rotation.as_euler(read)
     turns = Rotation.from_rotvec(angles) if meant == ROTATION_VECTOR else Rotation.from_euler(meant, angles)
     return Poses(turns.as_matrix(), poses.translation)
-
-
-def _other_places(loop: Loop, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop with other signs and another order of the coordinates of places, on either side."""
-    variants = {}
-    for side in ("robot",) if by_images else ("robot", "board"):
-        read = _stated(loop, side)
-        for names, places in other_axes(read.translation):
-            key = f"with x, y, z of the {side} taken as {names}: correct order and signs of the columns of positions"
-            variants[key] = _with_stated(loop, side, Poses(read.rotation, places))
-    return variants
 
 
 def _stated(loop: Loop, side: str) -> Poses:
@@ -229,95 +188,86 @@ def _with_stated(loop: Loop, side: str, poses: Poses) -> Loop:
     return replace(loop, stand_from_mount=poses.inverse() if loop.inverted else poses)
 
 
-def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop in each other convention; the key says which convention that is, and what to do. ``by_images`` :
-    the board's poses were computed here from images."""
-    kind = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
-    hand, eye = loop.stand_from_mount, loop.camera_from_board
-    # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
-    mirrored = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
-    named = _inverted_names(eye, by_images)
-    states = "the robot states" if by_images else "robot or camera states"
-    remedy = "change the signs of its y, qx and qz" + (
-        "; or images are mirrored: use them as taken" if by_images else ""
+def _inverted(loop: Loop, setup: Setup, by_images: bool) -> Candidate:
+    """Returns the loop with one side inverted. As a board is in front of its camera, that side is known unless the
+    poses have the board in front in both directions."""
+    seen, kind = loop.camera_from_board, "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+    robot, camera = FRAMES["robot"][1], FRAMES["camera"][1]
+    front, front_inverted = (bool((poses.translation[:, 2] > 0).all()) for poses in (seen, seen.inverse()))
+    named = f"{camera} or {robot}"
+    if by_images:
+        named = robot
+    elif front != front_inverted:
+        named = f"{robot} (the board is in front of the camera as read)" if front else camera
+    return Candidate(
+        f"with one side inverted: either these are {named}: rename them in the file, or give --poses-are where the "
+        f"file does not name them; or all are named rightly: give --setup {kind}",
+        lambda: replace(loop, camera_from_board=seen.inverse()),
     )
-    variants = {
-        f"{INVERTED}: either these are {named}: {NAMED}; or all are named rightly: give --setup {kind}": (
-            replace(loop, camera_from_board=eye.inverse())
-        ),
-        **_other_units(loop, by_images),
-        f"with one side mirrored: if {states} left-handed poses, {remedy}": replace(loop, camera_from_board=mirrored),
-    }
+
+
+def _variants(loop: Loop, setup: Setup, by_images: bool) -> Iterator[Candidate]:
+    """Yields the loop with a side inverted, mirrored, in another unit, or beside another row, or with quaternions in
+    another order. ``by_images`` : the board's poses were computed here from images."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    yield _inverted(loop, setup, by_images)
+    yield from _other_units(loop, by_images)
+    states = "the robot states" if by_images else "robot or camera states"
+    remedy = "change the signs of its y, qx and qz" + "; or images are mirrored: use them as taken" * by_images
+    # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
+    yield Candidate(
+        f"with one side mirrored: if {states} left-handed poses, {remedy}",
+        lambda: replace(loop, camera_from_board=Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)),
+    )
     for which, late, robot_rows, board_rows in (
         ("below", "robot's", slice(1, None), slice(-1)),
         ("above", "board's", slice(-1), slice(1, None)),
     ):
-        variants[
+        yield Candidate(
             f"with each pose of the board beside that of the flange one row {which}: move the {late} poses up by one "
-            "row, or the names of their images"
-        ] = Loop(hand[robot_rows], eye[board_rows], loop.inverted)
-    for reading in (*ORDERS, CONJUGATED):
-        robot, board = (reading.poses(_stated(loop, side)) for side in ("robot", "board"))
-        by_robot = _with_stated(loop, "robot", robot)
-        kind = "conjugated" if reading.conjugated else "in another order"
-        order = "xyzw" if reading is LAST else "wxyz"
-        robot_side, camera_side = (
-            f"quaternions {kind}: if {reading.held}, "
-            + (reading.remedy if reading.conjugated else NAMED_ORDER.format(side=side, order=order))
-            for side in ("robot", "camera")
+            "row, or the names of their images",
+            partial(lambda robot, board: Loop(hand[robot], eye[board], loop.inverted), robot_rows, board_rows),
         )
-        both_sides = f"quaternions {kind}: if {reading.held}, {reading.remedy}"
-        variants[f"with the robot's {both_sides if by_images else robot_side}"] = by_robot
-        if not by_images:
-            variants[f"with the board's {camera_side}"] = replace(loop, camera_from_board=board)
-            variants[f"with all {both_sides}"] = replace(by_robot, camera_from_board=board)
-    return variants
+    for reading in (*ORDERS, CONJUGATED):
+        robot, board = (reading.poses(_stated(loop, side)) for side, _ in SIDES)
+        by_robot = _with_stated(loop, "robot", robot)
+        quaternions = f"quaternions {'conjugated' if reading.conjugated else 'in another order'}: if {reading.held}"
+        order = "xyzw" if reading is LAST else "wxyz"
+        named = "name the columns so; for a file without names of columns give --rotation {}={}"
+        own = [reading.remedy if reading.conjugated else named.format(role, order) for _, role in SIDES]
+        if by_images:
+            yield Candidate(f"with the robot's {quaternions}, {reading.remedy}", partial(replace, by_robot))
+            continue
+        yield Candidate(f"with the robot's {quaternions}, {own[0]}", partial(replace, by_robot))
+        yield Candidate(f"with the board's {quaternions}, {own[1]}", partial(replace, loop, camera_from_board=board))
+        yield Candidate(
+            f"with all {quaternions}, {reading.remedy}", partial(replace, by_robot, camera_from_board=board)
+        )
 
 
-def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
-    """Returns the names that the poses of the inverted side should have. As a board is in front of its camera, the side
-    is known unless the poses have the board in front in both directions."""
-    robot, camera = FRAMES["robot"][1], FRAMES["camera"][1]
-    if by_images:
-        return robot
-    in_front = [bool((poses.translation[:, 2] > 0).all()) for poses in (camera_from_board, camera_from_board.inverse())]
-    if in_front[0] != in_front[1]:
-        return f"{robot} (the board is in front of the camera as read)" if in_front[0] else camera
-    return f"{camera} or {robot}"
-
-
-def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop with either side's lengths in the other unit, by what to do. Residuals show only the ratio of
-    the units; lengths beyond :data:`HALL_MM` tell which side it is."""
-    variants = {}
-    for side, other in (("robot", "board"), ("board", "robot")):
-        factor, which = 1000.0, side
+def _other_units(loop: Loop, by_images: bool) -> Iterator[Candidate]:
+    """Yields the loop with either side's lengths in the other unit. Residuals show only the ratio of the units; lengths
+    beyond :data:`HALL_MM` tell which side it is."""
+    for (side, _), (other, role) in (SIDES, SIDES[::-1]):
+        factor, which, times = 1000.0, side, "times"
         remedy = "if they are metres, name the columns x_m …, or give --length-unit m where none states a unit"
         if side == "board" and by_images:
             remedy = "if the size in its file is in metres, correct that"
         if np.median(np.linalg.norm(_of_side(loop, other).translation, axis=1)) > HALL_MM:
-            factor, which = 1e-3, other
-            role = "robot" if other == "robot" else "camera"
-            remedy = (
-                f"if they are mm, name the columns x_mm …, or give --length-unit {role}=mm where none states a unit"
-            )
-        poses = _of_side(loop, which)
-        scaled = Poses(poses.rotation, factor * poses.translation)
-        times = "times" if factor > 1 else "divided by"
-        variants[f"with the {which}'s lengths {times} 1000: {remedy}"] = (
-            replace(loop, stand_from_mount=scaled) if which == "robot" else replace(loop, camera_from_board=scaled)
-        )
-    return variants
+            factor, which, times = 1e-3, other, "divided by"
+            unit = f"{role}=mm"
+            remedy = f"if they are mm, name the columns x_mm …, or give --length-unit {unit} where none states a unit"
+        name, poses = "stand_from_mount" if which == "robot" else "camera_from_board", _of_side(loop, which)
+        scaled = {name: Poses(poses.rotation, factor * poses.translation)}
+        yield Candidate(f"with the {which}'s lengths {times} 1000: {remedy}", partial(replace, loop, **scaled))
 
 
 def _as_of_radians(loop: Loop, by_images: bool) -> str:
     """Returns the sides whose rotations are as small as radians are that were taken for degrees, in words."""
-    sides = ("robot",) if by_images else ("robot", "board")
     small = []
-    for side in sides:
+    for side, _ in SIDES[: 1 if by_images else 2]:
         rotation = _of_side(loop, side).rotation
-        cosines = (np.trace(rotation @ rotation[0].T, axis1=1, axis2=2) - 1) / 2
-        if np.arccos(np.clip(cosines, -1, 1)).max() < RADIANS_AS_DEGREES:
+        if Rotation.from_matrix(rotation @ rotation[0].T).magnitude().max() < RADIANS_AS_DEGREES:
             small.append(f"the {side}")
     return " and ".join(small)
 
@@ -329,8 +279,7 @@ def _of_side(loop: Loop, side: str) -> Poses:
 def _differ(loop: Loop) -> tuple[float, float]:
     """Returns the RMS deviation of poses from their mean: rad, and mm of flange or board, whichever moved more."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
-    turn = hand.rotation @ mean_pose(hand).rotation.T
-    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    angle = Rotation.from_matrix(hand.rotation @ mean_pose(hand).rotation.T).magnitude()
     shifts = [np.linalg.norm(poses.translation - poses.translation.mean(0), axis=1) for poses in (hand, eye)]
     return float(np.sqrt((angle**2).mean())), float(max(np.sqrt((shift**2).mean()) for shift in shifts))
 
@@ -340,14 +289,6 @@ def _typical(loop: Loop, guess: Guess, with_scale: bool, middle: Callable = np.m
     residuals = loop.residuals(*guess(loop, with_scale)).reshape(-1, 2, 3)
     turn, shift = middle(np.linalg.norm(residuals, axis=2), axis=0)
     return float(turn), float(shift)
-
-
-def _typical_or_far(loop: Loop, guess: Guess, with_scale: bool, middle: Callable = np.median) -> tuple[float, float]:
-    """Returns :func:`_typical`, infinite where the poses give no solution."""
-    try:
-        return _typical(loop, guess, with_scale, middle)
-    except DegenerateError:
-        return np.inf, np.inf
 
 
 ROUNDS = 20

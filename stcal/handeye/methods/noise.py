@@ -115,10 +115,13 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
     """Returns the components at an estimate of X. Covariances of the camera's poses hold the images' noise up to a
     factor, as the intrinsics' errors have the same weak directions; it is estimated where the robot's σ are too."""
     jacobians = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
-    stated = {
-        "robot": _stated(len(loop), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
-        "camera": _stated(len(loop), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
-    }
+    stated = {"robot": loop.robot_covariance, "camera": loop.camera_covariance}
+    for side, (rad, mm) in {
+        "robot": (noise.robot_rad, noise.robot_mm),
+        "camera": (noise.camera_rad, noise.camera_mm),
+    }.items():
+        if stated[side] is None and rad is not None and mm is not None:
+            stated[side] = np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (len(loop), 1, 1))
     known, free = np.zeros((len(loop), 6, 6)), {}
     for side, jacobian in jacobians.items():
         if stated[side] is not None:
@@ -138,15 +141,6 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
         else:
             del free["robot_rad"]
     return LoopComponents(known, np.array(list(free.values())).reshape(-1, len(loop), 6, 6), tuple(free))
-
-
-def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float | None) -> np.ndarray | None:
-    """Returns the covariances of the poses where they have any, else those of one σ for all poses."""
-    if covariance is not None:
-        return covariance
-    if rad is None or mm is None:
-        return None
-    return np.tile(np.diag([rad**2] * 3 + [mm**2] * 3), (m, 1, 1))
 
 
 def variance_components(

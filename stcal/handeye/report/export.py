@@ -1,9 +1,6 @@
-"""Export of a hand-eye transform to files of other programs; each file is read back and compared."""
+"""Export of a hand-eye transform to files of other programs."""
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 from xml.sax.saxutils import quoteattr
 
@@ -11,8 +8,8 @@ import numpy as np
 import yaml
 
 import stcal
-from stcal.errors import InputError, StcalError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.result import HandEye
 from stcal.io.poses.programs import (
@@ -20,19 +17,13 @@ from stcal.io.poses.programs import (
     fixed_joint,
     metres,
     plain_numbers,
-    pose_of_metres,
-    read_ros1_launch,
-    read_ros2_commands,
-    read_ros2_launch,
     require_form,
     ros1_launch,
     ros2_commands,
     ros2_launch,
-    static_of_joint,
     xyzw,
 )
-from stcal.io.table import require_poses_written
-from stcal.io.toml import load_yaml, opencv_matrix
+from stcal.io.toml import opencv_matrix
 
 CAMERA_FRAME = "camera_optical_frame"
 """Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""
@@ -41,6 +32,8 @@ CAMERA_LINK = "camera_link"
 LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """Rotation between both frames, which share their origin: REP 103, suffix frames."""
 CameraFrame = Literal["optical", "link"]
+MOVE_GROUP = {"freehand_robot_movement": True, "move_group": "manipulator", "move_group_namespace": "/"}
+"""What easy_handeye's files hold beside frames and transform, as its own dialogue writes it."""
 
 
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
@@ -101,27 +94,6 @@ def opencv_yaml(result: HandEye) -> str:
     return "\n".join(lines) + "\n"
 
 
-def named(result: HandEye) -> list[Static]:
-    """Returns both transforms of a result."""
-    return [_static(name, pose) for name, pose in result.transforms.items()]
-
-
-def _static(name: str, pose: Rigid) -> Static:
-    parent, _, child = name.partition("_from_")
-    return Static(parent, child, pose)
-
-
-def read_opencv(text: str) -> list[Static]:
-    """Returns the transforms in a text of :func:`opencv_yaml`."""
-    content = load_yaml(text)
-    frames = FRAMES[content["setup"]]
-    matrices = {name: np.reshape(content[name]["data"], (4, 4)) for name in (frames.camera, frames.board)}
-    return [_static(name, Rigid.from_matrix(matrix)) for name, matrix in matrices.items()]
-
-
-IN_HAND = "eye-in-hand"
-
-
 def urdf_joint(transforms: list[Static]) -> str:
     """Returns fixed joints of URDF (m; fixed-axis roll, pitch, yaw, rad); of several ones, in a ``robot`` for
     xacro."""
@@ -132,64 +104,41 @@ def urdf_joint(transforms: list[Static]) -> str:
     return "<robot>\n" + "".join(link + joint for link, joint in zip(links, joints, strict=True)) + "</robot>\n"
 
 
-def read_urdf(text: str) -> list[Static]:
-    """Returns the transforms in a text of :func:`urdf_joint`."""
-    root = ElementTree.fromstring(text)
-    return [static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
-
-
 def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
     """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
-    first = transforms[0]
-    turn = dict(zip(("qx", "qy", "qz", "qw"), xyzw(first.pose), strict=True))
+    turn, place = _rotation(transforms[0]), _place(transforms[0])
     content = {
         "parameters": {
-            "eye_on_hand": result.setup == IN_HAND,
-            "freehand_robot_movement": True,
-            "move_group": "manipulator",
-            "move_group_namespace": "/",
+            "eye_on_hand": result.setup == "eye-in-hand",
+            **MOVE_GROUP,
             "namespace": f"/{name}/",
-            **_robot_frames(result, first),
+            **_robot_frames(result, transforms[0]),
         },
-        "transformation": turn | dict(zip("xyz", metres(first.pose), strict=True)),
+        "transformation": {f"q{axis}": value for axis, value in turn.items()} | place,
     }
     return _commented_yaml(result, transforms, content)
-
-
-def read_easy_handeye(text: str) -> list[Static]:
-    """Returns the transform in a text of :func:`easy_handeye`."""
-    content = load_yaml(text)
-    numbers, frames = content["transformation"], content["parameters"]
-    pose = pose_of_metres([numbers[c] for c in "xyz"], [numbers[f"q{c}"] for c in "xyzw"])
-    return [_static_of_frames(frames, frames["eye_on_hand"], pose)]
 
 
 def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
     """Returns the file ``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
-    first = transforms[0]
     content = {
         "parameters": {
             "name": name,
-            "calibration_type": "eye_in_hand" if result.setup == IN_HAND else "eye_on_base",
-            **_robot_frames(result, first),
-            "freehand_robot_movement": True,
-            "move_group_namespace": "/",
-            "move_group": "manipulator",
+            "calibration_type": "eye_in_hand" if result.setup == "eye-in-hand" else "eye_on_base",
+            **_robot_frames(result, transforms[0]),
+            **MOVE_GROUP,
         },
-        "transform": {
-            "translation": dict(zip("xyz", metres(first.pose), strict=True)),
-            "rotation": dict(zip("xyzw", xyzw(first.pose), strict=True)),
-        },
+        "transform": {"translation": _place(transforms[0]), "rotation": _rotation(transforms[0])},
     }
     return _commented_yaml(result, transforms, content)
 
 
-def read_easy_handeye2(text: str) -> list[Static]:
-    """Returns the transform in a text of :func:`easy_handeye2`."""
-    content = load_yaml(text)
-    numbers, frames = content["transform"], content["parameters"]
-    pose = pose_of_metres([numbers["translation"][c] for c in "xyz"], [numbers["rotation"][c] for c in "xyzw"])
-    return [_static_of_frames(frames, frames["calibration_type"] == "eye_in_hand", pose)]
+def _place(each: Static) -> dict[str, float]:
+    return dict(zip("xyz", metres(each.pose), strict=True))
+
+
+def _rotation(each: Static) -> dict[str, float]:
+    return dict(zip("xyzw", xyzw(each.pose), strict=True))
 
 
 def _robot_frames(result: HandEye, first: Static) -> dict[str, str]:
@@ -204,12 +153,6 @@ def _robot_frames(result: HandEye, first: Static) -> dict[str, str]:
     }
 
 
-def _static_of_frames(frames: dict, in_hand: bool, pose: Rigid) -> Static:
-    return Static(
-        frames["robot_effector_frame" if in_hand else "robot_base_frame"], frames["tracking_base_frame"], pose
-    )
-
-
 def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) -> str:
     lines = said_of(result)
     for each in transforms[1:]:
@@ -218,48 +161,18 @@ def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) ->
     return "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
-SAME_MM, SAME_RAD = 1e-6, 1e-9
-"""Largest deviations of a transform that is read back; the digits printed cause less."""
-
-
-@dataclass(frozen=True, slots=True)
-class Form:
-    """``write`` : text of a result, its named transforms and the file's stem; ``read`` : the transforms of a text."""
-
-    write: Callable[[HandEye, list[Static], str], str]
-    read: Callable[[str], list[Static]]
-
-
-FORMS = {
-    "ros2": Form(lambda result, transforms, _: ros2_commands(transforms, said_of(result)), read_ros2_commands),
-    "moveit": Form(lambda result, transforms, _: ros1_launch(transforms, said_of(result)), read_ros1_launch),
-    "moveit2": Form(lambda result, transforms, _: ros2_launch(transforms, said_of(result)), read_ros2_launch),
-    "easy-handeye": Form(easy_handeye, read_easy_handeye),
-    "easy-handeye2": Form(easy_handeye2, read_easy_handeye2),
+FORMS: dict[str, Callable[[HandEye, list[Static], str], str]] = {
+    "ros2": lambda result, transforms, _: ros2_commands(transforms, said_of(result)),
+    "moveit": lambda result, transforms, _: ros1_launch(transforms, said_of(result)),
+    "moveit2": lambda result, transforms, _: ros2_launch(transforms, said_of(result)),
+    "easy-handeye": easy_handeye,
+    "easy-handeye2": easy_handeye2,
 }
-"""All formats, by the word of ``--export``."""
+"""Writers of all formats, by the word of ``--export``."""
 
 
 def exported(result: HandEye, transforms: list[Static], form: str, name: str = "handeye") -> str:
-    """Returns the text of ``transforms``, of :func:`tree`, in one of :data:`FORMS`, read back and compared; ``name`` :
-    the file's stem, which easy_handeye holds. Raises InputError: the format is unknown, or cannot hold the name of a
-    frame."""
+    """Returns the text of ``transforms``, of :func:`tree`, in one of :data:`FORMS`; ``name`` : the file's stem, which
+    easy_handeye holds. Raises InputError: the format is unknown, or cannot hold the name of a frame."""
     require_form(form, FORMS)
-    text = FORMS[form].write(result, transforms, name)
-    for static, wanted in zip(FORMS[form].read(text), transforms, strict=False):
-        difference = static.pose.inverse() @ wanted.pose
-        same_names = (static.parent, static.child) == (wanted.parent, wanted.child)
-        if not same_names or difference.angle_rad() > SAME_RAD or np.abs(difference.translation).max() > SAME_MM:
-            raise StcalError(
-                "E-EXPORT-READ-BACK", f"--export {form}: the file does not give the transform back; use another form"
-            )
-    return text
-
-
-def require_export_written(path: Path, read: Callable[[str], list[Static]], transforms: list[Static]) -> None:
-    """Reads a written file again, and requires the poses of ``transforms``."""
-
-    def again() -> Poses:
-        return Poses.of(each.pose for each in read(path.read_text(encoding="utf-8")))
-
-    require_poses_written(path, again, Poses.of(each.pose for each in transforms))
+    return FORMS[form](result, transforms, name)

@@ -1,19 +1,17 @@
 """Result file of a hand-eye calibration."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 import stcal
-from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
-from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.remarks import Word
-from stcal.handeye.report.outcome import ArmFound, Outcome, judged
+from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
-from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
-from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
+from stcal.handeye.validate import Compared
+from stcal.io.json import Finite, Matrix, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
 
 class FindingRow(Part):
@@ -27,7 +25,7 @@ class FindingRow(Part):
 
 class VerdictPart(Part):
     word: Word
-    sentence: str
+    sentence: Annotated[str, BeforeValidator(lambda said: said if isinstance(said, str) else said())]
     findings: list[FindingRow]
 
 
@@ -66,55 +64,53 @@ class HeldOutMeans(Part):
     agreeing: dict[str, float] | None
 
 
-class PredictedMotion(Part):
-    first: str
-    second: str
-    rotation_rad: float
-    translation_mm: float
-
-
-class HeldOutMotionRows(Part):
+class HeldOutMotionErrors(Part):
     fitted: int
-    rotation_rad: float
-    translation_mm: float
-    motions: list[PredictedMotion]
+    names: list[tuple[str, str]]
+    rotation_rad: Vector
+    translation_mm: Vector
 
 
 class SeenTurns(Part):
     turns_rad: Vector3
-    axes_flange: Matrix3
+    axes: Matrix3
     sigma_rad: Finite
     sigma_mm: Finite
 
 
 class SplitErrors(Part):
-    poses: list[str]
-    rotation_rad: Vector
-    translation_mm: Vector
-    board_mm: Vector | None = None
-    pose_mm: Vector | None = None
+    rows: Annotated[list[list[int]], BeforeValidator(lambda rows: np.asarray(rows).tolist())]
+    rotation_rad: Matrix
+    translation_mm: Matrix
+    board_mm: Matrix | None
+    pose_mm: Matrix | None
 
 
 class MethodRow(Part):
     method: str
-    reason: str | None
+    reason: str
     held_out: HeldOutMeans | None
     flange_from_camera: Pose | None = None
     base_from_camera: Pose | None = None
     base_from_board: Pose | None = None
     flange_from_board: Pose | None = None
-    splits: list[SplitErrors]
+    splits: SplitErrors | None
+
+
+class Way(Part):
+    method: str
+    camera: bool
+    scale: bool
 
 
 class TriedRow(Part):
-    way: str
-    splits: int
-    error_mm: Finite
-    reason: str | None
+    candidate: Way
+    mean_mm: Finite
+    reason: str
 
 
 class ChoicePart(Part):
-    chosen: str
+    chosen: Way
     sentence: str
     tried: list[TriedRow]
 
@@ -189,10 +185,10 @@ class HandEyeFile(ResultFile):
         "from those by "
         "the pose that the image gives alone; `agreeing`: the same means without `outliers`, null where there are none"
     )
-    motions_held_out: HeldOutMotionRows | None = Field(
+    motions: HeldOutMotionErrors | None = Field(
         None,
-        description="with `--motions-held-out`: number of `fitted` motions; means `rotation_rad`, `translation_mm` of "
-        "X B X⁻¹ against A over the others, and of each of the `motions`, which lead from pose `first` to `second`",
+        description="with `--motions-held-out`: number of `fitted` motions; `names` of the poses from which and to "
+        "which each other motion leads, and errors `rotation_rad`, `translation_mm` of X B X⁻¹ against A",
     )
     arm: ArmPart | None = Field(
         None,
@@ -203,9 +199,9 @@ class HandEyeFile(ResultFile):
     )
     choice: ChoicePart | None = Field(
         None,
-        description="where no method was named: the way of solving that was `chosen` by errors on poses held out, a "
-        "`sentence` on it, and all that were `tried`: `way` (method, with camera and scale solved for), `splits`, mean "
-        "`error_mm` (3-D at the board; of poses, of the board's origin), `reason` why it fails",
+        description="where no method was named: the way of solving that was `chosen` by errors on poses held out "
+        "(`method`, and whether `camera` and `scale` were solved for), a `sentence` on it, and all that were `tried`: "
+        "`candidate`, `mean_mm` (3-D at the board; of poses, of the board's origin), `reason` why it fails",
     )
     time_offset: TimeOffsetPart | None = Field(
         None,
@@ -214,159 +210,72 @@ class HandEyeFile(ResultFile):
         "`speed_mm_s`, `speed_rad_s` of the flange at the images",
     )
     observability: SeenTurns | None = Field(
-        description="`turns_rad` RMS between poses about the principal `axes_flange`; `sigma_rad`, `sigma_mm` of the "
-        "worst direction from poses of a common camera (1 mrad, 0.5 mm)"
+        description="`turns_rad` RMS between poses about the principal `axes`, rows, of the flange; `sigma_rad`, "
+        "`sigma_mm` of the worst direction from poses of a common camera (1 mrad, 0.5 mm)"
     )
     notes: list[str] = Field(description="what should be known about the result")
     understood: list[str] = Field(
         [], description="only of files of other programs: what each was taken for, a sentence each"
     )
-    splits: list[SplitErrors] = Field(
-        [],
-        description="only in `--json`: names of the `poses` held out, and the errors of each: `rotation_rad`, "
-        "`translation_mm`, `board_mm`, `pose_mm`",
+    splits: SplitErrors | None = Field(
+        None,
+        description="only in `--json`: `rows` of `poses` that each split held out, and the errors of each: "
+        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`",
     )
     methods: list[MethodRow] = Field(
         [],
         description="only in `--json`, with `--method all`: `method`, `X` and `Z` (`flange_from_camera`, "
-        "`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out` and `splits` with `poses`, "
-        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing` as above; `reason` where it fails",
+        "`base_from_board`, or `base_from_camera`, `flange_from_board`); `held_out`, with `splits`, `poses`, "
+        "`rotation_rad`, `translation_mm`, `board_mm`, `pose_mm`, `agreeing`, and `splits`, with `rows`, as above; "
+        "`reason` where it fails",
     )
 
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
         """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
-        found, seen = judged(outcome), outcome.result.observability
-        result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
-        poses = {name: pose.matrix() for name, pose in result.transforms.items()}
-        compared = [_method(each, names) for each in outcome.compared]
-        optional: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
-        optional |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
-        optional |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
-        optional |= {} if outcome.time_offset is None else {"time_offset": outcome.time_offset}
-        optional |= {"understood": outcome.understood} if outcome.understood else {}
-        optional |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
+        result, arm, held_out = outcome.result, outcome.arm, outcome.held_out
+        optional = {name: getattr(outcome, name) for name in ("motions", "choice", "time_offset", "understood")}
+        if arm is not None:
+            parts = {"robot": arm.robot, "parameters": arm.parameters, "sigma": arm.sigma}
+            optional["arm"] = parts | {"plain": arm.plain and arm.plain.summary()}
+        if whole:
+            optional |= {"splits": held_out, "methods": [_method(each, len(result.names)) for each in outcome.compared]}
         return cls.model_validate(
             {
                 "format": "stcal handeye 1",
                 "version": stcal.__version__,
                 "where": outcome.where,
-                "verdict": {"word": found.word, "sentence": found.sentence(), "findings": found.findings},
+                "verdict": judged(outcome),
                 "setup": result.setup,
                 "method": result.method,
-                **poses,
+                **result.transforms,
                 "covariance": result.covariance,
-                f"{board}_covariance": result.stand_covariance,
-                "board": board_part(outcome),
-                "camera": camera_part(outcome),
+                f"{FRAMES[result.setup].board}_covariance": result.stand_covariance,
+                "board": {"scale": result.scale, "scale_sigma": result.sigma_scale, "pitch_mm": outcome.true_pitch_mm},
+                "camera": outcome.camera,
                 "sigma": result.sigma,
                 "estimated": result.estimated,
                 "corner_px_is_factor": outcome.own_sigmas,
                 "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
-                "poses": poses_part(result),
+                "poses": [_pose(result, i) for i in range(len(result.names))],
                 "outliers": outcome.outliers(),
-                "left_out": [NamedReason(name=name, reason=reason) for name, reason in outcome.left_out],
-                "held_out": _held_out(outcome.held_out, result.outliers),
-                "observability": seen
-                and {
-                    "turns_rad": seen.turns_rad,
-                    "axes_flange": seen.axes,
-                    "sigma_rad": seen.sigma_rad,
-                    "sigma_mm": seen.sigma_mm,
-                },
+                "left_out": [{"name": name, "reason": reason} for name, reason in outcome.left_out],
+                "held_out": held_out and held_out.summary(result.outliers),
+                "observability": result.observability,
                 "notes": outcome.all_notes(),
-                **optional,
+                **{name: value for name, value in optional.items() if value},
             }
         )
 
 
-def board_part(outcome: Outcome) -> BoardSize:
-    result = outcome.result
-    pitch = None if outcome.pitch_mm is None else outcome.pitch_mm * result.scale
-    return BoardSize(scale=result.scale, scale_sigma=result.sigma_scale, pitch_mm=pitch)
+def _pose(result: HandEye, i: int) -> dict:
+    off, adjusted = result.residuals[i], result.reprojection
+    row = {"name": result.names[i], "used": not result.outliers[i], "rotation_rad": off[:3], "translation_mm": off[3:]}
+    return row if adjusted is None else row | {"corner_rms_px": adjusted.rms_px(i)}
 
 
-def camera_part(outcome: Outcome) -> AdjustedCamera | None:
-    adjustment = outcome.result.reprojection
-    if adjustment is None or adjustment.camera_covariance is None:
-        return None
-    names, sigma = parameter_names(outcome.colmap_model), np.sqrt(np.diag(adjustment.camera_covariance))
-    return AdjustedCamera(
-        model=outcome.colmap_model,
-        parameters=dict(zip(PARAMETER_NAMES, adjustment.camera.parameters(), strict=True)),
-        sigma=dict(zip(names, sigma, strict=True)),
-    )
-
-
-def poses_part(result: HandEye) -> list[PoseRow]:
-    rows = []
-    for i, (name, off) in enumerate(zip(result.names, result.residuals, strict=True)):
-        rms = {} if result.reprojection is None else {"corner_rms_px": result.reprojection.rms_px(i)}
-        row = {"name": name, "used": not result.outliers[i], "rotation_rad": off[:3], "translation_mm": off[3:]}
-        rows.append(PoseRow.model_validate(row | rms))
-    return rows
-
-
-def _held_out(found: HeldOutPoses | None, outliers: np.ndarray) -> HeldOutMeans | None:
-    if found is None:
-        return None
-    splits, poses = found.rows.shape
-    agreeing = (found.means(~outliers) or None) if outliers.any() else None
-    return HeldOutMeans(splits=splits, poses=poses, **found.means(), agreeing=agreeing)
-
-
-def _motions(found: HeldOutMotions) -> HeldOutMotionRows:
-    errors = zip(found.rotation_rad.tolist(), found.translation_mm.tolist(), strict=True)
-    return HeldOutMotionRows(
-        fitted=found.fitted,
-        rotation_rad=float(found.rotation_rad.mean()),
-        translation_mm=float(found.translation_mm.mean()),
-        motions=[
-            PredictedMotion(first=first, second=second, rotation_rad=turn, translation_mm=shift)
-            for (first, second), (turn, shift) in zip(found.names, errors, strict=True)
-        ],
-    )
-
-
-def _choice(found: Choice) -> ChoicePart:
-    tried = [
-        TriedRow(
-            way=candidate.candidate.name,
-            splits=len(candidate.error_mm),
-            error_mm=candidate.mean_mm() if candidate.error_mm.size else None,
-            reason=candidate.reason or None,
-        )
-        for candidate in found.tried
-    ]
-    return ChoicePart(chosen=found.chosen.name, sentence=found.sentence, tried=tried)
-
-
-def _arm(found: ArmFound) -> ArmPart:
-    return ArmPart(
-        robot=found.robot,
-        parameters=dict(zip(found.names, found.parameters.tolist(), strict=True)),
-        sigma=dict(zip(found.names, found.sigma.tolist(), strict=True)),
-        plain=_held_out(found.plain, np.zeros(0, bool)),
-    )
-
-
-def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:
-    """Returns the held-out poses of each split, and the errors on each."""
-    if found is None:
-        return []
-    return [
-        SplitErrors(poses=[names[i] for i in row], **{kind: getattr(found, kind)[k] for kind in found.means()})
-        for k, row in enumerate(found.rows)
-    ]
-
-
-def _method(each: Compared, names: tuple[str, ...]) -> MethodRow:
-    bad = np.zeros(len(names), bool) if each.result is None else each.result.outliers
-    transforms = {} if each.result is None else each.result.transforms
-    return MethodRow(
-        method=each.method,
-        reason=each.reason or None,
-        held_out=_held_out(each.held_out, bad),
-        **{name: pose.matrix() for name, pose in transforms.items()},
-        splits=_splits(each.held_out, names),
-    )
+def _method(each: Compared, count: int) -> dict:
+    result, held_out = each.result, each.held_out
+    bad, transforms = (np.zeros(count, bool), {}) if result is None else (result.outliers, result.transforms)
+    means = held_out and held_out.summary(bad)
+    return {"method": each.method, "reason": each.reason, "held_out": means, "splits": held_out, **transforms}

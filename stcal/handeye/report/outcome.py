@@ -2,11 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import f
 
+from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import skew
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
@@ -23,15 +23,13 @@ from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 class ArmFound:
     """The arm's parameters, if they were solved for.
 
-    ``robot`` : name of the robot; ``names`` : names of the k parameters: small motions of the axes, such as J2 ry in
-    rad, J2 x in mm; ``parameters``, ``sigma`` : (k,) deviation of the axes from the robot's file, and its σ; ``plain``
-    : errors on the same held-out poses, of the solution without these parameters.
+    ``robot`` : name of the robot; ``parameters``, ``sigma`` : by name, such as J2 ry in rad, J2 x in mm, small motions
+    of the axes about the robot's file, and their σ; ``plain`` : errors on the same held-out poses without them.
     """
 
     robot: str
-    names: tuple[str, ...]
-    parameters: np.ndarray
-    sigma: np.ndarray
+    parameters: dict[str, float]
+    sigma: dict[str, float]
     plain: HeldOutPoses | None = None
 
 
@@ -54,7 +52,6 @@ class Outcome:
     choice : the candidates that were tried, if no method was named
     pairs : the pairs that were solved, after repair of the numbering of a symmetric board
     views : the corners after the same repair, if there were images
-    folder : folder of the images; the pairs hold their names
     understood : how files of other programs were interpreted
     arm : the arm's parameters, if they were solved for
     time_offset : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ
@@ -73,7 +70,6 @@ class Outcome:
     choice: Choice | None = None
     pairs: HandEyePoses | None = None
     views: Views | None = None
-    folder: Path | None = None
     understood: tuple[str, ...] = ()
     arm: ArmFound | None = None
     time_offset: TimeOffset | None = None
@@ -98,14 +94,23 @@ class Outcome:
         """Returns the names of the poses that contradict the others."""
         return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
 
-    def flips(self) -> tuple[str, ...]:
-        """Returns the names of the outliers that agree with the others when they are tilted the other way."""
-        result = self.result
-        if self.pairs is None or not result.outliers.any():
-            return ()
-        loop = Loop.of(self.pairs, result.setup)
-        tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
-        return tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
+    @property
+    def true_pitch_mm(self) -> float | None:
+        """Pitch of dots or squares in the board's true size."""
+        return None if self.pitch_mm is None else self.pitch_mm * self.result.scale
+
+    @property
+    def camera(self) -> dict | None:
+        """COLMAP ``model``, ``parameters`` and their ``sigma`` by name, of intrinsics that were solved for."""
+        found = self.result.reprojection
+        if found is None or found.camera_covariance is None:
+            return None
+        parameters, sigma = found.camera.parameters(), np.sqrt(np.diag(found.camera_covariance))
+        return {
+            "model": self.colmap_model,
+            "parameters": dict(zip(PARAMETER_NAMES, parameters, strict=True)),
+            "sigma": dict(zip(parameter_names(self.colmap_model), sigma, strict=True)),
+        }
 
 
 SUSPICIOUS, FAILED = 1e-3, 1e-5
@@ -187,14 +192,12 @@ def _of_prediction(outcome: Outcome) -> Finding | None:
     dof = equations / 2, (equations - unknowns) / 2
     limits = [fitted * float(np.sqrt(expected * f.ppf(1 - odds, *dof))) for odds in (SUSPICIOUS, FAILED)]
     word = _word(error, *limits)
-    said = f"poses held out are missed by {error:.3g} mm (RMS), as the residuals of {fitted:.3g} mm promise"
+    promise = f"as the residuals of {fitted:.3g} mm promise"
     if word != GOOD:
-        said = (
-            f"poses held out are missed by {error:.3g} mm (RMS), where the residuals of {fitted:.3g} mm promise "
-            f"{fitted * np.sqrt(expected):.3g} mm"
-        )
-    remedy = "take more poses, and look for poses that do not belong to the others" if word != GOOD else ""
-    return Finding(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
+        promise = f"where the residuals of {fitted:.3g} mm promise {fitted * np.sqrt(expected):.3g} mm"
+    said = f"poses held out are missed by {error:.3g} mm (RMS), {promise}"
+    remedy = "take more poses, and look for poses that do not belong to the others"
+    return _graded(title, word, said, f"{error:.3g} mm", f"{limits[0]:.3g} mm", remedy)
 
 
 def _of_share(outcome: Outcome) -> Finding | None:
@@ -210,8 +213,8 @@ def _of_share(outcome: Outcome) -> Finding | None:
         f"σ of {FRAMES[outcome.result.setup].camera}{alone} is {sigma:.2g} mm where the board was ({distance:.0f} mm "
         f"away), the error of a single pose {shift:.2g} mm (RMS)"
     )
-    remedy = "take more poses, and turn the flange more, about two axes" if word != GOOD else ""
-    return Finding("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
+    remedy = "take more poses, and turn the flange more, about two axes"
+    return _graded("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
 
 
 def _of_common_errors(outcome: Outcome) -> Finding | None:
@@ -231,8 +234,8 @@ def _of_common_errors(outcome: Outcome) -> Finding | None:
         f"errors that all poses of the board have in common add {sigma:.2g} mm to the σ of "
         f"{FRAMES[outcome.result.setup].camera} where the board was ({distance:.0f} mm away)"
     )
-    remedy = "calibrate the camera better, or solve from the images: more poses do not help" if word != GOOD else ""
-    return Finding(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
+    remedy = "calibrate the camera better, or solve from the images: more poses do not help"
+    return _graded(title, word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
 
 
 def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
@@ -272,8 +275,8 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
-    remedy = observability.missing() if word != GOOD else ""
-    return Finding("Motions of the flange", word, said, f"{ratio:.2f} × σ of a pose", f"{AS_ONE:g}", remedy)
+    value = f"{ratio:.2f} × σ of a pose"
+    return _graded("Motions of the flange", word, said, value, f"{AS_ONE:g}", observability.missing())
 
 
 def _of_size(outcome: Outcome) -> Finding | None:
@@ -288,30 +291,30 @@ def _of_size(outcome: Outcome) -> Finding | None:
 
 def _of_outliers(outcome: Outcome) -> Finding:
     """Judges the number of outliers; one good set in a hundred has an outlier."""
-    bad, count = outcome.outliers(), len(outcome.result.names)
-    word = GOOD if not bad else BAD if len(bad) > MANY * count else CARE
-    said = f"none of {count} poses contradicts the others"
+    result, bad, count = outcome.result, outcome.outliers(), len(outcome.result.names)
     if not bad:
-        return Finding("Outliers", word, said, "0", "0")
-    flips = outcome.flips()
-    said, remedy = f"{_counted(bad, count)} the others: {_few(bad)}", "look at these poses"
+        return Finding("Outliers", GOOD, f"none of {count} poses contradicts the others", "0", "0")
+    said, others, flips = [], bad, ()
+    if outcome.pairs is not None:
+        loop = Loop.of(outcome.pairs, result.setup)
+        tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
+        flips = tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
     if flips:
-        said = f"{len(flips)} of {count} poses are tilted the other way, as the second pose of a flat target is: "
-        said += _few(flips)
-        if others := tuple(name for name in bad if name not in flips):
-            said += f"; {_counted(others, count)} the others: {_few(others)}"
-            remedy = f"look at {_few(others)}"
-    remedy += ": moved while the image was taken, or paired with another image"
-    if len(flips) == len(bad):
-        remedy = ""
-    if flips:
-        undo = "solve with --undo-flips, which takes the other tilt, or give images instead of the board's poses"
-        remedy = "; ".join(part for part in (undo if outcome.views is None else "", remedy) if part)
-    return Finding("Outliers", word, said, str(len(bad)), "0", remedy)
-
-
-def _counted(bad: Sequence[str], count: int) -> str:
-    return f"{len(bad)} of {count} poses contradict{'s' * (len(bad) == 1)}"
+        others = tuple(name for name in bad if name not in flips)
+        tilt = "poses are tilted the other way, as the second pose of a flat target is"
+        said.append(f"{len(flips)} of {count} {tilt}: {_few(flips)}")
+    if others:
+        said.append(f"{len(others)} of {count} poses contradict{'s' * (len(others) == 1)} the others: {_few(others)}")
+    remedies = []
+    if flips and outcome.views is None:
+        remedies.append(
+            "solve with --undo-flips, which takes the other tilt, or give images instead of the board's poses"
+        )
+    if others:
+        which = _few(others) if flips else "these poses"
+        remedies.append(f"look at {which}: moved while the image was taken, or paired with another image")
+    word = BAD if len(bad) > MANY * count else CARE
+    return Finding("Outliers", word, "; ".join(said), str(len(bad)), "0", "; ".join(remedies))
 
 
 def _few(names: Sequence[str]) -> str:
@@ -326,6 +329,10 @@ def of_notes(notes: Iterable[str]) -> list[Finding]:
             said, _, remedy = note.partition(": ")
             findings.append(Finding("Note", BAD if isinstance(note, Grave) else CARE, said, remedy=remedy))
     return findings
+
+
+def _graded(title: str, word: Word, said: str, value: str, limit: str, remedy: str) -> Finding:
+    return Finding(title, word, said, value, limit, remedy if word != GOOD else "")
 
 
 def _word(value: float, care: float, bad: float) -> Word:

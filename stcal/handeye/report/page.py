@@ -1,7 +1,5 @@
 """Report of a hand-eye calibration."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from stcal.geometry.rigid import Rigid
@@ -12,20 +10,15 @@ from stcal.handeye.report.figures import (
     BAD,
     GOOD,
     by_robot,
-    corner_figure,
     enlargement,
     image_coverage,
     image_figure,
-    overlays,
     pose_bars,
-    turns_between,
-    turns_figure,
 )
-from stcal.handeye.report.file import camera_part
 from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
-from stcal.handeye.validate import Compared, HeldOutMotions
+from stcal.handeye.validate import HeldOutMotions
 from stcal.report.document import (
     Block,
     Document,
@@ -40,7 +33,6 @@ from stcal.report.document import (
     macro,
     page_only,
     plot,
-    plots,
     sentence,
     subheading,
     tiles,
@@ -70,26 +62,6 @@ SIGMA_NAMES = {
 }
 
 
-def scale_text(outcome: Outcome, sigma_scale: float) -> str:
-    """Returns the estimated size of the board and its σ, in words."""
-    result = outcome.result
-    text = f"board: {result.scale:.5f} ± {sigma_scale:.5f} times its stated size"
-    if outcome.pitch_mm is None:
-        return text
-    pitch, sigma = outcome.pitch_mm * result.scale, outcome.pitch_mm * sigma_scale
-    return f"{text}: pitch {pitch:.4f} ± {sigma:.4f} mm, stated {outcome.pitch_mm:g} mm"
-
-
-def _headline(outcome: Outcome) -> str:
-    result, bad = outcome.result, outcome.outliers()
-    without = (
-        f", without {len(bad)} that contradict{'s' * (len(bad) == 1)} them: {', '.join(map(spoken, bad))}"
-        if bad
-        else ""
-    )
-    return f"{result.setup}, {result.method}: {len(result.names) - len(bad)} poses{without}"
-
-
 def _splits_text(outcome: Outcome) -> str:
     every = (outcome.held_out, *(each.held_out for each in outcome.compared))
     known = [found.rows.shape for found in every if found is not None]
@@ -117,30 +89,24 @@ def sigma_rows(outcome: Outcome) -> list[list[str]]:
     return rows
 
 
-def _off(each: Compared, result: HandEye) -> list[str]:
-    if each.result is None:
-        return [NONE, NONE]
-    off = result.mount_from_camera.inverse() @ each.result.mount_from_camera
-    return [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
-
-
 def outcome_report(outcome: Outcome) -> Document:
     """Returns the report of ``handeye``."""
-    result, frames = outcome.result, FRAMES[outcome.result.setup]
+    result, frames, found = outcome.result, FRAMES[outcome.result.setup], judged(outcome)
     turn, shift = result.rms()
-    covariances, bad, seen = (result.covariance, result.stand_covariance), result.outliers, result.observability
+    covariances, bad, seen = (result.covariance, result.stand_covariance), outcome.outliers(), result.observability
     held_out = []
     if outcome.held_out is not None:
         held_out = [f"held out ({_splits_text(outcome)}), mean: {means_text(outcome.held_out.means())}"]
-        if bad.any() and (agreeing := outcome.held_out.means(~bad)):
-            held_out.append(f"held out, mean without the {bad.sum()} left out above: {means_text(agreeing)}")
+        if bad and (agreeing := outcome.held_out.means(~result.outliers)):
+            held_out.append(f"held out, mean without the {len(bad)} left out above: {means_text(agreeing)}")
     turns = ", ".join(f"{turn:.1f}°" for turn in np.degrees(seen.turns_rad)) if seen else ""
+    asides = [note for note in outcome.all_notes() if isinstance(note, Aside)]
     answer: list[Block] = [
         tiles(_tiles(outcome)),
         *(
             block
             for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True)
-            for block in transform_blocks(name, pose, covariance)
+            for block in _transform(name, pose, covariance)
         ),
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
@@ -148,25 +114,27 @@ def outcome_report(outcome: Outcome) -> Document:
         *held_out,
         outcome.sentence(),
         Table(["<what errs, and by how much", "σ", "<"], sigma_rows(outcome)),
-        "" if result.sigma_scale is None else scale_text(outcome, result.sigma_scale),
+        _scale_text(outcome),
         f"the flange turns between poses by {turns} (RMS) about its principal axes" if turns else "",
         fold(
             "Camera, as adjusted (first pixel's centre at 0, 0)",
-            Table(["<", "value", "± σ", "<unit"], adjusted(outcome)),
+            Table(["<", "value", "± σ", "<unit"], _adjusted(outcome)),
         ),
-        *remark_blocks([note for note in outcome.all_notes() if isinstance(note, Aside)], outcome.understood),
-        findings_fold(judged(outcome)),
+        *([subheading("To know"), bullets(asides)] if asides else []),
+        *([subheading("What the files were taken for"), bullets(outcome.understood)] if outcome.understood else []),
+        _findings(found),
     ]
     heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
-    rows, contradicting = pose_rows(result), "left out, contradicting the others"
+    rows = _pose_rows(result)
     poses: list[Block] = [
-        legend({"used": GOOD, contradicting: BAD} if outcome.outliers() else {}),
-        macro("pose_chart", lambda: pose_bars(result), "By how much the chain through each pose misses the board"),
+        legend({"used": GOOD, "left out, contradicting the others": BAD} if bad else {}),
+        plot(lambda: pose_bars(result), "By how much the chain through each pose misses the board"),
         fold(f"{len(rows)} poses", Table(heads, rows)),
     ]
+    without = f", without {len(bad)} that contradict{'s' * (len(bad) == 1)} them: " + ", ".join(map(spoken, bad))
     return Document(
         f"Hand-eye calibration: {frames.camera}",
-        f"{outcome.where}: {_headline(outcome)}",
+        f"{outcome.where}: {result.setup}, {result.method}: {len(rows) - len(bad)} poses{without if bad else ''}",
         [
             Section("Result", answer, terminal=True),
             Section("What was tried", _tried(outcome.choice), terminal=True),
@@ -174,12 +142,19 @@ def outcome_report(outcome: Outcome) -> Document:
             Section("Methods", _methods(outcome), terminal=True),
             Section("Motions held out", _motions(outcome.motions), terminal=True),
             Section("Poses", poses),
-            Section("Coverage of the image", [Html(lambda: html(*coverage_blocks(outcome)))]),
+            Section("Coverage of the image", [Html(lambda: html(*_coverage(outcome)))]),
             Section("What the motions tell", _turns(outcome)),
-            Section("Overlays", photograph_blocks(outcome)),
             Section("Left out", [page_only(Table(["<image", "<reason"], outcome.left_out))]),
         ],
-        banner=verdict_blocks(judged(outcome)),
+        banner=[
+            Printed([f"verdict: {found.sentence()}", *(f"what to do: {remedy}" for remedy in found.remedies())]),
+            macro(
+                "judged",
+                found.word,
+                tone_of(found.word),
+                [sentence(": ".join(filter(None, (each.said, each.remedy)))) for each in found.reasons()],
+            ),
+        ],
     )
 
 
@@ -194,26 +169,14 @@ CHANCE = (
 )
 
 
-def verdict_blocks(found: Verdict) -> list[Block]:
-    """Returns the verdict with its reasons and remedies."""
-    reasons = [sentence(": ".join(filter(None, (finding.said, finding.remedy)))) for finding in found.reasons()]
-    printed = [f"verdict: {found.sentence()}", *(f"what to do: {remedy}" for remedy in found.remedies())]
-    return [Printed(printed), macro("judged", found.word, tone_of(found.word), reasons)]
-
-
-def findings_fold(found: Verdict) -> Block:
+def _findings(found: Verdict) -> Block:
     """Returns the findings that the verdict rests on, folded."""
     rows = [[f.title, VerdictWord(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
     table = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], rows, css="text")
     return fold("What the verdict rests on", table, CHANCE)
 
 
-def remark_blocks(notes: Sequence[str], understood: Sequence[str]) -> list[Block]:
-    blocks: list[Block] = [subheading("To know"), bullets(notes)] if notes else []
-    return blocks + ([subheading("What the files were taken for"), bullets(understood)] if understood else [])
-
-
-def transform_blocks(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
+def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
     """Returns a transform with σ, and its matrix, folded."""
     matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
     table = Table(["<" + name, *HEADS[1:]], transform_rows(pose, covariance))
@@ -227,7 +190,7 @@ def _tried(choice: Choice | None) -> list[Block]:
     rows = [
         [
             each.candidate.name,
-            number(each.mean_mm(), 3),
+            number(each.mean_mm, 3),
             str(len(each.error_mm)),
             "taken" if each.candidate == choice.chosen else each.reason,
         ]
@@ -249,10 +212,10 @@ def _arm(arm: ArmFound | None) -> list[Block]:
     if arm is None:
         return []
     cells_of_axis: dict[str, list[str]] = {}
-    for name, value, sigma in zip(arm.names, arm.parameters, arm.sigma, strict=True):
+    for name, value in arm.parameters.items():
         axis, component = name.split()
         unit, factor, digits = ("°", np.degrees(1.0), 4) if component.startswith("r") else ("mm", 1.0, 3)
-        text = f"{component} {number(value * factor, digits)} ± {number(sigma * factor, digits)} {unit}"
+        text = f"{component} {number(value * factor, digits)} ± {number(arm.sigma[name] * factor, digits)} {unit}"
         cells_of_axis.setdefault(axis, []).append(text)
     width = max(len(cells) for cells in cells_of_axis.values())
     rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in cells_of_axis.items()]
@@ -271,11 +234,17 @@ def _methods(outcome: Outcome) -> list[Block]:
     if not outcome.compared:
         return []
     kinds = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
-    rows = []
+    inverse, rows = outcome.result.mount_from_camera.inverse(), []
     for each in outcome.compared:
         means = each.held_out.means() if each.held_out else {}
         cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
-        rows.append([each.method, *cells, *_off(each, outcome.result), each.reason])
+        off = None if each.result is None else inverse @ each.result.mount_from_camera
+        far = (
+            [NONE, NONE]
+            if off is None
+            else [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
+        )
+        rows.append([each.method, *cells, *far, each.reason])
     heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"]
     if not any(row[-1] for row in rows):
         heads, rows = heads[:-1], [row[:-1] for row in rows]
@@ -309,7 +278,7 @@ def _motions(motions: HeldOutMotions | None) -> list[Block]:
     ]
 
 
-def coverage_blocks(outcome: Outcome) -> list[Block]:
+def _coverage(outcome: Outcome) -> list[Block]:
     """Returns how much of the image the board covered, with the residuals over it."""
     views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
     if views is None or pairs is None:
@@ -318,72 +287,49 @@ def coverage_blocks(outcome: Outcome) -> list[Block]:
         measured = np.concatenate([view.xy_px for view in views.views])
         residuals = np.concatenate(by_robot(outcome.result, pairs, views)) - measured
     else:
-        used = [views.views[i].xy_px for i in np.unique(board.view)]
-        measured, residuals = np.concatenate(used), board.residuals_px
+        measured = np.concatenate([views.views[i].xy_px for i in np.unique(board.view)])
+        residuals = board.residuals_px
     finite = np.isfinite(residuals).all(1)
-    size, residuals = (views.camera.width, views.camera.height), residuals[finite]
-    counts, factor = image_coverage(views), enlargement(residuals, views.camera.width)
+    size, counts = (views.camera.width, views.camera.height), image_coverage(views)
     by = "the adjustment" if board is not None else "robot and transforms"
+    factor = enlargement(residuals[finite], size[0])
     return [
         f"The board lay over {(counts > 0).mean():.0%} of the image in one photograph or another. Where it never was, "
         "nothing checks the distortion of the lens",
-        plots(
-            plot(
-                lambda: image_figure(size, counts, measured[finite], residuals),
-                "coverage of the image",
-                f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
-                "",
-            ),
-            None
-            if board is None
-            else plot(
-                lambda: corner_figure(board), "residuals of corners", "Corners: projected minus seen; circle: 95 %", ""
-            ),
+        plot(
+            lambda: image_figure(size, counts, measured[finite], residuals[finite]),
+            "coverage of the image",
+            f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
+            "",
         ),
     ]
 
 
 def _turns(outcome: Outcome) -> list[Block]:
     """Returns what the rotations between poses tell of the transform."""
-    pairs, observability = outcome.pairs, outcome.result.observability
-    if observability is None:
+    seen = outcome.result.observability
+    if seen is None:
         return []
-    picture = (
-        "Left: the axes about which the flange turned between two poses each, in its own frame, on a half sphere seen "
-        "along Z (equal areas; circles: 30° and 60° from Z); 1, 2, 3: the principal axes. Right: by how much it turned"
-    )
     rows = [
         [str(i), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
-        for i, (axis, turn) in enumerate(zip(observability.axes, observability.turns_rad, strict=True), 1)
+        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True), 1)
     ]
     return [
-        plot(lambda: turns_figure(turns_between(pairs), observability), "rotations between poses", picture)
-        if pairs
-        else None,
         Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
         "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "
         "transform is known well if the second rotation is large. If it is 0, the camera's place is undetermined "
         "along the first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
-        f"{np.degrees(observability.sigma_rad):.3f}° and {observability.sigma_mm:.2f} mm in the worst direction",
+        f"{np.degrees(seen.sigma_rad):.3f}° and {seen.sigma_mm:.2f} mm in the worst direction",
     ]
 
 
-def photograph_blocks(outcome: Outcome) -> list[Block]:
-    """Returns some photographs with their corners; read when the page is written."""
-    pairs, views, folder = outcome.pairs, outcome.views, outcome.folder
-    if pairs is None or views is None or folder is None:
-        return []
-
-    def photographs():
-        shown, missing = overlays(outcome.result, pairs, views, folder)
-        explained = (
-            "Circles: corners as measured. Lines lead to where they would be by the robot's pose as it was reported "
-            "and the transforms above, enlarged: the combined error of robot, transforms, camera and board"
-        )
-        pictures = plots(*(macro("corner_photo", photo) for photo in shown))
-        return html(explained if shown else "", pictures, *missing)
-
-    return [Html(photographs)]
+def _scale_text(outcome: Outcome) -> str:
+    """Returns the estimated size of the board and its σ, in words; empty where it was not solved for."""
+    scale, sigma, pitch = outcome.result.scale, outcome.result.sigma_scale, outcome.pitch_mm
+    if sigma is None:
+        return ""
+    text = f"board: {scale:.5f} ± {sigma:.5f} times its stated size"
+    return text if pitch is None else f"{text}: pitch {pitch * scale:.4f} ± {pitch * sigma:.4f} mm, stated {pitch:g} mm"
 
 
 def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
@@ -405,26 +351,24 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         said = f"robot's clock minus camera's, ± {1e3 * offset.sigma_s:.2g} ms"
         headline.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
     if result.sigma_scale is not None:
-        pitch = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
+        pitch = "" if outcome.true_pitch_mm is None else f": pitch {outcome.true_pitch_mm:.3f} mm"
         what = f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}"
         headline.append((f"{result.scale:.4f}", "", what))
     return headline
 
 
-def adjusted(outcome: Outcome) -> list[list[str]]:
+def _adjusted(outcome: Outcome) -> list[list[str]]:
     """Returns rows of the camera's parameters; none if they were not adjusted."""
-    camera, rows = camera_part(outcome), []
-    if camera is None:
-        return []
-    for name, value in camera.parameters.items():
-        sigma = camera.sigma.get(name, camera.sigma.get("f") if name in ("fx", "fy") else None)
+    camera, rows = outcome.camera or {"parameters": {}}, []
+    for name, value in camera["parameters"].items():
+        sigma = camera["sigma"].get(name, camera["sigma"].get("f") if name in ("fx", "fy") else None)
         if value or sigma:
             digits, unit = (3, "px") if name[0] in "fc" else (6, "")
             rows.append([name, number(value, digits), number(sigma, digits), unit])
     return rows
 
 
-def pose_rows(result: HandEye) -> list[list[str]]:
+def _pose_rows(result: HandEye) -> list[list[str]]:
     turn, shift = (np.linalg.norm(part, axis=1) for part in (result.residuals[:, :3], result.residuals[:, 3:]))
     rows = []
     for i, name in enumerate(result.names):

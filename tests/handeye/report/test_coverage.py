@@ -8,16 +8,11 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.views import View, Views, pairs_of_views
-from stcal.handeye.report.figures import (
-    by_robot,
-    equal_area,
-    image_coverage,
-    turns_between,
-)
+from stcal.handeye.report.figures import by_robot, image_coverage
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_report
 from stcal.handeye.solve import handeye
-from tests.support.handeye import simulated, simulated_views
+from tests.support.handeye import simulated_views
 
 
 @pytest.fixture(scope="module")
@@ -52,28 +47,6 @@ def test_the_share_of_the_image(truth):
     assert found[:20, :25].min() == 1  # rows are y, columns x
     assert found[-20:].max() == 0
     assert not image_coverage(views_of(camera, [(x, 10) for x in range(10, 60, 10)])).any()
-
-
-def test_turns_are_those_of_the_flange():
-    """About its own X by 10°, and by 20° the other way: the two turns and the one between them are about ± X."""
-    start = Rigid.exp([0.4, -2, 1, 0, 0, 0])
-    poses = Poses.of([start @ Rigid.exp([np.radians(a), 0, 0.0, 5, 6, 7]) for a in (0, 10, -20)])
-    pairs = replace(simulated(np.random.default_rng(1), 3).pairs, base_from_flange=poses)
-    turns = turns_between(pairs)
-    assert np.sort(np.degrees(np.linalg.norm(turns, axis=1))) == pytest.approx([10, 20, 30])
-    assert np.abs(turns[:, 1:]).max() < 1e-12
-    assert (turns[:, 2] >= 0).all()
-
-
-def test_the_map_keeps_areas():
-    """Directions spread evenly over the half sphere are spread evenly over the disc: as many within radius r as r²."""
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(40_000, 3))
-    directions[:, 2] = np.abs(directions[:, 2])
-    radius = np.linalg.norm(equal_area(directions / np.linalg.norm(directions, axis=1)[:, None]), axis=1)
-    assert radius.max() <= 1 + 1e-12
-    for r in (0.3, 0.6, 0.9):
-        assert (radius < r).mean() == pytest.approx(r**2, abs=4 * np.sqrt(r**2 * (1 - r**2) / 40_000))
 
 
 @pytest.mark.parametrize("method", ["reprojection", "pose"])

@@ -12,8 +12,17 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.report.export import FORMS, exported, opencv_yaml, read_urdf, tree, urdf_joint
-from stcal.io.poses.programs import messages, read_messages
+from stcal.handeye.report.export import FORMS, exported, opencv_yaml, tree, urdf_joint
+from stcal.io.poses.programs import (
+    Static,
+    messages,
+    pose_of_metres,
+    read_messages,
+    read_ros1_launch,
+    read_ros2_commands,
+    read_ros2_launch,
+    static_of_joint,
+)
 from tests.outcome import fails_with
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
@@ -85,6 +94,28 @@ def test_frames_of_the_same_name_are_refused():
         tree(result_of(Rigid()), "tool0", "tool0")
 
 
+def read_easy(text: str) -> list[Static]:
+    content = yaml.safe_load(text)
+    frames, at = content["parameters"], content.get("transformation") or content["transform"]
+    in_hand = frames.get("eye_on_hand") or frames.get("calibration_type") == "eye_in_hand"
+    place, turn = (at.get("translation", at), at.get("rotation") or {c: at[f"q{c}"] for c in "xyzw"})
+    pose = pose_of_metres([place[c] for c in "xyz"], [turn[c] for c in "xyzw"])
+    mount = frames["robot_effector_frame" if in_hand else "robot_base_frame"]
+    return [Static(mount, frames["tracking_base_frame"], pose)]
+
+
+def read_urdf(text: str) -> list[Static]:
+    root = ElementTree.fromstring(text)
+    return [static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
+
+
+READERS = {
+    "ros2": read_ros2_commands,
+    "moveit": read_ros1_launch,
+    "moveit2": read_ros2_launch,
+    "easy-handeye": read_easy,
+    "easy-handeye2": read_easy,
+}
 COVARIANCE = np.diag([1e-8, 4e-8, 9e-8, 0.01, 0.04, 0.09])
 LINK = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 """REP 103: the line of sight, Z of the optical frame, is X of the link; its X, to the right, is the link's -Y."""
@@ -102,9 +133,7 @@ LINK = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 @example((0, 0, -3.14159265358, 1, 2, 3))
 def test_every_form_gives_the_transform_back(form, setup, twist):
     pose = Rigid.exp(twist)
-    (own,) = FORMS[form].read(
-        text_of(result_of(pose, setup, COVARIANCE), form, parent="tool 0" if form == "ros2" else "")
-    )
+    (own,) = READERS[form](text_of(result_of(pose, setup, COVARIANCE), form, parent="tool 0" if form == "ros2" else ""))
     mount = "tool 0" if form == "ros2" else {"eye-in-hand": "flange", "eye-to-hand": "base"}[setup]
     assert (own.parent, own.child) == (mount, "camera_optical_frame")
     off = own.pose.inverse() @ pose
@@ -116,7 +145,7 @@ def test_every_form_gives_the_transform_back(form, setup, twist):
 def test_the_link_has_the_optical_frame_in_it(form):
     """One parent for each frame, and the way to the optical frame is the same."""
     pose = Rigid.exp([0.3, -2, 1, 12.5, -900, 3])
-    found = FORMS[form].read(text_of(result_of(pose), form, child="left_link", camera_frame="link"))
+    found = READERS[form](text_of(result_of(pose), form, child="left_link", camera_frame="link"))
     assert (found[0].parent, found[0].child) == ("flange", "left_link")
     assert np.abs((found[0].pose @ LINK).matrix() - pose.matrix()).max() < 1e-8
     for fixed in found[1:]:

@@ -12,7 +12,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
 from stcal.handeye.data.record import Said
-from stcal.workflows.handeye_inputs import one_source, read_input
+from stcal.workflows.handeye_inputs import Files, one_source
 from stcal.workflows.robot_at_images import read_robot_poses
 from tests.handeye.written import easy_handeye, in_metres, matrices, message, moveit, tum
 from tests.outcome import fails_with, refuses
@@ -300,11 +300,11 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     between = ";" if ";" in head else ","
     path = written(tmp_path, f"{head}\n{between.join('123456')}\n", name)
     said = Said(rotation="ur-rotvec")
-    refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", read_input, path, statements=said)
+    refuses("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm", Files(path, statements=said).read)
     refuses("E-POSES-NOT-FOUND … u", one_source, path, path, "image", said)
     refuses("E-POSES-NOT-FOUND … u", read_robot_poses, path, statements=said)
 
 
 def test_half_of_decimal_commas_is_no_list_of_numbers(tmp_path):
     with fails_with("E-POSES-NOT-FOUND … without a header"):
-        read_input(written(tmp_path, "1.5;2,5;3,5;4,5;5,5;6,5\n" * 2), statements=Said(rotation="ur-rotvec"))
+        Files(written(tmp_path, "1.5;2,5;3,5;4,5;5,5;6,5\n" * 2), statements=Said(rotation="ur-rotvec")).read()

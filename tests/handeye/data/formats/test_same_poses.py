@@ -7,7 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.handeye.data.record import Said
-from stcal.workflows.handeye_inputs import one_source, read_input
+from stcal.workflows.handeye_inputs import Files, one_source
 from stcal.workflows.robot_at_images import read_robot_poses
 from tests.handeye.written import FORMATS, REFUSED
 from tests.support.handeye import simulated
@@ -25,9 +25,9 @@ def read(arguments, path=None):
         options[name].append(value)
     said = Said.of_options(options["--rotation"], options["--length-unit"], options["--poses-are"])
     if source is not None:
-        return read_input(Path(source), statements=said)
+        return Files(Path(source), statements=said).read()
     told, _ = one_source(Path(options["--a"][0]), Path(options["--b"][0]), "image", said)
-    return read_input(told, statements=said)
+    return Files(told, statements=said).read()
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -51,7 +51,7 @@ def test_other_formats_are_refused_in_a_line(name, tmp_path):
     for call in (
         lambda: read_robot_poses(path),
         lambda: one_source(path, tmp_path / "b.npy", "image", Said(rotation="rotvec-rad", length_unit="m")),
-        lambda: read_input(path),
+        Files(path).read,
     ):
         with pytest.raises(InputError) as caught:
             call()
