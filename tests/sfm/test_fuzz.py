@@ -134,8 +134,8 @@ INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")
 @pytest.mark.parametrize(
     ("kind", "instead"),
     [
-        ("not read again", lambda path, robot: None),
-        ("check is blind", lambda path, robot: require_written(path, lambda: 0.0, 0.0, 0.0, "mm")),
+        ("not read again", lambda path, robot, chain: None),
+        ("check is blind", lambda path, robot, chain: require_written(path, lambda: 0.0, 0.0, 0.0, "mm")),
     ],
 )
 def test_a_writer_without_a_check_is_found(stock, case, monkeypatch, kind, instead):

@@ -108,7 +108,7 @@ def _columns(table: Table, prefix: str, names: list[str]) -> tuple[str, ...]:
 def _by_convention(table: Table, prefix: str, rotation: str | None) -> Turned | None:
     """Return rotations of three angles, a rotation vector or q1 … q4, by the convention of their names or the user."""
     for triple, stated in TRIPLES.items():
-        for unit in (*ANGLES, ""):
+        for unit in (*ANGLES, "") if len(triple) == 3 else ("",):
             names = _columns(table, prefix, [f"{name}_{unit}" if unit else name for name in triple])
             if not names:
                 continue
