@@ -22,7 +22,7 @@ from stcal.locate.exposures import Exposure, SceneFiles
 from stcal.locate.layout import TargetLayout
 from stcal.locate.patent import ASSUMED, PatentPose
 from stcal.locate.pipeline import Located
-from stcal.report.document import Block, Document, Html, Notes, Section, Table, Verdict, columns, macro
+from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, Verdict, columns, macro
 from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.report.text import NONE, number
 
@@ -87,7 +87,8 @@ def run_report(
         for name, pose in (goals.base_from_goal if goals else {}).items()
     ]
     scenes_and_goals = [Table(heads, _overview(results), css="text"), Table(goal_heads, goal_rows)]
-    count = f"{len(results)} scene{'s' * (len(results) != 1)}, {len(accepted(results))} accepted"
+    good = len(accepted(results))
+    count = f"{len(results)} scene{'s' * (len(results) != 1)}, {good} accepted"
     return Document(
         f"Tags located: {layout.name}",
         f"target {layout.name}, {len(layout.tags)} tags: {count}",
@@ -98,6 +99,7 @@ def run_report(
                 for each, files in zip(results, scenes, strict=True)
             ),
         ],
+        [Answer("yes" if good == len(results) else "part" if good else "no", count)],
     )
 
 

@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Affine, Similarity
 from stcal.register.liu2017 import Liu2017Options, SampleSize
 from stcal.register.result import ErrorFigures
 from stcal.register.workspace import Cubes, Field, Findings
-from stcal.report.document import Block, Document, Section, Table, alarms, legend, page_only, plot
+from stcal.report.document import Answer, Block, Document, Section, Table, alarms, legend, page_only, plot
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
 from stcal.report.text import NONE, number
 
@@ -29,7 +29,7 @@ def registration_report(found: Findings, more: Sequence[Section] = ()) -> Docume
         f"{outliers} outliers"
     )
     answer = [
-        page_only(alarms(found.notes)),
+        page_only(alarms(found.notes[1:])),
         matrix_table("b_from_a", found.b_from_a.matrix()),
         *_sigma_lines(found),
         error_table("lengths of errors, mm", _errors(found)),
@@ -52,7 +52,22 @@ def registration_report(found: Findings, more: Sequence[Section] = ()) -> Docume
             *more,
             Section("Rows", ["" if outliers else "no outliers", _rows(found)], terminal=True),
         ],
+        [_verdict(found)],
     )
+
+
+def _verdict(found: Findings) -> Answer:
+    """Returns whether the transform may be used: with care where another fits as well, or a note or a field says so."""
+    if found.field is not None and found.field.seen and not found.notes:
+        return Answer("with care", f"residuals are systematic, {found.field.size_mm:.2g} mm RMS over the workspace")
+    if found.notes:
+        return Answer("with care", found.notes[0])
+    if found.held_out is None:
+        return Answer("with care", "too few pairs to hold any out, so that nothing but the fit itself shows its errors")
+    if found.method == "least-squares":
+        return Answer("with care", "least squares takes every pair as right; without --method, wrong ones are found")
+    held = found.held_out.of_inliers
+    return Answer("yes", f"inliers that are held out are missed by {held.rms_mm:.3g} mm RMS, {held.max_mm:.3g} at most")
 
 
 def matrix_table(name: str, matrix: np.ndarray) -> Table:

@@ -173,6 +173,27 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer at the head of a report. ``word`` : yes, with care, part or no; ``why`` : in one sentence."""
+
+    word: str
+    why: str
+
+    def lines(self) -> list[str]:
+        """Return the answer as a line."""
+        return [f"{USABLE} {self._said()}"]
+
+    def __html__(self) -> str:
+        return _macro("answers", [(USABLE, self._said())], tone_of(self.word))
+
+    def _said(self) -> str:
+        return sentence(f"{self.word.capitalize()}: {self.why}")
+
+
+USABLE = "May I use it?"
+
+
+@dataclass(frozen=True, slots=True)
 class Swatch:
     """A word for a cell, with a patch of its colour before it."""
 
@@ -203,7 +224,7 @@ class Printed:
         return ""
 
 
-Block = str | Table | Notes | Printed | Html | None
+Block = str | Table | Notes | Answer | Printed | Html | None
 
 
 @dataclass(frozen=True, slots=True)

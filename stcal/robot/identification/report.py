@@ -8,7 +8,19 @@ import numpy as np
 from stcal.geometry.arrays import require_arguments
 from stcal.io.poses.columns import fixed
 from stcal.io.table import csv_text
-from stcal.report.document import Block, Document, Html, Notes, Section, Table, listed, page_only, plot, subheading
+from stcal.report.document import (
+    Answer,
+    Block,
+    Document,
+    Html,
+    Notes,
+    Section,
+    Table,
+    listed,
+    page_only,
+    plot,
+    subheading,
+)
 from stcal.report.svg import COLOURS, INK, Axes, Drawing, limits
 from stcal.report.text import NONE, number
 from stcal.robot.identification.adjustment import Observed, State, as_seen, tips_of
@@ -90,7 +102,23 @@ def identified_report(result: Identified) -> Document:
                 "Outliers, of less than half weight", [Table(["<Where", "error mm", "weight"], outliers)], terminal=True
             ),
         ],
+        [_verdict(result)],
     )
+
+
+def _verdict(result: Identified) -> Answer:
+    """Returns whether the robot may be used: no where rows held out err no less than by nominal axes."""
+    held_out, nominal = result.errors.get("held_out"), result.errors["nominal"].rms
+    if held_out is None:
+        return Answer("with care", "too few rows to hold any out, so that nothing but the fit itself shows its errors")
+    errs = f"rows that are held out err by {held_out.rms:.3g} mm RMS, by nominal axes {nominal:.3g}"
+    if held_out.rms >= nominal:
+        return Answer("no", errs)
+    if result.left:
+        return Answer("with care", f"{errs}; {result.left[0].sentence()}")
+    if result.undetermined:
+        return Answer("with care", f"{errs}; the data do not determine {', '.join(result.undetermined)}")
+    return Answer("yes", errs)
 
 
 def left_lines(left: Sequence[Finding] | None) -> list[str]:

@@ -7,9 +7,9 @@ from itertools import chain, combinations, product
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import fminbound, least_squares
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.explain import Candidate, explain
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
@@ -36,6 +36,8 @@ to the data, the valley is flat, and the misfit shows it."""
 STILL_MM = 0.01
 QUARTERS_DEG = (90, -90, 180)
 """Errors of a joint's zero that conventions of a robot's home position cause."""
+ZERO_STEP_DEG = 30
+"""Step at which other errors of a joint's zero are looked for; between two steps there is one minimum."""
 FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
 """Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
 other rows. Of a wrong robot's errors few are so much larger than their median."""
@@ -277,6 +279,7 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
         [("", "", robot, data)],
         chain(_single(robot, thinned), _late(robot, data)),
         _moves_of(robot, data, tools),
+        _any_zero(robot, thinned, tools),
     )
     for level in (*levels, _pairs(robot, thinned)):
         cases = (
@@ -382,6 +385,8 @@ def _single(robot: Robot, data: Measurements) -> Iterator[Case]:
     yield "joint values are radians in columns of degrees", "call the columns q1_rad …", robot, in_degrees
     in_radians = replace(data, q=q / np.where(robot.prismatic, 1.0, 180 / np.pi))
     yield "joint values are degrees in columns of radians", "call the columns q1_deg …", robot, in_radians
+    reversed_ = replace(data, q=np.where(robot.prismatic, q, -q))
+    yield "all joint values had the opposite sign", "check the rows and the joints' directions", robot, reversed_
     lengths = {"distances": data.distances, "positions": data.positions}
     for unit, words in UNIT_WORDS.items():
         there = words, "mm", unit, LENGTHS[unit]
@@ -457,6 +462,22 @@ def _zeros(robot: Robot, data: Measurements) -> Iterator[Case]:
         yield f"theta of joint {i + 1} were larger by {turn:+d}°", "correct theta_deg", _turned(robot, {i: turn}), data
 
 
+def _any_zero(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[Case]:
+    """Yields the turn of each inner joint's zero that fits best, whatever its size."""
+    for i in _inner(robot):
+
+        def misfit(turn: float, i: int = i) -> float:
+            return _placed(_turned(robot, {i: turn}), data, tools)[1]
+
+        try:
+            start_deg = min(range(-180, 180, ZERO_STEP_DEG), key=misfit)
+            turn = float(fminbound(misfit, start_deg - ZERO_STEP_DEG, start_deg + ZERO_STEP_DEG, xtol=0.02))
+        except (DegenerateError, ConvergenceError):
+            continue
+        what = f"theta of joint {i + 1} were larger by {turn:+.1f}°"
+        yield what, "correct theta_deg, or the joint's zero", _turned(robot, {i: turn}), data
+
+
 def _signs(robot: Robot, data: Measurements) -> Iterator[Case]:
     for i in range(n := len(robot.rows)):
         cure = f"check its direction in the rows, or the sign of q{i + 1}"
@@ -468,6 +489,13 @@ def _couplings(robot: Robot, data: Measurements) -> Iterator[Case]:
     n = len(robot.rows)
     if (robot.coupling != np.eye(n)).any():
         yield "the joints were not coupled", "take coupling out of the robot file", replace(robot, coupling=None), data
+        other = replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling)
+        yield (
+            "the joints were coupled with the other sign",
+            "change the signs of coupling off its diagonal",
+            other,
+            data,
+        )
     elif n >= 3:
         for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
             coupling = np.eye(n)

@@ -13,7 +13,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, csv_text, pose_cells, require_pose_table_written
-from stcal.report.document import Document, Printed, Section, legend, page_only, plot, plots
+from stcal.report.document import Answer, Document, Printed, Section, legend, page_only, plot, plots
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
 from stcal.report.text import number
@@ -322,7 +322,16 @@ def measure_report(result: MeasureResult, where: str, every: bool = False) -> Do
                 terminal=True,
             ),
         ],
+        [_verdict(result)],
     )
+
+
+def _verdict(result: MeasureResult) -> Answer:
+    """Returns which poses may be used: those that are certain, and fit."""
+    count, sound = len(result.images), sum(map(_is_sound, (image.pose for image in result.images)))
+    without = sum(each.gate == "pose" for each in result.left_out)
+    what = f"{sound} of {count + without} images give a certain pose that fits"
+    return Answer("yes" if sound == count + without else "part" if sound else "no", what)
 
 
 def _figures(result: MeasureResult) -> list[list[str]]:
