@@ -471,9 +471,10 @@ def _any_zero(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iter
 
         try:
             start_deg = min(range(-180, 180, ZERO_STEP_DEG), key=misfit)
-            turn = float(fminbound(misfit, start_deg - ZERO_STEP_DEG, start_deg + ZERO_STEP_DEG, xtol=0.02))
+            least = fminbound(misfit, start_deg - ZERO_STEP_DEG, start_deg + ZERO_STEP_DEG, xtol=0.02)
         except (DegenerateError, ConvergenceError):
             continue
+        turn = np.asarray(least).item()
         what = f"theta of joint {i + 1} were larger by {turn:+.1f}°"
         yield what, "correct theta_deg, or the joint's zero", _turned(robot, {i: turn}), data
 
