@@ -315,7 +315,7 @@ def located(folder: Path) -> None:
     wanted = np.array(re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", numbers), float)
     wanted = wanted.reshape(-1, 4, 4)[:, :3, 3] if file.suffix else wanted.reshape(-1, 3, 4)[:, :, 3]
     for scene, place in zip(scenes, wanted, strict=True):
-        sigma = np.sqrt(np.trace(np.array(scene["covariance"])[3:, 3:]))
+        sigma = np.sqrt(np.trace(np.array(scene["pose"]["covariance"])[3:, 3:]))
         assert np.linalg.norm(np.array(scene["camera_from_obj"])[:3, 3] - place) < 5 * sigma + 0.01
 
 

@@ -81,8 +81,8 @@ def test_a_command_calls_public_functions(command):
     assert {name for name, function in functions.items() if not calls_it(COMMANDS[command], function)} - INSIDE == set()
 
 
-INSIDE = {"sfm.detect_circles", "handeye.handeye", "robot.load_universal"}
-"""Beside what the command calls: the same for one image, for arrays, and with an error for other files."""
+INSIDE = {"sfm.detect_circles", "handeye.handeye", "robot.load_universal", "workflows.read_handeye"}
+"""Beside what the command calls: the same for one image, for arrays, with an error for other files, and at once."""
 
 
 def test_what_is_not_called_is_found():

@@ -67,7 +67,7 @@ def test_a_camera_of_several_is_asked_for_and_taken(call, monkeypatch, name):
     assert "\n" not in error
     taken = []
 
-    def chosen(names, choice, source):
+    def chosen(names, choice):
         taken.append(choice)
         raise InputError("E-CAMERA-SEVERAL", f"chosen: {choice}")
 

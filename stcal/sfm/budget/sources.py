@@ -231,11 +231,11 @@ def _flatness(contributions: Contributions, flatness_mm: float | None) -> Source
 
 
 def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> Source:
-    stated, adjusted = camera.covariance is not None, contributions.covariance_mm2[INTRINSICS]
+    adjusted = contributions.covariance_mm2[INTRINSICS]
     row: tuple[Literal["A", "B"], Origin, str, np.ndarray]
     if not camera_given:
         row = "A", "estimated", "found from these photographs, without a camera file; adjusted with all else", adjusted
-    elif refined and stated:
+    elif refined and camera.covariance is not None:
         row = "B", "stated", "adjusted; σ before that of the camera file", adjusted
     elif refined:
         row = "B", "assumed", "adjusted; σ before that of a calibration of some age", adjusted

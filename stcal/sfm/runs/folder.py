@@ -36,7 +36,7 @@ from stcal.io.json import checked, read_json, require_result_written
 from stcal.io.table import csv_rows
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress
-from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, require_pdf
+from stcal.report.document import Document, Notes, Section, Table, links, macro, pdf_of, plots, require_pdf
 from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel, ImageObservations
@@ -45,7 +45,7 @@ from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
-from stcal.sfm.report.figures import Residuals, shown_overlays
+from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
 from stcal.sfm.runs.report import ReportFile, report_of, residuals_px
@@ -290,12 +290,13 @@ def _page_on_failure(
         rows.append([image.name, join(sorted(image.face_ids())), len(image) - dots, dots])
     left_out = [f"{each.observations.name}: {note}" for each in labelled for note in each.notes]
     overlays = [(overlay_path(Path(), row[0]).as_posix(), row[0]) for row in rows]
+    shown = [macro("plot", place, image, image) for place, image in overlays[:FIRST_IMAGES]]
     sections = [
         Section("What is wrong", [*error.split("; ")]),
         Section("What was found", [seen, Table(["<Image", "<Faces", "Points", "Dots"], rows)]),
         Section("Left out", [Notes(left_out)]),
         Section("Not read", [Notes([f"{file.name}: {file.reason}" for file in detection.skipped])]),
-        Section("Overlays", [links(overlays)]),
+        Section("Overlays", [plots(*shown), links(overlays[FIRST_IMAGES:]) if overlays[FIRST_IMAGES:] else None]),
     ]
     answer = macro("answers", [("May the run be used?", f"No: {error.split('; ')[0]}")], "failed")
     return Document(name, f"{len(labelled)} images, no calibrated target", sections, [answer]).page()
