@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.geometry.arrays import Array, Brief, ByValue, freeze, rms
@@ -14,6 +14,7 @@ from stcal.register.pairs import Problem
 
 Length = Annotated[
     float,
+    Field(allow_inf_nan=True),
     BeforeValidator(lambda value: np.nan if value is None else value),
     PlainSerializer(lambda value: None if np.isnan(value) else value),
 ]
