@@ -299,6 +299,7 @@ def _handeye() -> list[Mistake]:
         )
     ]
     chessboard, pairs = call_of("handeye", images), call_of("handeye", data)
+    chessboard = replace(chessboard, words=chessboard.words.replace("checker.yaml", "board.toml"))
     found.append(Mistake("handeye: other setup", replace(pairs, words=f"{pairs.words} --setup eye-to-hand"), both()))
     return found + [
         Mistake(f"handeye, images: {name}", chessboard, edit, TURNED if name.startswith("rows and") else "")
