@@ -63,7 +63,7 @@ def _verdict(found: Findings) -> Answer:
     if found.notes:
         return Answer("with care", found.notes[0])
     if found.held_out is None:
-        return Answer("with care", "too few pairs to hold any out, so that nothing but the fit itself shows its errors")
+        return Answer("with care", "no pairs were held out: nothing but the fit itself shows the errors")
     if found.method == "least-squares":
         return Answer("with care", "least squares takes every pair as right; without --method, wrong ones are found")
     held = found.held_out.of_inliers

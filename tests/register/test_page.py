@@ -47,6 +47,18 @@ def test_text_tells_transform_outliers_and_reach():
     assert len(re.findall(r"line \d+ +(?:inlier|OUTLIER)", few)) == FEW_ROWS - 4
 
 
+def test_the_answer_is_at_the_head():
+    """Least squares cannot know wrong pairs, and a bent frame or few pairs are no "yes" either."""
+    answers = {
+        "Yes: inliers that are held out are missed by": found_of(),
+        "With care: least squares takes every pair as right": found_of(wild=(), method="least-squares"),
+        "With care: residuals are systematic": found_of(n=60, bend=0.15),
+        "With care: no pairs were held out": found_of(folds=0),
+    }
+    for answer, found in answers.items():
+        assert registration_report(found).text().splitlines()[1].startswith(f"May I use it? {answer}")
+
+
 def test_rows_that_do_not_correspond_are_no_noise():
     rng = np.random.default_rng(1)
     a = rng.uniform(-1000, 1000, (40, 3))

@@ -110,7 +110,7 @@ def _verdict(result: Identified) -> Answer:
     """Returns whether the robot may be used: no where rows held out err no less than by nominal axes."""
     held_out, nominal = result.errors.get("held_out"), result.errors["nominal"].rms
     if held_out is None:
-        return Answer("with care", "too few rows to hold any out, so that nothing but the fit itself shows its errors")
+        return Answer("with care", "no rows were held out: nothing but the fit itself shows the errors")
     errs = f"rows that are held out err by {held_out.rms:.3g} mm RMS, by nominal axes {nominal:.3g}"
     if held_out.rms >= nominal:
         return Answer("no", errs)

@@ -6,7 +6,7 @@ from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
 from stcal.report.camera import distortion_figure
-from stcal.report.document import Answer, Block, Document, Section, Table, alarms, plot, plots
+from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
 from stcal.sfm.camera.calibrate import CameraCalibration
@@ -36,7 +36,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
     outliers = [[o.image, o.label, number(o.residual_px, 3), number(o.weight, 2)] for o in summary.outliers]
     differ = f"{summary.photographs_differ:.1f} times more than their pixels explain; σ are larger by that"
     blocks: list[Block] = [
-        alarms(summary.warnings[1:]),
+        bullets(summary.warnings[1:]),
         Table(["<parameter", "value, px", "σ"], parameters),
         "the principal point counts from the centre of the top-left pixel; the camera file, as COLMAP's, counts from "
         f"that pixel's corner, so that cx, cy are {COLMAP_PIXEL_ORIGIN:g} px larger there",
