@@ -1,12 +1,10 @@
 """Where the program's envelope ends: rendered sets degraded as photographs are, at five strengths of each kind.
 
-.venv/bin/python scripts/studies/envelope_study.py [--sets FOLDER …] [--only KIND] [--strengths 1,3,5] [--bin FOLDER]
-    [--json FILE] [--compare FILE]
+.venv/bin/python scripts/studies/envelope_study.py [--sets FOLDER …] [--only KIND] [--strengths 1 3 5] [--json FILE]
 
-Where circles, faces and board lie in the photographs is taken from ``truth.json`` alone. Each degraded set goes through
-`stcal-sfm run` of this or another version (`--bin`: the folder that holds its `stcal-sfm`), one after another. With
-`--json` every row is kept as it comes, and rows that the file has already are not run again: a study that was stopped
-goes on, and a finished one is printed. `--compare FILE` puts an earlier file's figures in front.
+Where circles, faces and board lie in the photographs is taken from ``truth.json`` alone. Each degraded set is run, one
+after another. With `--json` every row is kept as it comes, and rows that the file has already are not run again: a
+study that was stopped goes on, and a finished one is printed.
 
 recall: circles found of those that must be found; what the degradation hides, cuts or mirrors must not. wrong: labels
 farther than 1.5 px, or a quarter of the circle's radius, from the place of that circle's ellipse, or of circles that
@@ -18,16 +16,12 @@ check failed.
 """
 
 import csv
+import itertools
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
 import tempfile
-import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -35,10 +29,14 @@ import cv2
 import numpy as np
 
 from scripts.runner import options_of
+from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.labels import BOARD
+from stcal.sfm.pipeline import run
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.result import RunResult
 from tests.support import degrade
 from tests.support.photograph import Photograph, Plane, RenderedSet, read_set
 
@@ -46,7 +44,6 @@ ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "tests" / "data" / "sample"
 NEAR_PX, NEAR_RADII = 1.5, 0.25
 SILENT_SIGMA = 4.0
-LONGEST_S = 1800.0
 Place = Callable[[np.ndarray], np.ndarray]
 
 
@@ -446,40 +443,43 @@ def plates(hexagonal: bool) -> Callable[[Photograph, float, Case], Picture]:
     return make
 
 
-KINDS = (
-    Kind("plain", "as it is", (0,), plain),
-    Kind("defocus", "px radius", (1, 2.5, 5, 8, 12), simple(degrade.defocused), goal=3),
-    Kind("motion", "px", (2, 5, 9, 14, 20), motion),
-    Kind("noise", "grey levels", (2, 8, 15, 30, 40), noise, goal=4),
-    Kind("underexposed", "×", (0.7, 0.5, 0.35, 0.25, 0.15), simple(degrade.exposed)),
-    Kind("overexposed", "×", (1.3, 1.6, 2.0, 2.5, 3.0), simple(degrade.exposed)),
-    Kind("gamma", "exponent 1/", (1.25, 0.8, 1.6, 0.6, 2.2), simple(degrade.toned)),
-    Kind("jpeg", "quality", (95, 80, 60, 40, 20), file_of_quality),
-    Kind("vignetting", "lost in the corners", (0.3, 0.45, 0.6, 0.75, 0.85), simple(degrade.vignetted)),
-    Kind("gradient", "brightest : darkest", (1.5, 2.5, 4, 6, 8), gradient),
-    Kind("face dimmed", "×", (0.7, 0.5, 0.35, 0.2, 0.15), dim_face),
-    Kind("board brighter", "×", (1.5, 2, 3, 4, 5), bright_board),
-    Kind("unevenly lit", "brightest : darkest", (1.5, 2.5, 4, 6, 8), uneven),
-    Kind("glare", "grey levels", (40, 80, 150, 250, 400), glare),
-    Kind("haze", "share", (0.15, 0.3, 0.45, 0.6, 0.75), haze),
-    Kind("circles hidden", "per face", (1, 2, 3, 4, 6), hide),
-    Kind("circles cut", "share of area", (0.05, 0.1, 0.2, 0.3, 0.4), cut),
-    Kind("board covered", "share", (0.1, 0.2, 0.3, 0.4, 0.5), cover_board),
-    Kind("one board covered", "share, one image a group", (0.1, 0.2, 0.3, 0.4, 0.5), cover_one_board),
-    Kind("halves darker", "share", (0.05, 0.1, 0.15, 0.2, 0.3), half),
-    Kind("hot pixels", "share", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), on_sensor(degrade.hot_pixels)),
-    Kind("dust", "spots", (5, 15, 40, 80, 150), on_sensor(degrade.dusty)),
-    Kind("printed grids", "grids behind", (1, 2, 3, 4, 5), plates(False)),
-    Kind("perforated", "plates behind", (1, 2, 3, 4, 5), plates(True)),
-    Kind("second board", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_board),
-    Kind("second target", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_target),
-    Kind("reflection", "× brightness", (0.2, 0.35, 0.5, 0.7, 0.9), reflection),
-    Kind("mirrored", "", MIRRORED, mirror_images, may_end=(5,)),
-    Kind("small circles", "px across", (12, 9, 7.5, 6, 5), small, camera=small_camera),
-    Kind("rolling shutter", "px", (0.5, 1, 2, 4, 8), rolling),
-    Kind("rotated", "", tuple(ROTATED), rotate, camera=rotated_camera),
-    Kind("deep", "bits", (10, 12, 14, 15, 16), deep),
-)  # fmt: skip
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind("plain", "as it is", (0,), plain),
+        Kind("defocus", "px radius", (1, 2.5, 5, 8, 12), simple(degrade.defocused), goal=3),
+        Kind("motion", "px", (2, 5, 9, 14, 20), motion),
+        Kind("noise", "grey levels", (2, 8, 15, 30, 40), noise, goal=4),
+        Kind("underexposed", "×", (0.7, 0.5, 0.35, 0.25, 0.15), simple(degrade.exposed)),
+        Kind("overexposed", "×", (1.3, 1.6, 2.0, 2.5, 3.0), simple(degrade.exposed)),
+        Kind("gamma", "exponent 1/", (1.25, 0.8, 1.6, 0.6, 2.2), simple(degrade.toned)),
+        Kind("jpeg", "quality", (95, 80, 60, 40, 20), file_of_quality),
+        Kind("vignetting", "lost in the corners", (0.3, 0.45, 0.6, 0.75, 0.85), simple(degrade.vignetted)),
+        Kind("gradient", "brightest : darkest", (1.5, 2.5, 4, 6, 8), gradient),
+        Kind("face dimmed", "×", (0.7, 0.5, 0.35, 0.2, 0.15), dim_face),
+        Kind("board brighter", "×", (1.5, 2, 3, 4, 5), bright_board),
+        Kind("unevenly lit", "brightest : darkest", (1.5, 2.5, 4, 6, 8), uneven),
+        Kind("glare", "grey levels", (40, 80, 150, 250, 400), glare),
+        Kind("haze", "share", (0.15, 0.3, 0.45, 0.6, 0.75), haze),
+        Kind("circles hidden", "per face", (1, 2, 3, 4, 6), hide),
+        Kind("circles cut", "share of area", (0.05, 0.1, 0.2, 0.3, 0.4), cut),
+        Kind("board covered", "share", (0.1, 0.2, 0.3, 0.4, 0.5), cover_board),
+        Kind("one board covered", "share, one image a group", (0.1, 0.2, 0.3, 0.4, 0.5), cover_one_board),
+        Kind("halves darker", "share", (0.05, 0.1, 0.15, 0.2, 0.3), half),
+        Kind("hot pixels", "share", (1e-4, 3e-4, 1e-3, 3e-3, 1e-2), on_sensor(degrade.hot_pixels)),
+        Kind("dust", "spots", (5, 15, 40, 80, 150), on_sensor(degrade.dusty)),
+        Kind("printed grids", "grids behind", (1, 2, 3, 4, 5), plates(False)),
+        Kind("perforated", "plates behind", (1, 2, 3, 4, 5), plates(True)),
+        Kind("second board", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_board),
+        Kind("second target", "× brightness", (0.4, 0.6, 0.8, 1.0, 1.3), second_target),
+        Kind("reflection", "× brightness", (0.2, 0.35, 0.5, 0.7, 0.9), reflection),
+        Kind("mirrored", "", MIRRORED, mirror_images, may_end=(5,)),
+        Kind("small circles", "px across", (12, 9, 7.5, 6, 5), small, camera=small_camera),
+        Kind("rolling shutter", "px", (0.5, 1, 2, 4, 8), rolling),
+        Kind("rotated", "", tuple(ROTATED), rotate, camera=rotated_camera),
+        Kind("deep", "bits", (10, 12, 14, 15, 16), deep),
+    )
+}  # fmt: skip
 
 
 # ---------------------------------------------------------------- runs
@@ -502,31 +502,6 @@ def write_case(kind: Kind, case: Case, folder: Path) -> dict[str, Picture]:
     camera = kind.camera(case) if kind.camera else case.data.camera
     write_cameras_txt(folder / "cameras.txt", Camera.of(camera, case.data.camera.colmap_model))
     return pictures
-
-
-ANSWERED_NO = 4
-"""Exit code of a run that wrote results and says that they must not be used: it has not ended early."""
-
-
-def run_program(program: Path, case: Case, folder: Path, workers: int) -> tuple[int, str, float]:
-    """(exit code, first line of the error, seconds) of a run on a degraded set."""
-    words = [str(program / "stcal-sfm"), "run", str(folder / "images"), "--camera", str(folder / "cameras.txt")]
-    words += ["--out", str(folder / "run"), "--workers", str(workers)]
-    for name in ("target", "board"):
-        if (path := case.data.folder / f"{name}.toml").exists():
-            words += [f"--{name}", str(path)]
-    start = time.monotonic()
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LONGEST_S, env=environment)
-        code, said = 0 if done.returncode == ANSWERED_NO else done.returncode, done.stderr
-    except subprocess.TimeoutExpired:
-        code, said = -1, f"error: not done after {LONGEST_S:.0f} s"
-    lines = [x for x in said.splitlines() if x.strip() and not re.fullmatch(r"[\w ]+: \d+ of \d+", x)]
-    errors = [x for x in lines if x.startswith("error")] or lines[-1:]
-    trace = "traceback: " if "Traceback" in said else ""
-    text = trace + errors[0].replace(str(folder), "…") if code and errors else ""
-    return code, text[:300], time.monotonic() - start
 
 
 # ---------------------------------------------------------------- judgement
@@ -600,50 +575,35 @@ def _count(photo: Photograph, picture: Picture, measured: dict, turn: np.ndarray
             counts["dots" if key.startswith(BOARD) else "found"] += 1
 
 
-def judge_faces(data: RenderedSet, run: Path) -> dict:
+def judge_faces(data: RenderedSet, run: RunResult) -> dict:
     """Faces found, and the largest errors: µm and in σ."""
     known = {face: Rigid.from_matrix(matrix) for face, matrix in data.truth["target_from_face"].items()}
     shown = {k.partition(":")[0] for p in data.photographs for k, must in p.must_find.items() if must}
-    row = {"faces": 0, "faces_of": len(shown & known.keys()), "worst_um": None, "worst_sigma": None, "worst_face": ""}
-    if not (run / "faces.json").exists():
-        return row
-    found = json.loads((run / "faces.json").read_text())
-    own = found["reference_face"]
-    row["faces"] = len(found["target_from_face"].keys() & known.keys())
-    for face, matrix in found["target_from_face"].items():
-        if face == own or face not in known or own not in known:
-            continue
-        true, estimate = known[own].inverse() @ known[face], Rigid.from_matrix(matrix)
-        shift = estimate.translation - true.translation
-        um = 1e3 * float(np.linalg.norm(shift))
-        if row["worst_um"] is None or um > row["worst_um"]:
-            row |= {"worst_um": um, "worst_face": face}
-        covariance = np.array(found.get("target_from_face_covariance", {}).get(face, np.zeros((6, 6))))
-        if np.linalg.eigvalsh(covariance)[0] > 0:
-            error = np.concatenate([Rigid(estimate.rotation @ true.rotation.T).log()[:3], shift])
-            sigma = float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6))
-            row["worst_sigma"] = max(sigma, row["worst_sigma"] or 0.0)
-    return row
+    poses, own, um, sigma = run.target.target_from_face, run.target.reference_face, 0.0, 0.0
+    for face in sorted(poses.keys() & known.keys() - {own}):
+        true = known[own].inverse() @ known[face]
+        shift = poses[face].translation - true.translation
+        error = np.concatenate([Rigid(poses[face].rotation @ true.rotation.T).log()[:3], shift])
+        um = max(um, 1e3 * float(np.linalg.norm(shift)))
+        sigma = max(sigma, float(np.sqrt(error @ np.linalg.solve(run.target.face_covariance[face], error) / 6)))
+    return {"faces": len(poses.keys() & known.keys()), "of": len(shown & known.keys()), "um": um, "sigma": sigma}
 
 
-def judge_checks(run: Path) -> dict:
-    """Keys of the checks that failed, and of those that are suspicious."""
-    report = run / "report.json"
-    checks = json.loads(report.read_text())["checks"] if report.exists() else []
-    return {name: [c["key"] for c in checks if c["verdict"] == name] for name in ("failed", "suspicious")}
-
-
-def run_case(kind: Kind, strength: int, data: RenderedSet, program: Path, workers: int) -> dict:
+def run_case(kind: Kind, strength: int, data: RenderedSet, workers: int) -> dict:
     """The row of one case."""
     case = Case(data, kind.name, kind.values[strength - 1])
+    row = {"set": data.folder.name, "kind": kind.name, "strength": strength, "value": case.value}
     with tempfile.TemporaryDirectory(prefix="envelope-") as scratch:
         folder = Path(scratch)
         pictures = write_case(kind, case, folder)
-        code, error, seconds = run_program(program, case, folder, workers)
-        run = folder / "run"
-        row = {"set": data.folder.name, "kind": kind.name, "strength": strength, "value": case.value}
-        row |= judge_labels(data, pictures, run) | judge_faces(data, run) | judge_checks(run)
-        return row | {"exit": code, "error": error, "seconds": round(seconds, 1)}
+        try:
+            designs = (data.target, data.board)
+            options = RunOptions(workers=workers)
+            result = run(folder / "images", folder / "cameras.txt", folder / "run", *designs, options)
+            row |= judge_faces(data, result) | {"failed": [c.key for c in result.checks if c.verdict == "failed"]}
+        except StcalError as error:
+            row["error"] = str(error).replace(str(folder), "…")
+        return row | judge_labels(data, pictures, folder / "run")
 
 
 # ---------------------------------------------------------------- results
@@ -651,123 +611,48 @@ def run_case(kind: Kind, strength: int, data: RenderedSet, program: Path, worker
 
 def silent(row: dict) -> bool:
     """Wrong without a word: over 4 σ, and no check failed."""
-    return (row["worst_sigma"] or 0) > SILENT_SIGMA and not row["failed"]
+    return row.get("sigma", 0) > SILENT_SIGMA and not row["failed"]
 
 
-def kind_of(row: dict) -> Kind:
-    return next(kind for kind in KINDS if kind.name == row["kind"])
+def share(rows: Sequence[dict], found: str, of: str) -> str:
+    return f"{100 * sum(r[found] for r in rows) / max(1, sum(r[of] for r in rows)):.1f}"
 
 
-def share(found: int, of: int) -> str:
-    return f"{100 * found / of:.1f}" if of else "–"
-
-
-def figures(row: dict | None) -> str:
-    """A row's figures, in columns."""
-    if row is None:
-        return f"{'–':>6} {'–':>6} {'–':>5} {'–':>4} {'–':>8} {'–':>6} {'–':>4} {'–':>4}"
-    um, sigma = (f"{row[key]:.1f}" if row[key] is not None else "–" for key in ("worst_um", "worst_sigma"))
-    faces = f"{row['faces']}/{row['faces_of']}"
-    checks = f"{len(row['failed'])}+{len(row['suspicious'])}"
-    return (
-        f"{share(row['found'], row['must']):>6} {share(row['dots'], row['must_dots']):>6} {row['wrong']:>5} "
-        f"{faces:>4} {um:>8} {sigma:>6} {checks:>4} {row['exit']:>4}"
-    )
-
-
-HEADINGS = f"{'circ %':>6} {'dots %':>6} {'wrong':>5} {'face':>4} {'µm':>8} {'σ':>6} {'f+s':>4} {'exit':>4}"
-
-
-def line_of(row: dict, before: dict | None, comparing: bool) -> str:
-    kind = kind_of(row)
+def line_of(row: dict) -> str:
+    kind = KINDS[row["kind"]]
     beyond = "*" if row["strength"] > kind.goal or row["strength"] in kind.may_end else " "
-    text = f"{row['set'][:11]:<11} {row['kind']:<17} {row['value']!s:>8}{beyond} "
-    text += f"{figures(before)}  |  " if comparing else ""
-    text += figures(row)
-    text += "  SILENT" if silent(row) else ""
-    return text + (f"  {row['error'][:110]}" if row["error"] else "")
-
-
-def summary(rows: list[dict]) -> str:
-    """What the issue's goals ask for, over all rows."""
-    ended = [r for r in rows if r["exit"]]
-    inside = [r for r in ended if r["strength"] <= kind_of(r).goal and r["strength"] not in kind_of(r).may_end]
-    lost = [r for r in rows if not r["exit"] and r["faces"] < r["faces_of"]]
-    names = lambda found: "; ".join(f"{r['set']} {r['kind']} {r['value']}" for r in found[:12])  # noqa: E731
-    wrong, quiet = [r for r in rows if r["wrong"]], [r for r in rows if silent(r)]
-    return "\n".join(
-        [
-            f"cases                {len(rows)}",
-            f"wrong labels         {sum(r['wrong'] for r in rows)} in {len(wrong)} cases: {names(wrong)}",
-            f"silent (> {SILENT_SIGMA:g} σ)       {len(quiet)}: {names(quiet)}",
-            f"runs that ended      {len(ended)}, {len(inside)} of them within the goals: {names(inside)}",
-            f"faces lost           in {len(lost)} runs: {names(lost)}",
-            f"circles found        {share(sum(r['found'] for r in rows), sum(r['must'] for r in rows))} %",
-            f"dots found           {share(sum(r['dots'] for r in rows), sum(r['must_dots'] for r in rows))} %",
-        ]
-    )
-
-
-def rows_of(path: Path | None) -> dict[tuple, dict]:
-    """Rows of a file by set, kind and strength."""
-    rows = json.loads(path.read_text()) if path and path.exists() else []
-    return {(r["set"], r["kind"], r["strength"]): r for r in rows}
+    text = f"{row['set'][:11]:<11} {row['kind']:<17} {row['value']!s:>8}{beyond} {share([row], 'found', 'must'):>6} "
+    text += f"{share([row], 'dots', 'must_dots'):>6} {row['wrong']:>5} "
+    if "error" in row:
+        return text + row["error"][:110]
+    text += f"{row['faces']}/{row['of']} {row['um']:>8.1f} {row['sigma']:>6.1f} {len(row['failed']):>4}"
+    return text + ("  SILENT" if silent(row) else "")
 
 
 def main() -> None:
-    given = options_of(
-        __doc__,
-        sets=[SAMPLE],
-        only="",
-        strengths="1,2,3,4,5",
-        bin=Path(sys.executable).parent,
-        workers=2,
-        json=Path,
-        compare=Path,
-        look=Path,
-    )
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # folders are removed then
-    strengths = [int(k) for k in given.strengths.split(",")]
-    done, before = rows_of(given.json), rows_of(given.compare)
+    given = options_of(__doc__, sets=[SAMPLE], only="", strengths=[1, 2, 3, 4, 5], workers=2, json=Path)
+    done = json.loads(given.json.read_text()) if given.json and given.json.exists() else []
+    known = {(r["set"], r["kind"], r["strength"]): r for r in done}
+    print(f"{'':40}{'circ %':>6} {'dots %':>6} {'wrong':>5} face {'µm':>7} {'σ':>6} {'bad':>4}", flush=True)
     rows = []
-    print(" " * 40 + (f"{HEADINGS}  |  " if before else "") + HEADINGS, flush=True)
-    for folder in given.sets:
-        data = None
-        for kind in KINDS:
-            for strength in strengths if re.search(given.only, kind.name) else []:
-                key = (folder.resolve().name, kind.name, strength)
-                if strength > len(kind.values):
-                    continue
-                if key not in done or given.look:
-                    data = data or read_set(folder.resolve())
-                    if given.look:
-                        look(kind, strength, data, given.look)
-                        continue
-                    done[key] = run_case(kind, strength, data, given.bin.resolve(), given.workers)
-                    if given.json:
-                        given.json.parent.mkdir(parents=True, exist_ok=True)
-                        given.json.write_text(json.dumps(list(done.values()), indent=1) + "\n")
-                rows.append(done[key])
-                print(line_of(rows[-1], before.get(key), bool(before)), flush=True)
-    if not rows:
-        return
-    if before:
-        print(
-            f"\nbefore\n{summary([before[k] for r in rows if (k := (r['set'], r['kind'], r['strength'])) in before])}"
-        )
-        print("\nafter", end="")
-    print(f"\n{summary(rows)}\n* beyond the goals")
-
-
-def look(kind: Kind, strength: int, data: RenderedSet, folder: Path) -> None:
-    """The first photograph of a case, as PNG."""
-    case = Case(data, kind.name, kind.values[strength - 1])
-    pixels = kind.make(data.photographs[0], case.value, case).pixels
-    if isinstance(pixels, bytes):
-        pixels = cv2.imdecode(np.frombuffer(pixels, np.uint8), cv2.IMREAD_GRAYSCALE)
-    folder.mkdir(parents=True, exist_ok=True)
-    name = f"{data.folder.name}-{kind.name}-{strength}".replace(" ", "-")
-    cv2.imwrite(str(folder / f"{name}.png"), degrade.stored(pixels))
+    for folder, kind in itertools.product(given.sets, KINDS.values()):
+        data = read_set(folder.resolve())
+        for strength in given.strengths if re.search(given.only, kind.name) else []:
+            key = (data.folder.name, kind.name, strength)
+            if strength > len(kind.values):
+                continue
+            if key not in known:
+                known[key] = run_case(kind, strength, data, given.workers)
+                if given.json:
+                    given.json.write_text(json.dumps(list(known.values()), indent=1) + "\n")
+            rows.append(known[key])
+            print(line_of(rows[-1]), flush=True)
+    quiet, ended = [r for r in rows if silent(r)], [r for r in rows if "error" in r]
+    inside = [r for r in ended if r["strength"] <= KINDS[r["kind"]].goal]
+    print(f"{len(rows)} cases: {sum(r['wrong'] for r in rows)} wrong labels, {len(quiet)} silent")
+    print(f"{len(ended)} runs ended, {len(inside)} of them within the goals (*: beyond them)")
+    print(f"faces lost in {sum(r['faces'] < r['of'] for r in rows if 'error' not in r)} runs")
+    print(f"{share(rows, 'found', 'must')} % of circles, {share(rows, 'dots', 'must_dots')} % of dots found")
 
 
 if __name__ == "__main__":

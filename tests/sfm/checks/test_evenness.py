@@ -85,10 +85,9 @@ def test_chance_alone_is_suspected_as_rarely_as_promised(group):
 def test_rendered_circles_with_a_darker_half_are_suspected(sample, tmp_path):
     """Whole runs on photographs: one half of every circle 10 % darker, and as they were."""
     study = load_script("envelope_study")
-    kinds = {kind.name: kind for kind in study.KINDS}
     for name, value, verdict in (("halves darker", 0.1, "suspicious"), ("plain", 0, "passed")):
         folder = tmp_path / name
-        study.write_case(kinds[name], study.Case(read_set(sample), name, value), folder)
+        study.write_case(study.KINDS[name], study.Case(read_set(sample), name, value), folder)
         camera = read_camera(folder / "cameras.txt")
         result = run(folder / "images", camera, folder / "run", options=RunOptions(workers=1))
         (check,) = [check for check in result.checks if check.key == "evenness"]

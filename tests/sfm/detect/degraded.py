@@ -16,7 +16,7 @@ from tests.scripts import load_script
 from tests.support.photograph import Photograph, RenderedSet
 
 study = load_script("envelope_study")
-KINDS = {kind.name: kind for kind in study.KINDS}
+KINDS = study.KINDS
 Make = Callable[[Photograph, float, object], object]
 
 
