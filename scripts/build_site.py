@@ -163,14 +163,12 @@ def build(out: Path, say: Callable[[str], None] = print) -> None:
         The extra ``docs`` is not installed, Sphinx warns of something, or a link leads nowhere.
     """
     if build_main is None or not all(map(find_spec, THEME)):
-        raise SystemExit('error: the site needs Sphinx, its theme and MyST; run pip install ".[docs]", and this again')
+        raise SystemExit('error: the site needs Sphinx, its theme and MyST; run scripts/setup "[docs]", and this again')
     source = out.parent / "site-source"
     for folder in (source, out):
         shutil.rmtree(folder, ignore_errors=True)
     collect(source)
-    if build_main(
-        ["-b", "html", "-W", "--keep-going", "-n", "-q", "-d", str(source / ".doctrees"), str(source), str(out)]
-    ):
+    if build_main(["-b", "html", "-W", "--keep-going", "-n", "-d", str(source / ".doctrees"), str(source), str(out)]):
         raise SystemExit("the site has not been built: see the warnings above")
     dead = list(dead_links(out))
     if dead:

@@ -1,17 +1,20 @@
-"""The pictures of README.md and docs/: what is found in the sample photographs, and the report's page.
+"""The pictures of README.md and docs/: what is found in the sample photographs, the report's page, and the drawings and
+first photographs of two tutorials.
 
 .venv/bin/python scripts/pictures.py [NAME …] [--out FOLDER]
 
-Calibrates `tests/data/sample`, whose photographs another program rendered, and writes `docs/pictures/`. `report` needs
-Chromium on the PATH, as its page is photographed in the browser.
+Calibrates `tests/data/sample`, whose photographs another program rendered, and writes `docs/pictures/`. All but `found`
+need Chromium on the PATH, as pages and drawings are photographed in the browser. `box` and `cube` show simulated
+photographs.
 """
 
 import argparse
 import csv
 import shutil
 import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from PIL import Image
@@ -25,6 +28,8 @@ FOUND_IN = "12/IMG_1001.jpg"
 MARGIN_PX = 45
 HALF_WIDTH_PX = 760
 PAGE_PX = (1280, 1240)
+PAPER = 200
+"""Grey value above which a drawing is paper."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
@@ -33,10 +38,15 @@ def found(result: Path, out: Path) -> None:
     photograph, overlay = Image.open(SAMPLE / "images" / FOUND_IN), Image.open(result / "overlays" / FOUND_IN)
     box = box_of_circles(result / "labels.csv", FOUND_IN, photograph.size)
     halves = [cut(image, box, photograph.width) for image in (photograph.convert("RGB"), overlay)]
-    side_by_side = Image.new("RGB", (2 * HALF_WIDTH_PX + 8, halves[0].height), "white")
+    side_by_side(halves, out / "found.jpg")
+
+
+def side_by_side(halves: Sequence[Image.Image], out: Path) -> None:
+    """Two pictures of equal width."""
+    both = Image.new("RGB", (2 * HALF_WIDTH_PX + 8, max(half.height for half in halves)), "white")
     for k, half in enumerate(halves):
-        side_by_side.paste(half, (k * (HALF_WIDTH_PX + 8), 0))
-    side_by_side.save(out / "found.jpg", quality=88)
+        both.paste(half, (k * (HALF_WIDTH_PX + 8), (both.height - half.height) // 2))
+    both.save(out, quality=88)
 
 
 def box_of_circles(detections: Path, image: str, size: tuple[int, int]) -> tuple[float, float, float, float]:
@@ -65,6 +75,43 @@ def report(result: Path, out: Path) -> None:
     photograph_page(result / "report.html", out / "report.png")
 
 
+def drawn(out: Path, size: tuple[int, int], design: str, draw: str, simulate: str) -> None:
+    """A drawing, shown ``size`` px large, and beside it what is found in the first of the simulated photographs."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        target = folder / "design" / "target.toml"
+        board = ["--board", target.with_name("board.toml")] * ("--tags" not in design)
+        for words in (
+            ["design", target.parent, *design.split()],
+            ["draw", target, "--out", folder / "drawing.svg", *draw.split()],
+            ["simulate", folder / "data", "--target", target, *board, *simulate.split()],
+            ["detect", folder / "data" / "images", "--target", target, *board, "--out", folder / "look"],
+        ):
+            subprocess.run([Path(sys.executable).with_name("stcal-sfm"), *words], check=True, capture_output=True)
+        photograph_page(folder / "drawing.svg", folder / "drawing.png", size)
+        drawing = Image.open(folder / "drawing.png").convert("L")
+        drawing = drawing.crop(drawing.point(lambda grey: 255 * (grey < PAPER)).getbbox()).convert("RGB")
+        height = round(HALF_WIDTH_PX * drawing.height / drawing.width)
+        name = min(row["image"] for row in csv.DictReader((folder / "look" / "detections.csv").open(encoding="utf-8")))
+        overlay = Image.open((folder / "look" / "overlays" / name).with_suffix(".jpg")).convert("RGB")
+        width = Image.open(folder / "data" / "images" / name).width
+        part = box_of_circles(folder / "look" / "detections.csv", name, (width, width))
+        halves = [drawing.resize((HALF_WIDTH_PX, height), Image.Resampling.LANCZOS), cut(overlay, part, width)]
+        side_by_side(halves, out)
+
+
+def box(_: Path, out: Path) -> None:
+    """Of the tutorial of a target of one's own."""
+    faces = "--size 160,140,120 --faces front,right,top --images 6"
+    drawn(out / "box.jpg", (1000, 640), faces, "", "--width 2016 --images 3 --one-board --seed 4")
+
+
+def cube(_: Path, out: Path) -> None:
+    """Of the tutorial of a cube of tags."""
+    made = "--tags cube --size 45 --distance-mm 300 --width 900 --images 20"
+    drawn(out / "cube.jpg", (1200, 1000), made, "--net", "--width 900 --images 3 --distance 300 --seed 5")
+
+
 def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> None:
     """A page as a browser shows it, in few colours.
 
@@ -82,7 +129,7 @@ def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> N
     Image.open(out).convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(out, optimize=True)
 
 
-PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report}
+PICTURES: dict[str, Callable[[Path, Path], None]] = {"found": found, "report": report, "box": box, "cube": cube}
 
 
 def main() -> None:
@@ -93,8 +140,10 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result"
-        run(SAMPLE / "images", SAMPLE / "cameras.txt", result)
-        for name in arguments.names or PICTURES:
+        names = arguments.names or list(PICTURES)
+        if {"found", "report"} & set(names):
+            run(SAMPLE / "images", SAMPLE / "cameras.txt", result)
+        for name in names:
             PICTURES[name](result, arguments.out)
 
 

@@ -46,25 +46,17 @@ def made() -> Iterator[tuple[str, str]]:
 
 
 def commands() -> Iterator[tuple[str, str]]:
-    """(name of the page, text) of each group of commands, and of their list."""
+    """(name of the page, text) of each command, and of their list."""
     root: Any = get_command(app)
-    single = {name: each for name, each in root.commands.items() if not hasattr(each, "commands")}
-    groups = {name: each for name, each in root.commands.items() if hasattr(each, "commands")}
     rows = ["# Commands", "", "Made from the program; `--help-all` of each says the same.", ""]
-    for name, group in groups.items():
+    for name, group in sorted(root.commands.items(), key=lambda item: hasattr(item[1], "commands")):
         words = f"stcal {name}" if name != "sfm" else "stcal-sfm"
-        text = [f"# {words}", "", str(group.help or "").strip(), ""]
-        rows += [f"- [{words}]({name}.md): {', '.join(f'`{each}`' for each in group.commands)}"]
-        for each, command in group.commands.items():
-            text += command_text(f"{words} {each}", command)
-        yield name, "\n".join(text) + "\n"
-    for name in sorted({each.split()[0] for each in single}):
-        own = {each: command for each, command in single.items() if each.split()[0] == name}
-        rows += [f"- [stcal {name}]({name}.md): {', '.join(f'`{each}`' for each in own)}"]
-        text = [f"# stcal {name}", ""]
-        for each, command in own.items():
-            text += command_text(f"stcal {each}", command)
-        yield name, "\n".join(text) + "\n"
+        members = getattr(group, "commands", None)
+        rows += ["", f"## {words}", "", inspect.cleandoc(group.help or ""), ""] if members else []
+        for each, command in {f"{words} {k}": v for k, v in members.items()}.items() if members else [(words, group)]:
+            page = each.replace(" ", "-")
+            rows.append(f"- [{each}]({page}.md)")
+            yield page, "\n".join(command_text(each, command)) + "\n"
     yield "index", "\n".join(rows) + "\n"
 
 
@@ -73,7 +65,7 @@ def command_text(words: str, command: Any) -> list[str]:
     context = command.make_context(words, [], resilient_parsing=True, **PLAIN["context_settings"])
     usage = " ".join(command.collect_usage_pieces(context))
     calls = [f"{words} {usage}", *examples_of(words)]
-    text = [f"## {words}", "", inspect.cleandoc(command.help or ""), "", "```", *calls, "```", ""]
+    text = [f"# {words}", "", inspect.cleandoc(command.help or ""), "", "```", *calls, "```", ""]
     records = [each.get_help_record(context) for each in command.params if each.name != "help"]
     rows = [f"| `{cell(names)}` | {plain(meaning)} |" for names, meaning in filter(None, records)]
     return [*text, "| argument or option | meaning |", "|---|---|", *rows, ""]
