@@ -32,5 +32,5 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(site, "build_main", None)
     with pytest.raises(SystemExit) as caught:
         site.build(tmp_path / "site")
-    assert 'pip install ".[docs]"' in str(caught.value)
+    assert 'scripts/setup "[docs]"' in str(caught.value)
     assert "\n" not in str(caught.value)
