@@ -59,8 +59,8 @@ def register(
     from stcal.register import register as registered
     from stcal.register.file import RegistrationFile, RobotPart
     from stcal.register.liu2017 import Liu2017Options, sample_sizes
-    from stcal.register.page import registration_report, sample_size_section
-    from stcal.register.pairs import read_pairs
+    from stcal.register.registration_report import registration_report, sample_size_section
+    from stcal.register.point_pairs import read_pairs
     from stcal.register.workspace import findings
 
     if identified and not robot_file:

@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field
 
 from stcal.geometry.rigid import Affine, Rigid, Similarity
 from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3
-from stcal.register.result import ErrorFigures
+from stcal.register.registered import ErrorFigures
 
 DIGITS = 9
 """Decimals of residuals, mm: there may be a million."""

@@ -13,9 +13,9 @@ from scipy.special import chdtrc, chdtri
 from stcal.errors import StcalError
 from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
-from stcal.register.models import MODELS, Model, Transform, jacobian
-from stcal.register.pairs import Pairs, Problem, noise_of
-from stcal.register.result import ErrorFigures, Registration, held_out
+from stcal.register.point_pairs import Pairs
+from stcal.register.registered import ErrorFigures, Registration, held_out
+from stcal.register.transforms import MODELS, Model, Problem, Transform, jacobian, problem_of
 
 MOST_POINTS = 500
 """Largest number of points of the model, evenly chosen from more, as its cost grows with the third power."""
@@ -102,11 +102,8 @@ class Field:
 
 def residual_field(registration: Registration, problem: Problem) -> Field | None:
     """Returns the systematic part of the residuals, or None; of covariances only mean variances are used."""
-    a, b, model, precision = problem.xyz_a, problem.xyz_b, problem.model, problem.noise.precision
-    if precision is None:
-        variance = np.ones(len(a))
-    else:
-        variance = 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
+    a, b, model, precision = problem.xyz_a, problem.xyz_b, problem.model, problem.precision
+    variance = 1 / precision if precision.ndim == 1 else np.trace(np.linalg.inv(precision), axis1=1, axis2=2) / 3
     used = registration.inliers.copy()
     followers = np.zeros(0, int)
     for _ in range(ROUNDS):
@@ -358,8 +355,8 @@ class Findings(Registration):
 @one_thread()
 def findings(pairs: Pairs, registration: Registration) -> Findings:
     """Returns a registration of these pairs with its residual field and cubes."""
-    noise = noise_of(len(pairs), pairs.weights, pairs.covariances)
-    problem = Problem(MODELS[registration.model], pairs.xyz_a, pairs.xyz_b, noise)
+    model = MODELS[registration.model]
+    problem = problem_of(model, pairs.xyz_a, pairs.xyz_b, pairs.weights, pairs.covariances)
     field = residual_field(registration, problem)
     reach = cubes(registration, problem, None if field is None else field.taken_back)
     found = {each.name: getattr(registration, each.name) for each in fields(registration)}

@@ -8,7 +8,7 @@ import numpy as np
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Similarity
 from stcal.register.liu2017 import Liu2017Options, SampleSize
-from stcal.register.result import ErrorFigures
+from stcal.register.registered import ErrorFigures
 from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import Answer, Block, Document, Section, Table, alarms, legend, page_only, plot
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below

@@ -31,32 +31,12 @@ from scipy.special import chdtr, chdtrc, chdtri, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.robust import ratio_limit
-from stcal.register.models import Model, Transform, hypotheses, leverages, unit_covariance
-from stcal.register.pairs import Problem
+from stcal.register.transforms import Model, Problem, Transform, hypotheses
 
 CONTRADICTED_AT = 0.01
 """Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 WIDE = 8.0
 """Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Covariance:
-    """``scaled`` : by residuals, not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
-
-    matrix: np.ndarray
-    scaled: bool
-    redundancy: float
-
-
-def kept_share(cut: float) -> float:
-    """Returns the fraction of points within ``cut`` σ, from χ²₃."""
-    return float(chdtr(3, cut**2))
-
-
-def kept_variance(cut: float) -> float:
-    """Returns the fraction of the total sum of squares that points within ``cut`` σ contribute, from χ²₅."""
-    return float(chdtr(5, cut**2))
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
@@ -71,7 +51,7 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
 
     def excess(candidate: float) -> float:
         cut = threshold / candidate
-        return candidate**2 * kept_variance(cut) / kept_share(cut) - sigma**2
+        return candidate**2 * chdtr(5, cut**2) / chdtr(3, cut**2) - sigma**2
 
     if excess(threshold) < 0:
         return threshold
@@ -79,29 +59,24 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
     return float(root_scalar(excess, method="brentq", bracket=bracket, xtol=1e-9 * sigma, rtol=1e-9).root)
 
 
-def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold: float) -> Covariance:
-    """Returns the covariance of a fit. A given σ is kept unless χ² contradicts it. Cutting off at c σ, ``threshold`` in
-    mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection."""
-    model, noise = inliers.model, inliers.noise
-    redundancy = float(inliers.redundancy)
-    used, scaled = sigma, True
-    if noise.sigma_mm is not None:
-        scaled = bool(chdtrc(redundancy, redundancy * (sigma / noise.sigma_mm) ** 2) < CONTRADICTED_AT)
+def covariance_of(
+    inliers: Problem, b_from_a: Transform, sigma: float, threshold: float
+) -> tuple[np.ndarray, bool, float]:
+    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
+
+    A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``
+    in mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
+    """
+    redundancy, used, scaled = float(inliers.redundancy), sigma, True
+    if inliers.sigma_mm is not None:
+        scaled = bool(chdtrc(redundancy, redundancy * (sigma / inliers.sigma_mm) ** 2) < CONTRADICTED_AT)
         if not scaled:
-            used, redundancy = noise.sigma_mm, np.inf
-    matrix = used**2 * unit_covariance(model, b_from_a, inliers.xyz_a, noise.precision)
+            used, redundancy = inliers.sigma_mm, np.inf
+    matrix = used**2 * inliers.unit_covariance(b_from_a)
     if used > 0 and threshold < WIDE * used:
         cut = threshold / used
-        matrix = matrix * kept_share(cut) / kept_variance(cut)
-    return Covariance(matrix, scaled, redundancy)
-
-
-def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
-    """Adds a common shift (3,), mm, as an error to the covariance of a fit between two groups of points."""
-    p = len(covariance.matrix)
-    by_step = np.zeros(p)
-    by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm
-    return replace(covariance, matrix=covariance.matrix + np.outer(by_step, by_step))
+        matrix = matrix * chdtr(3, cut**2) / chdtr(5, cut**2)
+    return matrix, scaled, redundancy
 
 
 FALSE_ALARMS = 1e-4
@@ -205,7 +180,14 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
 
 def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensus | None) -> Consensus | None:
     """Returns the best of the refined samples and of ``best``."""
-    square = _squares_of_many(*hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples]), problem)
+    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
+    residual = problem.xyz_b.T - translation[:, :, None]
+    residual -= (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
+    if problem.precision.ndim == 3:
+        force = np.einsum("nij,sjn->sin", problem.precision, residual, optimize=True)
+        square = np.maximum(np.einsum("sin,sin->sn", residual, force), 0)
+    else:
+        square = np.einsum("sin,sin->sn", residual, residual) * problem.precision
     value, cut = score(square)
     for i in np.argsort(value, kind="stable")[:REFINED]:
         found = _concentrated(problem, score, square[i] <= cut[i])
@@ -230,19 +212,6 @@ def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consen
         inliers = square <= cut[0]
         best = Consensus(inliers, float(value[0]))
     return best
-
-
-def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Problem) -> np.ndarray:
-    """Returns the squared distances (s, n) under s transforms."""
-    turned = (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
-    residual = problem.xyz_b.T - translation[:, :, None]
-    residual -= turned
-    precision = problem.noise.precision
-    if precision is not None and precision.ndim == 3:
-        weighted = np.einsum("nij,sjn->sin", precision, residual, optimize=True)
-        return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
-    plain = np.einsum("sin,sin->sn", residual, residual)
-    return plain if precision is None else plain * precision
 
 
 SUBSET = 500
@@ -391,11 +360,11 @@ def _chosen(
 def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
     """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself, C their covariance at unit noise:
     r (1 − H)⁻¹ r for points used, r (1 + H)⁻¹ r for others, with whitened residuals and H of
-    :func:`~stcal.register.models.leverages` (Cook & Weisberg 1982)."""
-    added = leverages(problem.model, transform, problem.xyz_a, used, problem.noise.precision)
+    :meth:`~stcal.register.transforms.Problem.leverages` (Cook & Weisberg 1982)."""
+    added = problem.leverages(transform, used)
     own = np.where(used, -1.0, 1.0)[:, None, None]
     value, vector = np.linalg.eigh(np.eye(3) + own * added)
-    turned = np.einsum("nij,ni->nj", vector, problem.whitened(transform))
+    turned = np.einsum("nij,ni->nj", vector, problem.whitened(problem.residuals(transform)))
     return (turned**2 / np.maximum(value, 1e-9)).sum(1)
 
 

@@ -9,8 +9,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.geometry.arrays import Array, Brief, ByValue, freeze, rms
-from stcal.register.models import Transform, parts
-from stcal.register.pairs import Problem
+from stcal.register.transforms import Problem, Transform, parts
 
 Length = Annotated[
     float,
