@@ -59,7 +59,7 @@ def register(
     from stcal.register import register as registered
     from stcal.register.liu2017 import Liu2017Options
     from stcal.register.point_pairs import read_pairs
-    from stcal.register.registration_report import RegistrationFile, RobotPart, registration_report, sample_size_section
+    from stcal.register.registration_report import OF_ROBOT, RegistrationFile, registration_report, sample_size_section
     from stcal.register.workspace import findings
 
     if identified and not robot_file:
@@ -108,7 +108,7 @@ def register(
                 liu2017_options=liu2017,
                 folds=folds,
             )
-            content = content.model_copy(update={"robot": RobotPart.model_validate(beside)})
+            content = content.model_copy(update={"robot": OF_ROBOT.checked(beside)})
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {shared.name_of(source)}: {beside.identified.rank} parameters."]

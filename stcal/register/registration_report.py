@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator
@@ -11,10 +11,10 @@ from pydantic import Field as Key
 
 from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3
+from stcal.io.json import Finite, Keys, Matrix, Matrix4, Points, ResultFile, Vector3
 from stcal.parallel import one_thread
 from stcal.register.liu2017 import Liu2017Options, orthogonal_samples
-from stcal.register.registered import ErrorFigures
+from stcal.register.registered import Alternative, ErrorFigures, HeldOutPoints
 from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import Answer, Block, Document, Section, Table, alarms, legend, page_only, plot
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
@@ -280,74 +280,12 @@ Rounded = Annotated[Points, BeforeValidator(lambda values: np.round(values, 9))]
 TransformMatrix = Annotated[
     Matrix4, BeforeValidator(lambda given: given.matrix() if isinstance(given, Rigid | Similarity | Affine) else given)
 ]
-
-
-class HeldOutPart(Part):
-    folds: int
-    rows: Rows
-    error_mm: Vector
-    of_inliers: ErrorFigures
-    of_all: ErrorFigures
-
-
-class AlternativePart(Part):
-    b_from_a: TransformMatrix
-    rows: Rows
-    apart_mm: float
-    turn_rad: float
-
-
-class FieldGrid(Part):
-    xyz_a_mm: Points
-    error_mm: Points
-    sigma_mm: Vector
-
-
-class FieldPart(Part):
-    seen: bool
-    p_value: float
-    length_mm: float
-    size_mm: float
-    noise_mm: float
-    rows: Rows
-    taken_back: Rows
-    plain: ErrorFigures
-    corrected: ErrorFigures
-    sigma_ratio: float
-    grid: FieldGrid
-
-
-class CubesPart(Part):
-    middle: Vector3
-    sides_mm: Vector
-    errors: list[list[ErrorFigures | None]]
-
-
-class WeightingPart(Part):
-    sigma_mm: float | None
-
-
-class IdentifiedPart(Part):
-    rank: int
-    names: list[str]
-    undetermined: list[str]
-    weighting: WeightingPart
-
-
-class RobotPart(Part):
-    """Base and kinematics, solved in addition to the transform."""
-
-    b_from_base: Pose
-    identified: IdentifiedPart
-    off_mm: float
-    better: bool
-    folds: int
-    rows: Rows
-    transform_mm: Vector
-    kinematics_mm: Vector
-    wild: Marks
-    transform: ErrorFigures
-    kinematics: ErrorFigures
+OF_ROBOT = Keys(
+    "b_from_base identified.rank identified.names identified.undetermined identified.weighting.sigma_mm off_mm better "
+    "folds rows transform_mm kinematics_mm wild transform kinematics"
+)
+"""Of base and kinematics, solved in addition to the transform: :class:`stcal.workflows.RegisteredRobot`."""
+OF_FIELD = Keys("seen p_value length_mm size_mm noise_mm rows taken_back plain corrected sigma_ratio grid")
 
 
 class RegistrationFile(ResultFile):
@@ -371,12 +309,12 @@ class RegistrationFile(ResultFile):
     sigma_factor: float | None = Key(description="by how much residuals exceed the σ given with the data")
     scaled: bool = Key(description="whether the covariance rests on the residuals")
     threshold_mm: float | None = Key(description="inliers are nearer than this; null by least squares")
-    inlier_errors: ErrorFigures = Key(description=f"lengths of the inliers' residuals: {FIGURES}")
-    held_out: HeldOutPart | None = Key(
+    inlier_errors: Annotated[ErrorFigures, Keys()] = Key(description=f"lengths of the inliers' residuals: {FIGURES}")
+    held_out: Annotated[HeldOutPoints, Keys()] | None = Key(
         description=f"`folds`; `rows` and `error_mm` of each point tried; {FIGURES} `of_inliers` and `of_all`"
     )
     ambiguous: bool = Key(description="whether `alternative` is about as good")
-    alternative: AlternativePart | None = Key(
+    alternative: Annotated[Alternative, Keys()] | None = Key(
         description="another transform that other points agree on: `b_from_a`, `rows`, `apart_mm` (RMS), `turn_rad`"
     )
     notes: list[str] = Key(description="what to look at")
@@ -386,7 +324,7 @@ class RegistrationFile(ResultFile):
     inliers: Marks = Key(description="whether it is an inlier")
     residuals: Rounded = Key(description="b − b_from_a a, frame b")
     outliers: Rows = Key(description="rows of the outliers, the farthest first")
-    field: FieldPart | None = Key(
+    field: Annotated[Field, OF_FIELD] | None = Key(
         description="systematic residuals over the workspace, null with too few points: `seen` (chance below 1 %), "
         "`p_value`; `size_mm` RMS length, `length_mm` over which they change, `noise_mm` σ per axis beside them; "
         "`rows` used (at most 500), `taken_back` rows of outliers that follow the field of the others; "
@@ -396,12 +334,12 @@ class RegistrationFile(ResultFile):
         "points and a quarter beyond), `error_mm` to expect of b − b_from_a a there, frame b, and its `sigma_mm` per "
         "axis"
     )
-    cubes: CubesPart | None = Key(
+    cubes: Annotated[Cubes, Keys()] | None = Key(
         description="null with too few points: `middle` in a and `sides_mm` of cubes along the axes of a; in row i and "
         f"column j of `errors`: {FIGURES} of the fit in cube i at the points of cube j that are not in cube j − 1; "
         "points that the fit used are held out in turn"
     )
-    robot: RobotPart | None = Key(
+    robot: Annotated[Any, OF_ROBOT] | None = Key(
         None,
         description="with `--robot`: `b_from_base` of the identified robot; `identified`: `rank`, `names`, "
         "`undetermined`, and `weighting` with `sigma_mm`, as of `identify`; `off_mm`: RMS of a off the robot file's "
