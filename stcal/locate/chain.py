@@ -17,7 +17,7 @@ from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, checked, read_result
 from stcal.io.poses.rotations import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
-from stcal.locate.pipeline import Located
+from stcal.locate.scenes import Located
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
 ROBOT = "base_from_flange_"

@@ -2,7 +2,7 @@
 explain why it fits badly."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.stats import chi2 as chi_square
@@ -74,6 +74,7 @@ class VerdictOptions:
 class PoseCheck:
     """One value and its limit: ``value`` must not be less than ``at_least``, or not greater than ``at_most``."""
 
+    KEYS: ClassVar = "name value at_least at_most unit passed"
     name: str
     value: float
     at_least: float | None = None
