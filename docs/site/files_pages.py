@@ -63,7 +63,7 @@ def rows_of(model: type[Part], above: str = "", said: str | None = None) -> Iter
             yield f"{key}{suffix}" if within else key, kind, LINK.sub(r"\1", field.description)
         elif said is None or f"`{field.alias or name}`" not in said:
             raise ValueError(f"{model.__name__}.{name}: neither a description, nor named by the object that holds it")
-        holder = field.description or said
+        holder = field.description or said or ""
         if within and issubclass(within, Part):
             yield from rows_of(within, f"{key}{suffix}.", holder)
         elif within and not all(f"`{each}`" in holder for each in names_of(annotation, within)):
