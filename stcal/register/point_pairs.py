@@ -138,25 +138,16 @@ def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
     order = np.argsort(key, kind="stable")
     near = np.flatnonzero(np.diff(key[order]) == 0)
     same = near[(rows[order[near]] == rows[order[near + 1]]).all(1)]
-    if len(same):
-        first, again = sorted((int(order[same[0]]), int(order[same[0] + 1])))
-        raise InputError(
-            "E-TABLE-ROW-REPEATED",
-            f"{table.where}: line {table.lines[again]}: the same pair as on line {table.lines[first]}"
-            f"{_and_more(same)}; remove it, or give one of them twice the weight",
-        )
+    first_of = dict(zip(order[same + 1].tolist(), order[same].tolist(), strict=True))
+    remedy = "remove it, or give one of them twice the weight"
+    table.refuse(
+        np.isin(np.arange(len(rows)), list(first_of)),
+        "E-TABLE-ROW-REPEATED",
+        lambda i: f"the same pair as on line {table.lines[first_of[i]]}; {remedy}",
+    )
 
 
 def _positive(table: Table, name: str, values: np.ndarray) -> np.ndarray:
-    bad = np.flatnonzero(values <= 0)
-    if len(bad):
-        raise InputError(
-            "E-SIGMA-VALUE",
-            f"{table.where}: line {table.lines[bad[0]]}: {name} is {values[bad[0]]:g}, a positive number needed"
-            f"{_and_more(bad)}; remove a row to give it no weight",
-        )
+    needed = "a positive number needed; remove a row to give it no weight"
+    table.refuse(values <= 0, "E-SIGMA-VALUE", lambda i: f"{name} is {values[i]:g}, {needed}")
     return values
-
-
-def _and_more(rows: np.ndarray) -> str:
-    return f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
