@@ -384,7 +384,10 @@ def calibrate(
             "show it, or name another origin in the layout file",
         )
     images = [replace(image, rows=np.searchsorted(seen_rows, image.rows)) for image in images]
-    start = _median_corners(images, len(seen_rows))
+    places = np.full((len(images), len(seen_rows), 4, 2), np.nan)  # medians are robust against a misread tag
+    for i, image in enumerate(images):
+        places[i, image.rows] = plane_points(image.pose, image.seen).reshape(-1, 4, 2)
+    start = np.nanmedian(places, axis=0)
     adjusted = adjust(images, start)
     return _collected(plan, images, seen_rows, start, adjusted, left_out)
 
@@ -445,14 +448,6 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
             row: place for row, place in zip(image.rows, places[best], strict=True) if row not in place_of_tag
         }
     return turned
-
-
-def _median_corners(images: Sequence[ImageCorners], count: int) -> np.ndarray:
-    """Returns each corner's median over all images, (count, 4, 2) mm on the board, robust against a misread tag."""
-    places = np.full((len(images), count, 4, 2), np.nan)
-    for i, image in enumerate(images):
-        places[i, image.rows] = plane_points(image.pose, image.seen).reshape(-1, 4, 2)
-    return np.nanmedian(places, axis=0)
 
 
 def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out) -> CalibratedLayout:

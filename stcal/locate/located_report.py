@@ -8,9 +8,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
 from stcal.geometry.print_modes import stretch_in_words
-from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.io.json import Finite, Keys, Part, Pose, ResultFile, Shape
@@ -178,7 +176,13 @@ def _picture(
     for tag, corners in zip(exposure.tags.tags, exposure.tags.corners_px, strict=True):
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
         tags.append((points, COLOURS[2] if tag in rows else COLOURS[1], str(tag[1]), *corners.mean(0)))
-    count = sum(tag in rows for tag in exposure.tags.tags)
+    count, axes = sum(tag in rows for tag in exposure.tags.tags), []
+    if pose is not None:  # a third of the target long; none if behind the camera
+        length = float(np.ptp(layout.corners_mm.reshape(-1, 2), axis=0).max()) / 3
+        ends = pose @ (length * np.vstack([np.zeros(3), np.eye(3)]))
+        if (ends[:, 2] > 0).all():
+            start, *tips = model.sized(width, height).project(ends)
+            axes = [(start, tip, colour, name) for tip, colour, name in zip(tips, AXIS_COLOURS, "XYZ", strict=True)]
     return {
         "shown_px": width_px,
         "width": width,
@@ -187,18 +191,8 @@ def _picture(
         "caption": f"{exposure.name}: {count} of {len(layout.tags)} tags",
         "jpeg": "data:image/jpeg;base64," + base64.b64encode(thumbnail(grey, width_px)[0].tobytes()).decode(),
         "tags": tags,
-        "axes": [] if pose is None else _axes(pose, layout, model.sized(width, height)),
+        "axes": axes,
     }
-
-
-def _axes(pose: Rigid, layout: TargetLayout, camera: Camera) -> list[tuple]:
-    """Returns (start, tip, colour, name) of X, Y, Z of {obj}, a third of the target long; none if behind the camera."""
-    length = float(np.ptp(layout.corners_mm.reshape(-1, 2), axis=0).max()) / 3
-    ends = pose @ (length * np.vstack([np.zeros(3), np.eye(3)]))
-    if (ends[:, 2] <= 0).any():
-        return []
-    start, *tips = camera.project(ends)
-    return [(start, tip, colour, name) for tip, colour, name in zip(tips, AXIS_COLOURS, "XYZ", strict=True)]
 
 
 Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
