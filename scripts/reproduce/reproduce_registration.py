@@ -26,8 +26,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
 from stcal.register import register
 from stcal.register.liu2017 import Liu2017Options, affine_least_squares, liu2017
-from stcal.register.models import MODELS
-from stcal.register.pairs import PointNoise, Problem
+from stcal.register.transforms import MODELS, problem_of
 from stcal.register.workspace import residual_field
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
@@ -129,7 +128,7 @@ def solved(cell: Cell, points: Points) -> dict:
     except DegenerateError:
         pass
     found = register(points.a, points.b, folds=0, allow_ambiguous=True)
-    field = residual_field(found, Problem(MODELS[found.model], points.a, points.b, PointNoise()))
+    field = residual_field(found, problem_of(MODELS[found.model], points.a, points.b))
     affine = register(points.a, points.b, model="affine", folds=0, allow_ambiguous=True).b_from_a
     good = found.inliers.copy()
     good[field.taken_back] = True

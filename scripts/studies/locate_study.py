@@ -29,12 +29,12 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
-from stcal.locate.calibration import CalibrationImages
 from stcal.locate.estimate import locate, merge
 from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import LayoutPlan, TargetLayout
+from stcal.locate.layout_calibration import CalibrationImages
 from stcal.locate.patent import PatentOptions
-from stcal.locate.pipeline import LocateOptions, locate_image, run
+from stcal.locate.scenes import LocateOptions, locate_image, run
 from stcal.locate.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread
 from stcal.synthetic.optics import Light, expose

@@ -83,9 +83,9 @@ def calibrate(
     """Find the corners of the target's tags, with σ, in the frame at the centre of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
     from stcal.io.cameras.read import read_camera
-    from stcal.locate.calibration import calibrate as calibrated
     from stcal.locate.layout import layout_toml, load_plan, require_layout_written
-    from stcal.locate.page import CalibratedLayoutFile, calibrated_text, warnings
+    from stcal.locate.layout_calibration import calibrate as calibrated
+    from stcal.locate.located_report import CalibratedLayoutFile, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
@@ -169,10 +169,10 @@ def run(
     from stcal.locate.chain import goal_chain, goals
     from stcal.locate.exposures import find_scenes
     from stcal.locate.layout import load_layout
-    from stcal.locate.page import LocatedFile, accepted, poses_csv, run_report, uncertain
+    from stcal.locate.located_report import LocatedFile, accepted, poses_csv, run_report, uncertain
     from stcal.locate.patent import PatentOptions
-    from stcal.locate.pipeline import LocateOptions
-    from stcal.locate.pipeline import run as located
+    from stcal.locate.scenes import LocateOptions
+    from stcal.locate.scenes import run as located
     from stcal.locate.verdict import VerdictOptions
 
     chain = None

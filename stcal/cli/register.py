@@ -57,10 +57,9 @@ def register(
 ) -> None:
     """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
-    from stcal.register.file import RegistrationFile, RobotPart
-    from stcal.register.liu2017 import Liu2017Options, sample_sizes
-    from stcal.register.page import registration_report, sample_size_section
-    from stcal.register.pairs import read_pairs
+    from stcal.register.liu2017 import Liu2017Options
+    from stcal.register.point_pairs import read_pairs
+    from stcal.register.registration_report import OF_ROBOT, RegistrationFile, registration_report, sample_size_section
     from stcal.register.workspace import findings
 
     if identified and not robot_file:
@@ -93,7 +92,7 @@ def register(
     content, sections, failed = RegistrationFile.model_validate(registration), [], None
     if report and liu2017:
         limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
-        sections.append(sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
+        sections.append(sample_size_section(pairs.xyz_a, pairs.xyz_b, limits, seed))
     if robot_file:
         from stcal.robot.identification.result import require_identified_written
         from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -109,7 +108,7 @@ def register(
                 liu2017_options=liu2017,
                 folds=folds,
             )
-            content = content.model_copy(update={"robot": RobotPart.model_validate(beside)})
+            content = content.model_copy(update={"robot": OF_ROBOT.checked(beside)})
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {shared.name_of(source)}: {beside.identified.rank} parameters."]

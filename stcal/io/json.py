@@ -6,7 +6,7 @@ that was given as None is null. Arrays and poses are lists of numbers in the fil
 
 import json
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -152,6 +152,56 @@ class CovarianceShape(Shape):
         except (InputError, ValueError, TypeError) as error:
             raise mistake(str(error).removeprefix("array: ")) from error
         return matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """An object of a file that holds attributes of a result: those named, in words, or all fields of a dataclass.
+
+    ``a.b`` is the attribute b of a, in an object of its own; methods are called. ``model: Annotated[Result, Keys()]``.
+    """
+
+    names: str = ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(Keys(self.names or _names(source)).checked)
+
+    def checked(self, value: Any) -> dict[str, Any]:
+        """Return the object as plain values; a dict is one already."""
+        if isinstance(value, dict):
+            if value.keys() != {name.partition(".")[0] for name in self.names.split()}:
+                raise mistake(f"an object with {self.names} needed")
+            return value
+        found: dict[str, Any] = {}
+        for name in self.names.split():
+            place, held, (*above, last) = found, value, name.split(".")
+            for part in above:
+                place, held = place.setdefault(part, {}), getattr(held, part)
+            place[last] = _plain(getattr(held, last))
+        return found
+
+
+def _names(kind: Any) -> str:
+    return getattr(kind, "KEYS", "") or " ".join(each.name for each in fields(kind))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: transforms and arrays as lists, null for numbers that are not finite."""
+    if callable(value):
+        return _plain(value())
+    if hasattr(value, "matrix"):
+        return value.matrix().tolist()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if is_dataclass(value):
+        return Keys(_names(type(value))).checked(value)
+    if isinstance(value, dict):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple | range):
+        return [_plain(each) for each in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value
 
 
 Finite = Annotated[

@@ -93,15 +93,18 @@ class Table(ByValue):
                 values = np.array(values, dtype=float)
             except ValueError:
                 values = np.array([_number(v) for v in values])
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            shown = self.columns[column][bad[0]]
-            suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-            raise InputError(
-                "E-TABLE-NUMBER",
-                f"{self.where}: line {self.lines[bad[0]]}: {column} is {str(shown)!r}, a finite number needed{suffix}",
-            )
+        text = self.columns[column]
+        self.refuse(
+            ~np.isfinite(values), "E-TABLE-NUMBER", lambda i: f"{column} is {str(text[i])!r}, a finite number needed"
+        )
         return values
+
+    def refuse(self, bad: np.ndarray, code: str, said: Callable[[int], str]) -> None:
+        """Refuse rows, by a mask (m,), by the line of the first one; ``said`` : returns what is wrong in row i."""
+        rows = np.flatnonzero(bad)
+        if len(rows):
+            more = f" (and {len(rows) - 1} more)" if len(rows) > 1 else ""
+            raise InputError(code, f"{self.where}: line {self.lines[rows[0]]}: {said(int(rows[0]))}{more}")
 
     def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
         """Return the values (m,) of the column ``name_unit``, in mm or rad."""
@@ -110,13 +113,8 @@ class Table(ByValue):
 
     def _near(self, column: str) -> np.ndarray:
         """Return the values (m,) of a column; refuse values whose squares may overflow."""
-        values = self.numbers(column)
-        far = np.flatnonzero(np.abs(values) > FARTHEST)
-        if len(far):
-            raise InputError(
-                "E-VALUE-TOO-FAR",
-                f"{self.where}: line {self.lines[far[0]]}: {column} is {values[far[0]]:g}, up to {FARTHEST:g} possible",
-            )
+        values, far = self.numbers(column), f"up to {FARTHEST:g} possible"
+        self.refuse(np.abs(values) > FARTHEST, "E-VALUE-TOO-FAR", lambda i: f"{column} is {values[i]:g}, {far}")
         return values
 
     def unit(self, name: str, units: dict[str, float]) -> str:

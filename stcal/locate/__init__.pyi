@@ -1,5 +1,3 @@
-from .calibration import CalibratedLayout as CalibratedLayout
-from .calibration import calibrate as calibrate
 from .chain import GoalChain as GoalChain
 from .chain import Goals as Goals
 from .chain import goal_chain as goal_chain
@@ -16,12 +14,14 @@ from .layout import TagLayout as TagLayout
 from .layout import TargetLayout as TargetLayout
 from .layout import load_layout as load_layout
 from .layout import load_plan as load_plan
-from .page import poses_csv as poses_csv
+from .layout_calibration import CalibratedLayout as CalibratedLayout
+from .layout_calibration import calibrate as calibrate
+from .located_report import poses_csv as poses_csv
 from .patent import PatentOptions as PatentOptions
 from .patent import PatentPose as PatentPose
-from .pipeline import Located as Located
-from .pipeline import LocateOptions as LocateOptions
-from .pipeline import locate_image as locate_image
-from .pipeline import run as run
+from .scenes import Located as Located
+from .scenes import LocateOptions as LocateOptions
+from .scenes import locate_image as locate_image
+from .scenes import run as run
 from .verdict import Verdict as Verdict
 from .verdict import VerdictOptions as VerdictOptions

@@ -17,7 +17,7 @@ from stcal.geometry.rigid import Order, Poses, Rigid, UncertainRigid
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, checked, read_result
 from stcal.io.poses.rotations import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
-from stcal.locate.pipeline import Located
+from stcal.locate.scenes import Located
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
 ROBOT = "base_from_flange_"
@@ -145,15 +145,13 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "
     table = read_table(path, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
-    pose_of_scene = {}
-    for row, (name, pose) in enumerate(zip(table.text(key), poses, strict=True)):
-        if name in pose_of_scene:
-            raise InputError(
-                "E-TABLE-ROW-REPEATED",
-                f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed",
-            )
-        pose_of_scene[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])
-    return pose_of_scene
+    scenes, every = table.text(key), np.zeros((len(table), 6, 6)) if covariances is None else covariances
+    table.refuse(
+        np.array([name in scenes[:row] for row, name in enumerate(scenes)], bool),
+        "E-TABLE-ROW-REPEATED",
+        lambda row: f"scene {scenes[row]} again; every scene once needed",
+    )
+    return {name: UncertainRigid(pose, own) for name, pose, own in zip(scenes, poses, every, strict=True)}
 
 
 NEAR_BASE_MM, NEAR_FLANGE_MM = 20.0, 2.0

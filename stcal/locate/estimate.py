@@ -80,8 +80,8 @@ class PlanarProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedCorners:
-    """``residual`` : (h, n, 2) of h poses, measured minus projected; ``by_pose`` : (h, n, 2, 6), ``by_corner`` : (h, n,
-    2, 2) negative derivatives; ``before`` : (h,) all corners in front of the camera."""
+    """``residual`` : (h, n, 2) measured minus projected, of h poses; ``by_pose``, ``by_corner`` : negative derivatives;
+    ``before`` : (h,) all corners in front of the camera."""
 
     residual: np.ndarray
     by_pose: np.ndarray
@@ -395,6 +395,14 @@ def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: t
     )
 
 
+def reprojection_rms(camera_from_obj: Rigid, xy: np.ndarray, pixels: np.ndarray, camera: Camera) -> float:
+    """Returns the RMS distance of projected corners (n, 2), mm, from measured ones, px; infinite behind the camera."""
+    xyz = camera_from_obj @ np.column_stack([xy, np.zeros(len(xy))])
+    if (xyz[:, 2] <= 0).any():
+        return np.inf
+    return float(np.sqrt(((camera.project(xyz) - pixels) ** 2).sum(1).mean()))
+
+
 def covering_both(pose: ObjPose) -> ObjPose:
     """Returns the pose with a covariance that also covers its second solution, weighted by the odds of both."""
     if pose.second is None:
@@ -450,9 +458,8 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     corners, edge = np.full((*shape, 4, 2), np.nan), np.zeros(shape)
     covariance, joint = np.tile(np.eye(2), (*shape, 4, 1, 1)), np.tile(np.eye(8), (*shape, 1, 1))
     for e, tags in enumerate(exposures):
-        place = {rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows}
-        seen = [k for k, row in enumerate(used) if row in place]
-        own = [place[used[k]] for k in seen]
+        own = [k for k, tag in enumerate(tags.tags) if tag in rows]
+        seen = np.searchsorted(used, [rows[tags.tags[k]] for k in own])
         corners[e, seen], covariance[e, seen] = tags.corners_px[own], tags.covariance_px2[own]
         joint[e, seen], edge[e, seen] = np.asarray(tags.joint_px2)[own], tags.edge_sigma_px()[own]
     visible = np.isfinite(corners[..., 0, 0])

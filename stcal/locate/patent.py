@@ -15,6 +15,7 @@ from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import PlanePoses, poses_of_plane
 from stcal.geometry.rigid import Rigid
+from stcal.locate.estimate import reprojection_rms
 from stcal.locate.layout import TargetLayout
 from stcal.locate.verdict import PoseCheck, Verdict
 
@@ -135,14 +136,6 @@ def triangulated_area(points: np.ndarray) -> float:
     a, b, c = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).T
     s = (a + b + c) / 2
     return float(np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0)).sum())
-
-
-def reprojection_rms(pose: Rigid, xy_obj: np.ndarray, pixels: np.ndarray, camera: Camera) -> float:
-    """Returns the RMS distance of the projected corners from the measured ones, px (S7)."""
-    xyz = pose @ np.column_stack([xy_obj, np.zeros(len(xy_obj))])
-    if (xyz[:, 2] <= 0).any():
-        return np.inf
-    return float(np.sqrt(((camera.project(xyz) - pixels) ** 2).sum(1).mean()))
 
 
 def same_pose(a: Rigid, b: Rigid) -> bool:

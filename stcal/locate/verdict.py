@@ -2,7 +2,7 @@
 explain why it fits badly."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.stats import chi2 as chi_square
@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import deciding_delta
 from stcal.geometry.rigid import Poses
 from stcal.io.cameras.model import CameraPrior
-from stcal.locate.estimate import ObjPose, SeenTags, covering_both, locate
+from stcal.locate.estimate import ObjPose, SeenTags, covering_both, locate, reprojection_rms
 from stcal.locate.layout import TargetLayout
 
 Decision = Literal["accept", "ambiguous", "reject"]
@@ -64,8 +64,7 @@ class VerdictOptions:
                 f"verdict: odds {self.max_p:g} and {self.flip_odds:g}, margin {self.sigma_margin:g}, {self.min_tags} "
                 "tags: odds between 0 and 1, a margin and a number of at least 1 needed",
             )
-        limits = (self.max_sigma_deg, "°"), (self.max_sigma_mm or 0.0, " mm"), (self.min_spread_px, " px")
-        for value, unit in limits:
+        for value, unit in ((self.max_sigma_deg, "°"), (self.max_sigma_mm or 0.0, " mm"), (self.min_spread_px, " px")):
             if not 0 <= value < np.inf:
                 raise InputError("E-OPTION-RANGE", f"verdict: limit {value:g}{unit}; a number of at least 0 needed")
 
@@ -74,6 +73,7 @@ class VerdictOptions:
 class PoseCheck:
     """One value and its limit: ``value`` must not be less than ``at_least``, or not greater than ``at_most``."""
 
+    KEYS: ClassVar = "name value at_least at_most unit passed"
     name: str
     value: float
     at_least: float | None = None
@@ -155,8 +155,7 @@ TURNS = {
     1: "every tag were turned by 90° more (add 90 to each angle_deg)",
     3: "every tag were turned by 90° less (subtract 90 from each angle_deg)",
 }
-MIRRORED = "Y pointed down (the layout has it upwards: change the signs of y_mm and angle_deg)"
-PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs of y_mm)"
+MIRRORED = "Y pointed down (the layout has it upwards: change the signs of y_mm{})"
 
 
 def likely_mistake(
@@ -181,12 +180,10 @@ def likely_mistake(
 
 def _misfit_px(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: ObjPose) -> float:
     """Returns the RMS distance of all corners, those left out by the pose too, from where the layout has them."""
-    corners = layout.corners_mm[detected.rows].reshape(-1, 2)
-    xyz_camera = pose.camera_from_obj @ np.column_stack([corners, np.zeros(len(corners))])
-    if xyz_camera[:, 2].min() <= 0 or pose.foreshortening <= 0:
+    if pose.foreshortening <= 0:
         return np.inf
-    off = detected.corners_px.reshape(-1, 2) - camera.project(xyz_camera)
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
+    xy = layout.corners_mm[detected.rows].reshape(-1, 2)
+    return reprojection_rms(pose.camera_from_obj, xy, detected.corners_px.reshape(-1, 2), camera)
 
 
 def _mistakes(corners: np.ndarray) -> list[Candidate]:
@@ -197,6 +194,6 @@ def _mistakes(corners: np.ndarray) -> list[Candidate]:
     middles = corners.mean(axis=1, keepdims=True)
     moved = corners - middles + middles * down
     found = [(words, np.roll(corners, -turns, axis=1)) for turns, words in TURNS.items()]
-    for words, other in ((MIRRORED, mirrored), (PLACES_MIRRORED, moved)):
+    for words, other in ((MIRRORED.format(" and angle_deg"), mirrored), (MIRRORED.format(""), moved)):
         found += [(words, other), (f"{words} and {TURNS[2]}", np.roll(other, 2, axis=1))]
     return [Candidate(words, lambda other=other: other) for words, other in found]

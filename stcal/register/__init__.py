@@ -1,4 +1,4 @@
-"""Registration of two instruments from corresponding points; read ``pipeline.py`` first."""
+"""Registration of two instruments from corresponding points; read ``registration.py`` first."""
 
 import lazy_loader
 

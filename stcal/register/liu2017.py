@@ -8,19 +8,14 @@ transform of the smallest variance is the answer (eq. 9); it is not fitted again
 state the limit for orthogonality and the number of samples; both are options here.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.rigid import Affine
-from stcal.parallel import one_thread
 
-SIZES = range(4, 41, 2)
-"""Sizes N of a sample in the paper's figure 6."""
-SWEEP_TRIES = 200
-"""Number of samples of each size for this figure."""
 ASSUMED = (
     "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
     "sample, and the variance of their distances"
@@ -58,14 +53,12 @@ class Liu2017Options:
 
     def __post_init__(self):
         require_fields(self, "liu2017")
-        needed = {
-            "sample": (self.sample >= 4, "4 or more points for twelve parameters"),
-            "share": (0 < self.share <= 1, "more than 0 and at most 1"),
-        }
-        needed |= {
-            name: (getattr(self, name) > 0, "a positive number") for name in ("limit_mm", "orthogonal_within", "tries")
-        }
-        for name, (fits, words) in needed.items():
+        positive = ("limit_mm", "orthogonal_within", "tries")
+        for name, fits, words in (
+            ("sample", self.sample >= 4, "4 or more points for twelve parameters"),
+            ("share", 0 < self.share <= 1, "more than 0 and at most 1"),
+            *((name, getattr(self, name) > 0, "a positive number") for name in positive),
+        ):
             if not fits:
                 raise InputError("E-LIU-OPTIONS", f"liu2017: {name} is {getattr(self, name):g}; {words} needed")
 
@@ -99,7 +92,7 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
         )
     best, least, acceptable = None, np.inf, 0
     shares = np.full(options.tries, np.nan)
-    for i, sample, b_from_a, error in _orthogonal_samples(xyz_a, xyz_b, options, seed):
+    for i, sample, b_from_a, error in orthogonal_samples(xyz_a, xyz_b, options, seed):
         near, others = error < options.limit_mm, np.delete(error, sample)
         inside = others[others < options.limit_mm]
         shares[i] = len(inside) / len(others)
@@ -119,7 +112,7 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
     return Liu2017Result(*best, acceptable, shares)
 
 
-def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int):
+def orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int):
     """Yields the tries whose 3×3 part is orthogonal enough: number, sample, transform, and errors (n,)."""
     rng, count = np.random.default_rng(seed), len(xyz_a)
     for i in range(options.tries):
@@ -127,30 +120,3 @@ def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Op
         b_from_a = affine_least_squares(xyz_a[sample], xyz_b[sample])
         if np.abs(b_from_a.linear.T @ b_from_a.linear - np.eye(3)).max() <= options.orthogonal_within:
             yield i, sample, b_from_a, np.linalg.norm(xyz_b - b_from_a @ xyz_a, axis=1)
-
-
-@dataclass(frozen=True, slots=True)
-class SampleSize:
-    """``points`` of each sample; ``best``, ``median`` : share of the others within the limit, or NaN; ``orthogonal``,
-    ``acceptable`` : number of such among the ``tries``."""
-
-    points: int
-    best: float
-    median: float
-    orthogonal: int
-    acceptable: int
-    tries: int
-
-
-@one_thread()
-def sample_sizes(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> list[SampleSize]:
-    """Returns the data of the paper's figure 6: samples of every even size from 4 to 40."""
-    sizes = []
-    for points in SIZES:
-        if points < len(xyz_a):
-            swept = replace(options, sample=points, tries=min(options.tries, SWEEP_TRIES))
-            samples = _orthogonal_samples(xyz_a, xyz_b, swept, seed)
-            shares = np.array([(np.delete(error, own) < swept.limit_mm).mean() for _, own, _, error in samples])
-            best, median = (float(shares.max()), float(np.median(shares))) if len(shares) else (np.nan, np.nan)
-            sizes.append(SampleSize(points, best, median, len(shares), int((shares > swept.share).sum()), swept.tries))
-    return sizes

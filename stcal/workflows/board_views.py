@@ -44,7 +44,7 @@ from stcal.io.images import (
     size_fault,
 )
 from stcal.labels import DotLabel
-from stcal.locate.calibration import CalibrationImages
+from stcal.locate.layout_calibration import CalibrationImages
 from stcal.parallel import Progress
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board

@@ -16,9 +16,9 @@ from stcal.io.table import Table, read_table
 from stcal.parallel import one_thread
 from stcal.register import register
 from stcal.register.liu2017 import Liu2017Options
-from stcal.register.page import error_table, matrix_table
-from stcal.register.pairs import WHAT, Pairs
-from stcal.register.result import ErrorFigures, Registration
+from stcal.register.point_pairs import WHAT, Pairs
+from stcal.register.registered import ErrorFigures, Registration
+from stcal.register.registration_report import error_table, matrix_table
 from stcal.register.workspace import Findings, findings
 from stcal.report import document
 from stcal.robot.identification.adjustment import State, tips

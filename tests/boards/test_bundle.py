@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import load_layout, load_plan
-from stcal.locate.pipeline import run
+from stcal.locate.scenes import run
 from tests.boards.drawn import kalibr_tag
 from tests.outcome import fails_with
 

@@ -1,7 +1,8 @@
 """JSON files: any content is a value or one line of error; result files say what is wrong where."""
 
 import json
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from pydantic import ValidationError
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
-from stcal.io.json import ByFace, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
+from stcal.io.json import ByFace, Keys, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
 from tests.outcome import fails_with
 
 
@@ -113,3 +114,34 @@ def test_any_bytes_are_a_value_or_one_line(tmp_path_factory, content):
     except InputError as error:
         message = str(error)
     assert "\n" not in message
+
+
+@dataclass(frozen=True)
+class Fit:
+    pose: Rigid
+    sigma: np.ndarray
+    worst: float = np.inf
+
+    def share(self) -> float:
+        return 0.5
+
+
+@dataclass(frozen=True)
+class Found:
+    fit: Fit
+    names: tuple[str, ...] = ("a",)
+
+
+class WithKeys(ResultFile):
+    every: Annotated[Fit, Keys()]
+    named: Annotated[Found, Keys("names fit.share fit.worst")]
+
+
+def test_an_object_of_a_file_holds_named_attributes_of_a_result_or_all_its_fields():
+    fit = Fit(Rigid(), np.array([1.0, 2.0]))
+    content = WithKeys.model_validate({"every": fit, "named": Found(fit)}).content()
+    assert content["every"] == {"pose": np.eye(4).tolist(), "sigma": [1.0, 2.0], "worst": None}
+    assert content["named"] == {"names": ["a"], "fit": {"share": 0.5, "worst": None}}
+    assert WithKeys.model_validate(content).content() == content
+    with pytest.raises(ValidationError, match="an object with pose sigma worst needed"):
+        WithKeys.model_validate(content | {"every": {"pose": 1}})

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses
-from stcal.io.poses.rotations import FIRST, INVERTED, LAST, READINGS, explaining
+from stcal.io.poses.rotations import FIRST, INVERTED, LAST, READINGS
 from stcal.io.table import read_table
 
 XYZW = np.array([[0.1, 0.2, 0.3, 0.0], [0.5, -0.5, 0.1, 0.0]])
@@ -48,13 +48,10 @@ def test_the_reading_that_fits_is_found(wrong):
     held = np.swapaxes(true, 1, 2) if wrong.conjugated else true
     wxyz = Poses(held, np.zeros((12, 3))).quaternions()
     read = Poses.from_quaternions(wxyz[:, np.argsort(wrong.order)], np.zeros((12, 3))).rotation
-    found = explaining(read, lambda rotations: float(np.abs(rotations - true).max()))
-    assert found is not None
-    assert found[0] is wrong
-    assert found[1] < 1e-9
+    off = {each.held: np.abs(each.rotations(read) - true).max() for each in READINGS}
+    assert [held for held in off if off[held] < 1e-9] == [wrong.held]
 
 
-def test_nothing_is_said_where_all_readings_fit_alike():
+def test_half_turns_are_their_own_inverse():
     half = np.repeat(Rotation.from_rotvec([np.pi, 0, 0]).as_matrix()[None], 5, axis=0)
     np.testing.assert_allclose(INVERTED.rotations(half), half, atol=1e-12)
-    assert explaining(half, lambda rotations: float(np.abs(rotations - rotations.mean(0)).max())) is None

@@ -10,7 +10,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.locate.layout import TargetLayout
-from stcal.locate.pipeline import locate_image
+from stcal.locate.scenes import locate_image
 from tests.outcome import fails_with, refuses
 from tests.support.areas import homography, rendered
 

@@ -11,7 +11,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import TargetLayout
-from stcal.locate.pipeline import LocateOptions, locate_scene, run
+from stcal.locate.scenes import LocateOptions, locate_scene, run
 from stcal.synthetic.optics import Light, expose, moved
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 

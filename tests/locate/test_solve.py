@@ -8,7 +8,8 @@ from stcal.boards.design import BoardView, ChessboardDesign, view_of
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration import (
+from stcal.locate.layout import LayoutPlan, obj_from_plane
+from stcal.locate.layout_calibration import (
     CalibratedLayout,
     ImageCorners,
     _by_board_corners,
@@ -16,7 +17,6 @@ from stcal.locate.calibration import (
     calibrate,
     plane_points,
 )
-from stcal.locate.layout import LayoutPlan, obj_from_plane
 from tests.outcome import fails_with, refuses
 from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
 

@@ -6,7 +6,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.mistakes import mirrored_ratio
+from stcal.register.doubts import mirrored_ratio
 from tests.outcome import fails_with, refuses
 from tests.support.point_pairs import scene
 

@@ -8,26 +8,16 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Affine, Rigid, Similarity
-from stcal.register.models import (
-    MODELS,
-    fit,
-    hypotheses,
-    jacobian,
-    leverages,
-    parts,
-    squares,
-    unit_covariance,
-    whitened,
-)
+from stcal.register.transforms import MODELS, Problem, hypotheses, jacobian, parts
 from tests.outcome import fails_with
 from tests.support.point_pairs import make_scene
 
 NOISE = ("equal", "weights", "matrices")
 
 
-def precision_of(kind: str, rng: np.random.Generator, n: int) -> np.ndarray | None:
+def precision_of(kind: str, rng: np.random.Generator, n: int) -> np.ndarray:
     if kind == "equal":
-        return None
+        return np.ones(n)
     if kind == "weights":
         return rng.uniform(0.2, 5, n)
     root = Rotation.random(n, random_state=1).as_matrix() * rng.uniform(0.3, 3, (n, 1, 3))
@@ -50,11 +40,11 @@ def perturbed(transform, step: np.ndarray):
 def test_the_fit_is_the_minimum_that_a_general_optimiser_finds(model, kind):
     rng = np.random.default_rng(1)
     s = make_scene(rng, 12, sigma_mm=3)
-    precision = precision_of(kind, rng, 12)
-    found = fit(model, s.xyz_a, s.xyz_b, precision)
+    problem = Problem(model, s.xyz_a, s.xyz_b, precision_of(kind, rng, 12))
+    found = problem.fit()
 
     def cost(step):
-        return whitened(s.xyz_b - perturbed(found, step) @ s.xyz_a, precision).ravel()
+        return problem.whitened(problem.residuals(perturbed(found, step))).ravel()
 
     # from elsewhere, so that it does not merely stay
     step = [1e-3, -1e-3, 2e-3, 1] * 3 if model.name == "affine" else [0.01, -0.01, 0.02, 0, 0, 0, 0]
@@ -62,7 +52,7 @@ def test_the_fit_is_the_minimum_that_a_general_optimiser_finds(model, kind):
     best = least_squares(cost, start, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=2000)
     mine = (cost(np.zeros(model.parameters)) ** 2).sum()
     assert mine == pytest.approx(2 * best.cost, rel=1e-8)
-    assert mine == pytest.approx(squares(s.xyz_b - found @ s.xyz_a, precision).sum())
+    assert mine == pytest.approx(problem.squares(found).sum())
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=lambda m: m.name)
@@ -70,17 +60,14 @@ def test_the_fit_is_the_minimum_that_a_general_optimiser_finds(model, kind):
 def test_the_covariance_is_that_of_numeric_derivatives(model, kind):
     rng = np.random.default_rng(2)
     s = make_scene(rng, 9)
-    precision = precision_of(kind, rng, 9)
-    transform = fit(model, s.xyz_a, s.xyz_b, precision)
-    h = 1e-5
-    columns = [
-        whitened((perturbed(transform, h * e) @ s.xyz_a) - (perturbed(transform, -h * e) @ s.xyz_a), precision).ravel()
-        / (2 * h)
-        for e in np.eye(model.parameters)
+    problem = Problem(model, s.xyz_a, s.xyz_b, precision_of(kind, rng, 9))
+    transform, h = problem.fit(), 1e-5
+    moved = [
+        perturbed(transform, h * e) @ s.xyz_a - perturbed(transform, -h * e) @ s.xyz_a for e in np.eye(model.parameters)
     ]
-    slope = np.column_stack(columns)
+    slope = np.column_stack([problem.whitened(each).ravel() / (2 * h) for each in moved])
     # The origin of a is 1 m from the points, so that the parameters are correlated to 0.99: compare N⁻¹ N with 1.
-    product = unit_covariance(model, transform, s.xyz_a, precision) @ (slope.T @ slope)
+    product = problem.unit_covariance(transform) @ (slope.T @ slope)
     scale = np.sqrt(np.diag(slope.T @ slope))
     np.testing.assert_allclose(product * scale[:, None] / scale, np.eye(model.parameters), atol=2e-4)
 
@@ -90,10 +77,8 @@ def test_the_covariance_is_that_of_numeric_derivatives(model, kind):
 def test_leverages_sum_to_the_parameters(model, kind):
     rng = np.random.default_rng(3)
     s = make_scene(rng, 15)
-    precision = precision_of(kind, rng, 15)
-    used = np.arange(15) < 12
-    transform = fit(model, s.xyz_a[used], s.xyz_b[used], None if precision is None else precision[used])
-    found = leverages(model, transform, s.xyz_a, used, precision)
+    problem, used = Problem(model, s.xyz_a, s.xyz_b, precision_of(kind, rng, 15)), np.arange(15) < 12
+    found = problem.leverages(problem[used].fit(), used)
     assert np.trace(found, axis1=1, axis2=2)[used].sum() == pytest.approx(model.parameters, rel=1e-9)
     # inside, a point's own share is less than all of it; outside, extrapolation has no bound
     assert np.linalg.eigvalsh(found[used]).max() < 1
@@ -103,12 +88,11 @@ def test_leverage_foretells_the_residual_without_the_point():
     """Of a linear model exactly: r without i = (1 − H)⁻¹ r."""
     rng = np.random.default_rng(4)
     s, model = make_scene(rng, 9, sigma_mm=2), MODELS["affine"]
-    precision = precision_of("matrices", rng, 9)
-    transform = fit(model, s.xyz_a, s.xyz_b, precision)
-    spread = leverages(model, transform, s.xyz_a, np.ones(9, bool), precision)
-    own = whitened(s.xyz_b - transform @ s.xyz_a, precision)
-    rest = np.arange(9) != 4
-    without = whitened(s.xyz_b - fit(model, s.xyz_a[rest], s.xyz_b[rest], precision[rest]) @ s.xyz_a, precision)
+    problem = Problem(model, s.xyz_a, s.xyz_b, precision_of("matrices", rng, 9))
+    transform = problem.fit()
+    spread = problem.leverages(transform, np.ones(9, bool))
+    own = problem.whitened(problem.residuals(transform))
+    without = problem.whitened(problem.residuals(problem[np.arange(9) != 4].fit()))
     np.testing.assert_allclose(np.linalg.solve(np.eye(3) - spread[4], own[4]), without[4], rtol=1e-6)
 
 
@@ -118,7 +102,7 @@ def test_many_samples_at_once_are_single_fits(model):
     samples = np.random.default_rng(6).permutation(30)[: 6 * model.sample].reshape(6, model.sample)
     linear, translation = hypotheses(model, s.xyz_a[samples], s.xyz_b[samples])
     for sample, matrix, shift in zip(samples, linear, translation, strict=True):
-        one, at = parts(fit(model, s.xyz_a[sample], s.xyz_b[sample]))
+        one, at = parts(Problem(model, s.xyz_a[sample], s.xyz_b[sample], np.ones(len(sample))).fit())
         np.testing.assert_allclose(matrix, one, atol=1e-9)
         np.testing.assert_allclose(shift, at, atol=1e-6)
 
@@ -130,12 +114,12 @@ def test_frames_may_be_moved(seed, name):
     s, model = make_scene(rng, 8), MODELS[name]
     weights = rng.uniform(0.5, 2, 8)
     moved = make_scene(rng, 3).b_from_a
-    found = fit(model, s.xyz_a, s.xyz_b, weights)
+    found = Problem(model, s.xyz_a, s.xyz_b, weights).fit()
     np.testing.assert_allclose(
-        fit(model, s.xyz_a, moved @ s.xyz_b, weights) @ s.xyz_a, moved @ (found @ s.xyz_a), atol=1e-7
+        Problem(model, s.xyz_a, moved @ s.xyz_b, weights).fit() @ s.xyz_a, moved @ (found @ s.xyz_a), atol=1e-7
     )
     np.testing.assert_allclose(
-        fit(model, moved @ s.xyz_a, s.xyz_b, weights) @ (moved @ s.xyz_a), found @ s.xyz_a, atol=1e-7
+        Problem(model, moved @ s.xyz_a, s.xyz_b, weights).fit() @ (moved @ s.xyz_a), found @ s.xyz_a, atol=1e-7
     )
 
 

@@ -5,9 +5,8 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.mistakes import moved_meanwhile
-from stcal.register.models import MODELS
-from stcal.register.pairs import PointNoise, Problem
+from stcal.register.groups import moved_meanwhile
+from stcal.register.transforms import MODELS, problem_of
 from tests.outcome import fails_with
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
@@ -54,7 +53,7 @@ def test_a_drift_is_told_from_a_jump():
 
 def sound(seed: int) -> bool:
     a, b = points(seed, 20 + seed % 40)
-    problem = Problem(MODELS[("rigid", "similarity", "affine")[seed % 3]], a, b, PointNoise())
+    problem = problem_of(MODELS[("rigid", "similarity", "affine")[seed % 3]], a, b)
     return moved_meanwhile(problem, problem.fit()) is not None
 
 

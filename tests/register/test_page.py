@@ -10,8 +10,7 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import json_text
 from stcal.register import Pairs, register
-from stcal.register.file import RegistrationFile
-from stcal.register.page import FEW_ROWS, registration_report
+from stcal.register.registration_report import FEW_ROWS, RegistrationFile, registration_report
 from stcal.register.workspace import GRID, findings
 from stcal.report.document import Section
 

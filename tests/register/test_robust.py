@@ -7,10 +7,9 @@ from scipy.stats import beta
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
-from stcal.register.mistakes import lies_together, sphericity, two_groups, wilks_bound
-from stcal.register.models import MODELS, fit
-from stcal.register.pairs import PointNoise, Problem
-from stcal.register.robust import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
+from stcal.register.consensus import CLEAN_SETS_WITH_OUTLIER, by_scale, chernoff, deletion_squares, search
+from stcal.register.groups import lies_together, sphericity, two_groups, wilks_bound
+from stcal.register.transforms import MODELS, Problem, problem_of
 from tests.outcome import fails_with
 from tests.support.point_pairs import SIGMA_MM, directions, scene
 
@@ -124,7 +123,7 @@ def test_noise_along_one_axis_that_the_fit_carries_into_the_others():
         rng = np.random.default_rng([trial, 12])
         s = scene([trial, 12], 100, sigma_mm=0.01)
         b = s.xyz_b + rng.normal(0, 0.3, (100, 1)) * [0, 0.8, 0.6]
-        assert two_groups(Problem(RIGID, s.xyz_a, b, PointNoise()), rng) is None
+        assert two_groups(problem_of(RIGID, s.xyz_a, b), rng) is None
 
 
 def test_wilks_bound_is_above_the_distribution():
@@ -151,16 +150,12 @@ def test_sphericity_is_a_p_value():
 
 def test_deletion_residuals_are_those_of_the_fit_without_the_point():
     """Exactly so of the affine model, which is linear, with σ of every point its own."""
-    s, model = scene(24, 12), MODELS["affine"]
-    noise = PointNoise(np.random.default_rng(0).uniform(0.5, 2, 12))
-    whole = np.ones(12, bool)
-    found = fit(model, s.xyz_a, s.xyz_b, noise.precision)
-    problem = Problem(model, s.xyz_a, s.xyz_b, noise)
-    with_it = deletion_squares(problem, found, whole)
+    s, whole = scene(24, 12), np.ones(12, bool)
+    problem = Problem(MODELS["affine"], s.xyz_a, s.xyz_b, np.random.default_rng(0).uniform(0.5, 2, 12))
+    with_it = deletion_squares(problem, problem.fit(), whole)
     for i in range(12):
         rest = np.arange(12) != i
-        less = fit(model, s.xyz_a[rest], s.xyz_b[rest], noise[rest].precision)
-        without = deletion_squares(problem, less, rest)
+        without = deletion_squares(problem, problem[rest].fit(), rest)
         assert with_it[i] == pytest.approx(without[i], rel=1e-6)
 
 
@@ -340,18 +335,17 @@ def test_false_alarms_of_the_search_are_rare():
     for trial in range(30):
         s = scene([trial, 5], 15)
         total = ((s.xyz_b - align_rigid(s.xyz_b, s.xyz_a) @ s.xyz_a) ** 2).sum()
-        problem = Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise())
+        problem = problem_of(RIGID, s.xyz_a, s.xyz_b)
         found = search(problem, by_scale(RIGID, 15, total), np.random.default_rng(0))
         assert found.value > np.log(1e-3)
 
 
 def test_groups():
     s = scene(22, 60, 0.4, "one shift", (1.5, 1.5))
-    groups = two_groups(Problem(RIGID, s.xyz_a, s.xyz_b, PointNoise()), np.random.default_rng(0))
-    near = [((s.xyz_b - t @ s.xyz_a) ** 2).sum(1) for t in groups.transforms]
+    groups = two_groups(problem_of(RIGID, s.xyz_a, s.xyz_b), np.random.default_rng(0))
+    near = [((s.xyz_b - t @ s.xyz_a) ** 2).sum(1) for t in groups]
     assert ((near[0] < near[1]) == s.clean).mean() > 0.97
-    assert not groups.in_space
     none = scene(23, 60)
-    assert two_groups(Problem(RIGID, none.xyz_a, none.xyz_b, PointNoise()), np.random.default_rng(0)) is None
+    assert two_groups(problem_of(RIGID, none.xyz_a, none.xyz_b), np.random.default_rng(0)) is None
     assert lies_together(s.xyz_a, s.xyz_a[:, 0] > 800)
     assert not lies_together(s.xyz_a, s.clean)

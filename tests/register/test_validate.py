@@ -6,15 +6,14 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import align_rigid
 from stcal.register import register
-from stcal.register.models import MODELS
-from stcal.register.pairs import PointNoise, Problem
-from stcal.register.result import held_out
+from stcal.register.registered import held_out
+from stcal.register.transforms import MODELS, problem_of
 from tests.support.point_pairs import SIGMA_MM, scene
 
 
 def test_leave_one_out_is_what_it_says():
     s = scene(0, 7)
-    problem = Problem(MODELS["rigid"], s.xyz_a, s.xyz_b, PointNoise())
+    problem = problem_of(MODELS["rigid"], s.xyz_a, s.xyz_b)
     found = held_out(problem, lambda rows: problem[rows].fit(), s.clean, 7, 0)
     for i, error in zip(found.rows, found.error_mm, strict=True):
         rest = np.arange(7) != i
@@ -43,7 +42,7 @@ def test_no_folds_and_too_few_points():
 
 def test_a_fold_that_cannot_be_fitted_is_left_out():
     s = scene(3, 12)
-    problem = Problem(MODELS["rigid"], s.xyz_a, s.xyz_b, PointNoise())
+    problem = problem_of(MODELS["rigid"], s.xyz_a, s.xyz_b)
 
     def sometimes(rows):
         if 0 not in rows:

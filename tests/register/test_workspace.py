@@ -5,8 +5,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
-from stcal.register.models import MODELS
-from stcal.register.pairs import Problem, noise_of
+from stcal.register.transforms import MODELS, Problem, problem_of
 from stcal.register.workspace import MOST_POINTS, cubes, residual_field
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])
@@ -25,13 +24,13 @@ def bent(seed: int, n: int, sigma: float = SIGMA, half: float = 100.0):
     return a, B_FROM_A @ (a + bend(a)) + rng.normal(0, sigma, a.shape)
 
 
-def problem_of(found, a, b, covariances=None) -> Problem:
-    return Problem(MODELS[found.model], a, b, noise_of(len(a), None, covariances))
+def inputs(found, a, b, covariances=None) -> Problem:
+    return problem_of(MODELS[found.model], a, b, None, covariances)
 
 
 def fitted(a, b):
     found = register(a, b, method="least-squares", folds=0)
-    return found, residual_field(found, problem_of(found, a, b))
+    return found, residual_field(found, inputs(found, a, b))
 
 
 @pytest.mark.slow
@@ -103,7 +102,7 @@ def test_bent_points_are_taken_back_and_wild_ones_are_not():
     found = register(a, b, threshold_mm=0.25, folds=0)
     lost = set(found.outliers) - set(wild)
     assert len(lost) >= 5
-    field = residual_field(found, problem_of(found, a, b))
+    field = residual_field(found, inputs(found, a, b))
     assert set(field.taken_back) <= lost
     assert len(field.taken_back) > len(lost) / 2
 
@@ -118,7 +117,7 @@ def test_points_of_different_sigma():
     errors = {}
     for name, given in (("told", sigma**2), ("untold", None)):
         found = register(a, b, method="least-squares", covariances=given, folds=0)
-        field = residual_field(found, problem_of(found, a, b, given))
+        field = residual_field(found, inputs(found, a, b, given))
         off = B_FROM_A @ (new + bend(new)) - found.b_from_a @ new - field.at(new)[0]
         errors[name] = np.linalg.norm(off, axis=1).mean()
         if name == "told":
@@ -135,7 +134,7 @@ def test_cubes_by_hand():
     b = B_FROM_A @ a + np.where(far[:, None], [3.0, 0.0, 4.0], 0.0)
     found = register(a, b, threshold_mm=10.0, folds=0)
     assert found.inliers.all()
-    result = cubes(found, problem_of(found, a, b))
+    result = cubes(found, inputs(found, a, b))
     np.testing.assert_allclose(result.middle, [800, 200, 700])
     np.testing.assert_allclose(result.sides_mm, [100, 200, 300, 400])
     inner = result.errors[0]
@@ -163,7 +162,7 @@ def test_points_in_the_cube_are_held_out():
         a = np.vstack([rng.uniform(-50, 50, (10, 3)), rng.uniform(-50, 50, (10, 3)) + np.array([0, 0, 150])])
         b = B_FROM_A @ a + rng.normal(0, 1, a.shape)
         found = register(a, b, threshold_mm=50.0, folds=0)
-        result = cubes(found, problem_of(found, a, b), folds=10)
+        result = cubes(found, inputs(found, a, b), folds=10)
         inside.append(result.errors[-1][-1].rms_mm if result.errors[-1][-1] else np.nan)
     # 20 points: held out 1 + 6/60 of the noise's variance of 3, in sample 1 − 6/60
     assert np.sqrt(3) < np.nanmean(inside) < np.sqrt(3 * 1.25)
@@ -172,9 +171,9 @@ def test_points_in_the_cube_are_held_out():
 def test_cubes_without_points_or_width():
     a, b = bent(0, 8)
     found = register(a, b, folds=0)
-    assert cubes(found, problem_of(found, a, b)) is None
+    assert cubes(found, inputs(found, a, b)) is None
     rng = np.random.default_rng(0)
     flat = np.vstack([rng.uniform(-50, 50, (20, 3)) * [1, 1, 0], rng.uniform(-200, 200, (60, 3))])
     found = register(flat, B_FROM_A @ flat, model="affine", method="least-squares", folds=0)
-    result = cubes(found, problem_of(found, flat, B_FROM_A @ flat))
+    result = cubes(found, inputs(found, flat, B_FROM_A @ flat))
     assert result.sides_mm[0] > 100  # the plane in the middle determines no affine transform: left out

@@ -11,9 +11,9 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, refine_planar_pose
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration import CalibratedLayout, CalibrationImages, calibrate
 from stcal.locate.estimate import SeenTags, locate, merge
 from stcal.locate.layout import LayoutPlan, TargetLayout
+from stcal.locate.layout_calibration import CalibratedLayout, CalibrationImages, calibrate
 from stcal.locate.patent import PatentOptions, locate_as_patent
 from stcal.locate.verdict import Decision, VerdictOptions, judge
 

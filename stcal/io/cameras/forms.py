@@ -92,7 +92,7 @@ def _region(stated: object) -> np.ndarray | None:
     try:
         region = None if stated is None else np.array(stated, float)
     except (TypeError, ValueError):
-        region = np.full(1, np.nan)  # foreign.refused below
+        region = np.full(1, np.nan)  # refused below
     if region is not None and not region.size:
         return None
     if region is not None and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):

@@ -86,8 +86,12 @@ def pass_over(parts: Collection[str], what: str = "") -> None:
     """Add parts of a camera file to what is passed over, the first ``SHOWN`` by name; ``what`` : what they are."""
     collected = _passed_over.get()
     if collected is not None and parts:
-        more = f" and {len(parts) - SHOWN} more" if len(parts) > SHOWN else ""
-        collected.append(f"{what}{', '.join(part[:40] for part in list(parts)[:SHOWN])}{more}")
+        collected.append(f"{what}{_first(list(parts))}")
+
+
+def _first(names: list[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(name[:40] for name in names[:SHOWN]) + more
 
 
 def plain(key: object) -> str:
@@ -165,15 +169,15 @@ def require_known(unread: Mapping, harmless: Collection[str] = (), undistorted: 
             unknown.append(".".join(path))
         elif not is_neutral(value):
             taken = "call it distortion_coefficients if it is OpenCV's k1, k2, p1, p2, k3 …; " if coefficients else ""
+            text = " ".join(str(value).split())
+            shown = text if len(text) <= 40 else f"{text[:40]} …"
             raise InputError(
                 "E-CAMERA-KEY",
-                f"{'.'.join(path)[:80]} = {_short(value)} may change the projection and is not "
+                f"{'.'.join(path)[:80]} = {shown} may change the projection and is not "
                 f"supported; {taken}remove it if the lens is right without it, or calibrate without it",
             )
     if unknown:
-        more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""
-        first = ", ".join(key[:40] for key in unknown[:SHOWN])
-        note(f"not known, and passed over: {first}{more}")
+        note(f"not known, and passed over: {_first(unknown)}")
 
 
 def _with_numbers(unread: Mapping) -> list[str]:
@@ -186,11 +190,6 @@ def _with_numbers(unread: Mapping) -> list[str]:
         if not isinstance(value, str | bool) and (numbers.any() if numbers.size else is_nested) and not is_identity:
             named.append(".".join(keys))
     return named
-
-
-def _short(value: object) -> str:
-    text = " ".join(str(value).split())
-    return text if len(text) <= 40 else f"{text[:40]} …"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -63,11 +63,6 @@ HEAD_BYTES = 116
 """Length of the text at the beginning of a file; scipy writes the time into it."""
 
 
-def is_mat(content: bytes) -> bool:
-    """Return True if a file begins as a MATLAB file."""
-    return content.startswith(HEADS)
-
-
 def from_mat(content: bytes, choice: str) -> CameraModel | ForeignLens:
     """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras."""
     if content.startswith(HEADS[1]):

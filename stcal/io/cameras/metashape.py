@@ -38,12 +38,6 @@ def is_metashape(text: str) -> bool:
     return text.lstrip().startswith("<") and ElementTree.fromstring(text).tag in ("calibration", *ROOTS)
 
 
-def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:
-    """Return the camera of a calibration, or of exported cameras; errors as of the functions for them."""
-    root = ElementTree.fromstring(text)
-    return from_calibration(root) if root.tag == "calibration" else from_cameras(root, choice)
-
-
 def from_calibration(root: ElementTree.Element) -> CameraModel | ForeignLens:
     """Return the camera of a ``<calibration>``; a foreign lens with ``b2``, ``p3``, ``p4``, or a frame camera with
     ``k4``."""
@@ -93,9 +87,12 @@ def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: floa
     return ForeignLens(f"Metashape's lens with {own}", project, camera.width, camera.height)
 
 
-def from_cameras(root: ElementTree.Element, choice: str) -> CameraModel | ForeignLens:
-    """Return a sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance."""
-    sensors = {}
+def from_metashape(text: str, choice: str) -> CameraModel | ForeignLens:
+    """Return the lens of a ``<calibration>``, or a sensor of exported cameras, or of a project's ``doc.xml``, as
+    adjusted, with its covariance."""
+    root, sensors = ElementTree.fromstring(text), {}
+    if root.tag == "calibration":
+        return from_calibration(root)
     for number, sensor in enumerate(root.iter("sensor")):
         calibrations = sensor.findall("calibration")
         adjusted = [item for item in calibrations if item.get("class", "adjusted") == "adjusted"] or calibrations

@@ -182,7 +182,10 @@ def _read(path: Path, name: str) -> CameraModel | ForeignLens:
         ) from error
 
 
-BINARY_FORMATS = ((matlab.is_mat, matlab.from_mat), (forms.is_colmap_binary, forms.from_colmap_binary))
+BINARY_FORMATS = (
+    (lambda content: content.startswith(matlab.HEADS), matlab.from_mat),
+    (forms.is_colmap_binary, forms.from_colmap_binary),
+)
 """For each binary format a test of the content and a reader, which is given the content and a name."""
 TEXT_FORMATS: tuple[tuple[Callable[[str], bool], Callable[[str, str], CameraModel | ForeignLens]], ...] = (
     (lambda text: COLMAP_LINE.search(text) is not None, _from_colmap),

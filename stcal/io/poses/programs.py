@@ -1,9 +1,7 @@
 """Poses in the form of other programs: static transforms of ROS, in metres, and COLMAP's ``images.txt``."""
 
-import ast
 import json
 import shlex
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from xml.sax.saxutils import quoteattr
@@ -41,12 +39,6 @@ def xyzw(pose: Rigid) -> list[float]:
     return [float(v) for v in Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True)]
 
 
-def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
-    """Return the pose of a translation in metres and a quaternion; inverse of :func:`metres` and :func:`xyzw`."""
-    turn = Rotation.from_quat([float(v) for v in quaternion_xyzw]).as_matrix()
-    return Rigid(turn, [METRE_MM * float(v) for v in translation_m])
-
-
 def messages(statics: Iterable[Static]) -> str:
     """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
     documents = [
@@ -63,16 +55,6 @@ def messages(statics: Iterable[Static]) -> str:
     return "---\n".join(yaml.safe_dump(each, sort_keys=False, allow_unicode=True) for each in documents)
 
 
-def read_messages(text: str) -> list[Static]:
-    """Return the transforms in a text of :func:`messages`."""
-    statics = []
-    for document in yaml.safe_load_all(text):
-        transform = document["transform"]
-        pose = pose_of_metres([transform["translation"][c] for c in "xyz"], [transform["rotation"][c] for c in "xyzw"])
-        statics.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
-    return statics
-
-
 def fixed_joint(each: Static) -> str:
     """Return a fixed joint of URDF."""
     name = quoteattr(f"{each.parent}_to_{each.child}")
@@ -87,26 +69,12 @@ def fixed_joint(each: Static) -> str:
     )
 
 
-def static_of_joint(joint: ElementTree.Element) -> Static:
-    """Return the transform of a joint of :func:`fixed_joint`."""
-    parts = {part.tag: part.attrib for part in joint}
-    place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
-    pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
-    return Static(parts["parent"]["link"], parts["child"]["link"], pose)
-
-
 def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     """Return a shell script, with lines of a comment, that calls ``ros2 run tf2_ros static_transform_publisher`` for
     each transform, all but the last one in the background."""
     calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
     head = ["#!/bin/sh", *(f"# {line}" for line in said)]
     return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
-
-
-def read_ros2_commands(text: str) -> list[Static]:
-    """Return the transforms in a script of :func:`ros2_commands`."""
-    calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
-    return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
 
 
 def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
@@ -126,15 +94,6 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     return "\n".join(lines) + "\n</launch>\n"
 
 
-def read_ros1_launch(text: str) -> list[Static]:
-    """Return the transforms in a launch file of :func:`ros1_launch`."""
-    statics = []
-    for node in ElementTree.fromstring(text).findall("node"):
-        words = node.attrib["args"].split()
-        statics.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
-    return statics
-
-
 def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     """Return a launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
     lines = [f"# {line}" for line in said]
@@ -149,13 +108,6 @@ def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
 
 
-def read_ros2_launch(text: str) -> list[Static]:
-    """Return the transforms in a launch file of :func:`ros2_launch`."""
-    words = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.keyword) and node.arg]
-    lists = [ast.literal_eval(node) for node in words if isinstance(node, ast.List)]
-    return [_static_of_arguments(arguments) for arguments in lists]
-
-
 def _arguments(each: Static) -> list[str]:
     values = zip(ARGUMENTS, _pose_words(each.pose), strict=True)
     pairs = [("--frame-id", each.parent), ("--child-frame-id", each.child), *values]
@@ -164,12 +116,6 @@ def _arguments(each: Static) -> list[str]:
 
 def _pose_words(pose: Rigid) -> list[str]:
     return [*plain_numbers(metres(pose), METRE_DIGITS), *plain_numbers(xyzw(pose), QUATERNION_DIGITS)]
-
-
-def _static_of_arguments(words: list[str]) -> Static:
-    given = dict(zip(words[::2], words[1::2], strict=True))
-    values = [given[name] for name in ARGUMENTS]
-    return Static(given["--frame-id"], given["--child-frame-id"], pose_of_metres(values[:3], values[3:]))
 
 
 def plain_numbers(values, digits: int) -> list[str]:

@@ -1,7 +1,7 @@
 """Conventions and units of the numbers that state a rotation, and mistakes in the order of quaternions."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -219,11 +219,3 @@ READINGS = (
         for each in ORDERS
     ),
 )
-
-
-def explaining(read: np.ndarray, misfit: Callable[[np.ndarray], float]) -> tuple[Reading, float] | None:
-    """Return the reading of rotations (m, 3, 3) that brings a misfit of theirs below the share :data:`EXPLAINS`, and
-    its misfit; None if no reading does, as with the same orientation in all rows."""
-    misfit_of = {reading: misfit(reading.rotations(read)) for reading in READINGS}
-    best = min(misfit_of, key=misfit_of.__getitem__)
-    return (best, misfit_of[best]) if misfit_of[best] < EXPLAINS * misfit(read) else None

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
 from stcal.handeye.report.export import FORMS, exported, opencv_yaml, tree, urdf_joint
-from stcal.io.poses.programs import (
-    Static,
-    messages,
+from stcal.io.poses.programs import Static, messages
+from tests.outcome import fails_with
+from tests.support.static_transforms import (
     pose_of_metres,
     read_messages,
     read_ros1_launch,
@@ -23,7 +23,6 @@ from stcal.io.poses.programs import (
     read_ros2_launch,
     static_of_joint,
 )
-from tests.outcome import fails_with
 
 angle, length = st.floats(-3.1, 3.1), st.floats(-3000, 3000)
 

@@ -12,10 +12,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
-from stcal.io.poses.programs import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
 from stcal.labels import parse_label
 from stcal.sfm.interop.export import FORMS, export_run
 from tests.outcome import fails_with
+from tests.support.static_transforms import read_messages, read_ros1_launch, read_ros2_launch, static_of_joint
 
 AGAIN_MM = 1e-9
 """Doubles in their shortest text, by way of metres and quaternions."""

@@ -1,8 +1,7 @@
 """Pipeline from exposures to poses with verdicts: the stages in order."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -133,7 +132,11 @@ def run(
     options, model = options or LocateOptions(), camera_model(camera)
     layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
-        yield _named(locate_scene(tags, layout, model, options), layout, partial(_first_image, tags, files))
+        located = locate_scene(tags, layout, model, options)
+        if _without_tag(located):
+            first = next(file for file in files.files if file.name == tags.exposures[0].name)
+            located = _explained(located, layout, decode(first.read(), first.name))
+        yield located
 
 
 @require_arguments
@@ -177,7 +180,8 @@ def locate_image(
     if size != wanted:
         raise InputError("E-IMAGE-SIZE", f"{name}: {size_fault(name, size, wanted, 'the camera').reason}")
     exposure = detect(grey_8bit(grey), name, target.dictionaries())
-    return _named(locate_scene(SceneTags(name, (exposure,)), target, model, options), target, lambda: grey)
+    located = locate_scene(SceneTags(name, (exposure,)), target, model, options)
+    return _explained(located, target, grey) if _without_tag(located) else located
 
 
 def locate_scene(
@@ -274,22 +278,17 @@ def _scene_trouble(merged: Merged, options: LocateOptions) -> str | None:
     )
 
 
-def _named(located: Located, layout: TargetLayout, image: Callable[[], np.ndarray]) -> Located:
-    """Returns the result; if no tag is seen, with the reason: tags in view may be of another dictionary. ``image`` :
-    returns one of the scene's grey images."""
-    merged = located.merged
-    if merged is None or sum(merged.counts):
-        return located
-    if merged.unknown:
-        names = _first_ids(merged.unknown)
+def _without_tag(located: Located) -> bool:
+    return located.merged is not None and not sum(located.merged.counts)
+
+
+def _explained(located: Located, layout: TargetLayout, image: np.ndarray) -> Located:
+    """Returns the result of a scene without a tag with the reason: tags in its image may be of another dictionary."""
+    if located.merged and located.merged.unknown:
+        names = _first_ids(located.merged.unknown)
         reason = f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
     else:
         reason = f"no tag of {', '.join(layout.dictionaries())}; 1 of the layout needed"
-        if shown := seen_otherwise(image(), layout.rows(), "the layout file"):
+        if shown := seen_otherwise(image, layout.rows(), "the layout file"):
             reason = f"{reason}, and {located.exposures[0].name} shows {shown}"
     return replace(located, verdict=Verdict("reject", (), (reason,)))
-
-
-def _first_image(tags: SceneTags, files: SceneFiles) -> np.ndarray:
-    file = next(file for file in files.files if file.name == tags.exposures[0].name)
-    return decode(file.read(), file.name)

@@ -2,23 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PlainSerializer
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.geometry.arrays import Array, Brief, ByValue, freeze, rms
-from stcal.register.models import Transform, parts
-from stcal.register.pairs import Problem
-
-Length = Annotated[
-    float,
-    Field(allow_inf_nan=True),
-    BeforeValidator(lambda value: np.nan if value is None else value),
-    PlainSerializer(lambda value: None if np.isnan(value) else value),
-]
-"""A length in mm, or NaN, which is null in a file."""
+from stcal.register.transforms import Problem, Transform, parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +15,9 @@ class ErrorFigures:
     """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points."""
 
     points: int
-    mean_mm: Length
-    rms_mm: Length
-    max_mm: Length
+    mean_mm: float
+    rms_mm: float
+    max_mm: float
 
     @classmethod
     def of(cls, lengths: np.ndarray) -> "ErrorFigures":

@@ -104,23 +104,48 @@ class _Rows:
 
     @classmethod
     def of(cls, images: Sequence[ImageCorners], seen: list[np.ndarray], noise: list[np.ndarray]) -> "_Rows":
-        counts = [len(each) for each in noise]
-        focal = np.repeat([image.focal_px for image in images], counts)
-        stacked = np.concatenate(seen).reshape(len(focal), -1, 2)
-        return cls(np.repeat(np.arange(len(images)), counts), stacked, np.concatenate(noise), focal)
+        image = np.repeat(np.arange(len(images)), [len(each) for each in noise])
+        focal = np.array([each.focal_px for each in images])[image]
+        return cls(image, np.concatenate(seen).reshape(len(image), -1, 2), np.concatenate(noise), focal)
 
-    def off(self, poses: PoseStack, xyz: np.ndarray) -> np.ndarray:
-        """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board."""
-        return (self._projected(poses, xyz)[0] - self.seen).reshape(len(xyz), -1)
+    def off(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board, and the derivatives
+        by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
+        rotation = poses.rotation[self.image]
+        turned = xyz @ np.swapaxes(rotation, 1, 2)
+        uv, by_point, by_pose = normalised(turned, turned + poses.translation[self.image][:, None])
+        flat = len(xyz), -1
+        return (uv - self.seen).reshape(flat), by_pose.reshape(*flat, 6), by_point @ rotation[:, None]
 
-    def slopes(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns its derivatives by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
-        _, by_point, by_pose = self._projected(poses, xyz)
-        return by_pose.reshape(len(xyz), -1, 6), by_point @ poses.rotation[self.image][:, None]
+    def factor(self, a: Adjustment, kind: str, covariance: np.ndarray, blocks: Sequence, places, derivatives) -> None:
+        """Adds the observations to the adjustment, with Huber's loss. ``places`` : returns the points (r, c, 3) for the
+        values of the second block; ``derivatives`` : by them, from those by the places."""
+        limit = length_limit(covariance.shape[-1], HUBER_TAIL)
 
-    def _projected(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        turned = xyz @ np.swapaxes(poses.rotation[self.image], 1, 2)
-        return normalised(turned, turned + poses.translation[self.image][:, None])
+        def by_both(poses: PoseStack, second: Vector) -> tuple[np.ndarray, np.ndarray]:
+            _, by_pose, by_place = self.off(poses, places(second))
+            return by_pose, derivatives(by_place)
+
+        a.factor(
+            lambda poses, second: self.off(poses, places(second))[0],
+            blocks,
+            derivatives=by_both,
+            root=np.linalg.inv(np.linalg.cholesky(covariance)),
+            kind=kind,
+            cluster=self.image,
+            loss=Huber(limit, GROSS * limit),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Noise:
+    """Noise model: ``board``, factor on the σ of the board's points; ``corner_px``, ``tag_px``, additional σ of single
+    corners, and of the four corners of a tag together; ``amplitude`` of the smooth deviations of the board's print."""
+
+    board: float
+    corner_px: float
+    tag_px: float
+    amplitude: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,45 +170,21 @@ class _Layout:
         places, place = np.unique(xyz.round(6), axis=0, return_inverse=True)
         prints = PrintModes.of(places[:, :2])
         modes = prints.modes.reshape(len(places), 3, -1)[place.ravel()]
-        tag = np.concatenate([image.rows for image in images])
-        return cls(board, xyz[:, None], tags, tag, modes, prints)
+        return cls(board, xyz[:, None], tags, np.concatenate([image.rows for image in images]), modes, prints)
 
-    def problem(self, start: Mapping[str, Any], noise: "_Noise") -> Adjustment:
+    def problem(self, start: Mapping[str, Any], noise: _Noise) -> Adjustment:
         """Returns the adjustment from poses, corners (n, 8) and modes of the print (1, m), with σ of ``noise``."""
         a, board, tags = Adjustment(), self.board, self.tags
         pose, places = a.block("pose", start["pose"], eliminate=True), a.block("corners", start["corners"])
         prints = a.block("print", start["print"])
         covariance = tags.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
-
-        def by_board(poses: PoseStack, prints: Vector) -> tuple[np.ndarray, np.ndarray]:
-            by_pose, by_place = board.slopes(poses, self.printed(prints))
-            return by_pose, by_place[:, 0] @ self.modes
-
-        def by_tags(poses: PoseStack, corners: Vector) -> tuple[np.ndarray, np.ndarray]:
-            by_pose, by_place = tags.slopes(poses, self.placed(corners))
-            return by_pose, block_diagonal(by_place[..., :2])
-
-        a.factor(
-            lambda poses, prints: board.off(poses, self.printed(prints)),
-            [(pose, board.image), (prints, None)],
-            derivatives=by_board,
-            root=_root(noise.board**2 * board.noise),
-            kind="board",
-            cluster=board.image,
-            loss=_loss(2),
-        )
-        a.factor(
-            lambda poses, corners: tags.off(poses, self.placed(corners)),
-            [(pose, tags.image), (places, self.tag)],
-            derivatives=by_tags,
-            root=_root(covariance / tags.focal_px[:, None, None] ** 2),
-            kind="tags",
-            cluster=tags.image,
-            loss=_loss(8),
-        )
-        a.prior(
-            prints, np.zeros((1, len(self.print.spread_mm))), np.diag((noise.amplitude * self.print.spread_mm) ** -2.0)
-        )
+        in_px = covariance / tags.focal_px[:, None, None] ** 2
+        of_board, of_tags = [(pose, board.image), (prints, None)], [(pose, tags.image), (places, self.tag)]
+        of_print = noise.board**2 * board.noise
+        board.factor(a, "board", of_print, of_board, self.printed, lambda by_place: by_place[:, 0] @ self.modes)
+        tags.factor(a, "tags", in_px, of_tags, self.placed, lambda by_place: block_diagonal(by_place[..., :2]))
+        spread = noise.amplitude * self.print.spread_mm
+        a.prior(prints, np.zeros((1, len(spread))), np.diag(spread**-2.0))
         return a
 
     def printed(self, prints: Vector) -> np.ndarray:
@@ -197,16 +198,17 @@ class _Layout:
     def px(self, solution: Solution) -> tuple[np.ndarray, np.ndarray]:
         """Returns the residuals of board (r, 2) and tags (r, 8), px."""
         pose, prints, corners = (solution.values[name] for name in ("pose", "print", "corners"))
-        board, tags = self.board.off(pose, self.printed(prints)), self.tags.off(pose, self.placed(corners))
-        return self.board.focal_px[:, None] * board, self.tags.focal_px[:, None] * tags
+        pairs = (self.board, self.printed(prints)), (self.tags, self.placed(corners))
+        board, tags = (rows.focal_px[:, None] * rows.off(pose, places)[0] for rows, places in pairs)
+        return board, tags
 
-    def first_noise(self, start: Mapping[str, Any]) -> "_Noise":
+    def first_noise(self, start: Mapping[str, Any]) -> _Noise:
         """Returns first σ from the medians of the residuals."""
         solution = self.problem(start, _Noise(1.0, 0.0, 0.0, 1.0)).at(start)
         tags = np.linalg.norm(self.px(solution)[1].reshape(-1, 2), axis=1)
         return _Noise(max(robust_sigma(solution.rows[0].length, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0, 1.0)
 
-    def noise(self, solution: Solution, noise: "_Noise") -> "_Noise":
+    def noise(self, solution: Solution, noise: _Noise) -> _Noise:
         """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
         board, tags = solution.rows
         redundancy = [max(solution.redundancy(kind), 1.0) for kind in ("board", "tags")]
@@ -219,26 +221,6 @@ class _Layout:
         told = Told(solution.values["print"].array[0], solution.inverse[at, at], nothing, self.print.spread_mm)
         factor = max(noise.board * sigma_factor(square, redundancy[0]), LEAST_FACTOR)
         return _Noise(factor, corner, float(tag), found_amplitude([told], noise.amplitude))
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(np.linalg.cholesky(covariance))
-
-
-def _loss(coordinates: int) -> Huber:
-    limit = length_limit(coordinates, HUBER_TAIL)
-    return Huber(limit, GROSS * limit)
-
-
-@dataclass(frozen=True, slots=True)
-class _Noise:
-    """Noise model: ``board``, factor on the σ of the board's points; ``corner_px``, ``tag_px``, additional σ of single
-    corners, and of the four corners of a tag together; ``amplitude`` of the smooth deviations of the board's print."""
-
-    board: float
-    corner_px: float
-    tag_px: float
-    amplitude: float
 
 
 def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
@@ -402,7 +384,10 @@ def calibrate(
             "show it, or name another origin in the layout file",
         )
     images = [replace(image, rows=np.searchsorted(seen_rows, image.rows)) for image in images]
-    start = _median_corners(images, len(seen_rows))
+    places = np.full((len(images), len(seen_rows), 4, 2), np.nan)  # medians are robust against a misread tag
+    for i, image in enumerate(images):
+        places[i, image.rows] = plane_points(image.pose, image.seen).reshape(-1, 4, 2)
+    start = np.nanmedian(places, axis=0)
     adjusted = adjust(images, start)
     return _collected(plan, images, seen_rows, start, adjusted, left_out)
 
@@ -463,14 +448,6 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
             row: place for row, place in zip(image.rows, places[best], strict=True) if row not in place_of_tag
         }
     return turned
-
-
-def _median_corners(images: Sequence[ImageCorners], count: int) -> np.ndarray:
-    """Returns each corner's median over all images, (count, 4, 2) mm on the board, robust against a misread tag."""
-    places = np.full((len(images), count, 4, 2), np.nan)
-    for i, image in enumerate(images):
-        places[i, image.rows] = plane_points(image.pose, image.seen).reshape(-1, 4, 2)
-    return np.nanmedian(places, axis=0)
 
 
 def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out) -> CalibratedLayout:

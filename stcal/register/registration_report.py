@@ -1,14 +1,20 @@
-"""The report of a registration: page and pictures."""
+"""The report of a registration, page and pictures, and its result file: the keys are those of the result."""
 
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import chain, pairwise
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BeforeValidator
+from pydantic import Field as Key
 
 from stcal.geometry.arrays import rms
-from stcal.geometry.rigid import Affine, Similarity
-from stcal.register.liu2017 import Liu2017Options, SampleSize
-from stcal.register.result import ErrorFigures
+from stcal.geometry.rigid import Affine, Rigid, Similarity
+from stcal.io.json import Finite, Keys, Matrix, Matrix4, Points, ResultFile, Vector3
+from stcal.parallel import one_thread
+from stcal.register.liu2017 import Liu2017Options, orthogonal_samples
+from stcal.register.registered import Alternative, ErrorFigures, HeldOutPoints
 from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import Answer, Block, Document, Section, Table, alarms, legend, page_only, plot
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
@@ -28,11 +34,16 @@ def registration_report(found: Findings, more: Sequence[Section] = ()) -> Docume
         f"{found.pairs}: {count} point pairs, {found.model}, {found.method}{cut}: {count - outliers} inliers, "
         f"{outliers} outliers"
     )
+    errors, held = [("residuals of the inliers", found.inlier_errors)], found.held_out
+    if held is not None:
+        errors.append((f"held out ({held.folds} folds), inliers", held.of_inliers))
+        if held.of_inliers.points < held.of_all.points:
+            errors.append((f"held out ({held.folds} folds), all", held.of_all))
     answer = [
         page_only(alarms(found.notes[1:])),
         matrix_table("b_from_a", found.b_from_a.matrix()),
         *_sigma_lines(found),
-        error_table("lengths of errors, mm", _errors(found)),
+        error_table("lengths of errors, mm", errors),
     ]
     space = [
         legend({"inlier": COLOURS[0], **({"outlier": COLOURS[1]} if outliers else {})}),
@@ -58,16 +69,19 @@ def registration_report(found: Findings, more: Sequence[Section] = ()) -> Docume
 
 def _verdict(found: Findings) -> Answer:
     """Returns whether the transform may be used: with care where another fits as well, or a note or a field says so."""
-    if found.field is not None and found.field.seen and not found.notes:
-        return Answer("with care", f"residuals are systematic, {found.field.size_mm:.2g} mm RMS over the workspace")
+    held = None if found.held_out is None else found.held_out.of_inliers
     if found.notes:
-        return Answer("with care", found.notes[0])
-    if found.held_out is None:
-        return Answer("with care", "no pairs were held out: nothing but the fit itself shows the errors")
-    if found.method == "least-squares":
-        return Answer("with care", "least squares takes every pair as right; without --method, wrong ones are found")
-    held = found.held_out.of_inliers
-    return Answer("yes", f"inliers that are held out are missed by {held.rms_mm:.3g} mm RMS, {held.max_mm:.3g} at most")
+        doubt = found.notes[0]
+    elif found.field is not None and found.field.seen:
+        doubt = f"residuals are systematic, {found.field.size_mm:.2g} mm RMS over the workspace"
+    elif held is None:
+        doubt = "no pairs were held out: nothing but the fit itself shows the errors"
+    elif found.method == "least-squares":
+        doubt = "least squares takes every pair as right; without --method, wrong ones are found"
+    else:
+        said = f"inliers that are held out are missed by {held.rms_mm:.3g} mm RMS, {held.max_mm:.3g} at most"
+        return Answer("yes", said)
+    return Answer("with care", doubt)
 
 
 def matrix_table(name: str, matrix: np.ndarray) -> Table:
@@ -105,23 +119,13 @@ def _sigma_lines(found: Findings) -> list[str]:
     return [*lines, f"σ of a coordinate {found.sigma_mm:.4g} mm{factor}{redundancy}"]
 
 
-def _errors(found: Findings) -> list[tuple[str, ErrorFigures]]:
-    errors, held = [("residuals of the inliers", found.inlier_errors)], found.held_out
-    if held is not None:
-        errors.append((f"held out ({held.folds} folds), inliers", held.of_inliers))
-        if held.of_inliers.points < held.of_all.points:
-            errors.append((f"held out ({held.folds} folds), all", held.of_all))
-    return errors
-
-
 def _rows(found: Findings) -> Table:
     """Returns the residuals of all rows; of many rows those of outliers, and the largest of inliers."""
-    rows = np.arange(len(found))
+    rows, length = np.arange(len(found)), found.length_mm
     if len(found) > FEW_ROWS:
         inliers = np.flatnonzero(found.inliers)
-        worst = inliers[np.argsort(-found.length_mm[inliers], kind="stable")][:WORST]
-        rows = np.concatenate([worst, found.outliers])
-    cells, length = [], found.length_mm
+        rows = np.concatenate([inliers[np.argsort(-length[inliers], kind="stable")][:WORST], found.outliers])
+    cells = []
     for row in rows.tolist():
         values = (number(float(v), 4) for v in (*found.residuals[row], length[row]))
         cells.append([f"line {found.lines[row]}", "inlier" if found.inliers[row] else "OUTLIER", *values])
@@ -167,7 +171,7 @@ def _where_it_holds(found: Findings) -> list[Block]:
         blocks.append(_field_sentence(found, field))
         blocks.append(
             plot(
-                lambda: field_figure(found, field),
+                lambda: _field_figure(found, field),
                 "systematic error over the workspace",
                 "Systematic error to expect of the transform at places in and around the points, enlarged, frame b",
             )
@@ -184,15 +188,13 @@ def _where_it_holds(found: Findings) -> list[Block]:
 
 def _reach_of_inner(reach: Cubes) -> str:
     """Returns how large the errors of a fit to the inner cube are there, and farther out."""
-    inner, *outer = reach.errors[0]
-    outside = [(side, e.max_mm) for side, e in zip(reach.sides_mm[1:], outer, strict=True) if e]
-    if inner is None or not outside:
+    found = [(side, e.max_mm) for side, e in zip(reach.sides_mm, reach.errors[0], strict=True) if e]
+    if reach.errors[0][0] is None or len(found) < 2:
         return ""
-    most = np.maximum.accumulate([inner.max_mm, *(error for _, error in outside)])[1:]
-    farther = (f", {error:.3g} mm to {side:g} mm" for (side, _), error in zip(outside, most, strict=True))
-    return (
-        f"fitted in the cube of {reach.sides_mm[0]:g} mm it holds within {inner.max_mm:.3g} mm there{''.join(farther)}"
-    )
+    most = np.maximum.accumulate([error for _, error in found])
+    (inner, _), *outer = found
+    farther = (f", {error:.3g} mm to {side:g} mm" for (side, _), error in zip(outer, most[1:], strict=True))
+    return f"fitted in the cube of {inner:g} mm it holds within {most[0]:.3g} mm there{''.join(farther)}"
 
 
 def _cube_table(reach: Cubes) -> Table:
@@ -200,10 +202,9 @@ def _cube_table(reach: Cubes) -> Table:
     rows = []
     for side, row in zip(reach.sides_mm, reach.errors, strict=True):
         errors = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row]
-        rows.append([f"{side:g} mm", *(cell for error in errors for cell in error)])
+        rows.append([f"{side:g} mm", *chain.from_iterable(errors)])
     sides = [f"{side:g}" for side in reach.sides_mm]
-    shells = [f"inner {sides[0]} mm", *(f"{a} … {b} mm" for a, b in pairwise(sides))]
-    over = [("", 1), *((f"{name}:", 3) for name in shells)]
+    over = [("", 1), (f"inner {sides[0]} mm:", 3), *((f"{a} … {b} mm:", 3) for a, b in pairwise(sides))]
     return Table(["<fitted in the cube of", *["points", "mean", "max"] * len(rows)], rows, over)
 
 
@@ -225,11 +226,9 @@ def space_figure(found: Findings) -> Drawing:
     return _views(found.b_from_a @ found.xyz_a[rows], found.residuals[rows], found.inliers[rows])
 
 
-def field_figure(found: Findings, field: Field) -> Drawing:
-    """Returns three views of the grid of the field in frame b with the error to expect there, enlarged."""
-    grid = field.grid
-    places = found.b_from_a @ grid["xyz_a_mm"]
-    return _views(places, grid["error_mm"], np.ones(len(places), bool))
+def _field_figure(found: Findings, field: Field) -> Drawing:
+    places, error = field.grid["xyz_a_mm"], field.grid["error_mm"]
+    return _views(found.b_from_a @ places, error, np.ones(len(places), bool))
 
 
 def _views(place: np.ndarray, error: np.ndarray, inlier: np.ndarray) -> Drawing:
@@ -253,12 +252,16 @@ def _views(place: np.ndarray, error: np.ndarray, inlier: np.ndarray) -> Drawing:
     return drawing
 
 
-def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> Section:
-    """Returns the paper's figure 6 for these points, as a section of the page."""
-    rows = [
-        [e.points, number(100 * e.best, 1), number(100 * e.median, 1), e.orthogonal, f"{e.acceptable} of {e.tries}"]
-        for e in sizes
-    ]
+@one_thread()
+def sample_size_section(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int) -> Section:
+    """Returns the paper's figure 6 for these points: samples of every even size N from 4 to 40."""
+    rows, tries = [], min(options.tries, 200)
+    for points in range(4, min(41, len(xyz_a)), 2):
+        samples = orthogonal_samples(xyz_a, xyz_b, replace(options, sample=points, tries=tries), seed)
+        shares = np.array([(np.delete(error, own) < options.limit_mm).mean() for _, own, _, error in samples])
+        best, median = (100 * shares.max(), 100 * np.median(shares)) if len(shares) else (np.nan, np.nan)
+        acceptable = f"{(shares > options.share).sum()} of {tries}"
+        rows.append([points, number(best, 1), number(median, 1), len(shares), acceptable])
     told = (
         "Samples of every size, as in figure 6 of Liu et al. (2017): the share of the other points within "
         f"{options.limit_mm:g} mm of what the sample says. A sample is acceptable with more than "
@@ -266,3 +269,81 @@ def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> Sec
     )
     heads = ["points", "best (%)", "median (%)", "orthogonal", "acceptable"]
     return Section("Size of the sample", [told, Table(heads, rows)])
+
+
+Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
+"""Rows of the file of points, from 0."""
+FIGURES = "`points`, `mean_mm`, `rms_mm`, `max_mm`"
+Marks = Annotated[list[bool], BeforeValidator(lambda marks: np.asarray(marks, bool).tolist())]
+Rounded = Annotated[Points, BeforeValidator(lambda values: np.round(values, 9))]
+"""Residuals, mm: there may be a million."""
+TransformMatrix = Annotated[
+    Matrix4, BeforeValidator(lambda given: given.matrix() if isinstance(given, Rigid | Similarity | Affine) else given)
+]
+OF_ROBOT = Keys(
+    "b_from_base identified.rank identified.names identified.undetermined identified.weighting.sigma_mm off_mm better "
+    "folds rows transform_mm kinematics_mm wild transform kinematics"
+)
+"""Of base and kinematics, solved in addition to the transform: :class:`stcal.workflows.RegisteredRobot`."""
+OF_FIELD = Keys("seen p_value length_mm size_mm noise_mm rows taken_back plain corrected sigma_ratio grid")
+
+
+class RegistrationFile(ResultFile):
+    """Result file of ``register``; lengths in mm, angles in rad; rows are those of the file of points, from 0."""
+
+    format: Literal["stcal registration 1"] = Key(description="the file's form and its version")
+    pairs: str = Key(description="the file of the points")
+    model: str = Key(description="as asked for (`liu2017` is always affine)")
+    method: str = Key(description="as asked for")
+    b_from_a: TransformMatrix = Key(description="row-major: `xyz_b = b_from_a @ xyz_a`")
+    covariance: Matrix = Key(
+        description="of a left perturbation in the axes of b (rotation about the origin of a, translation of that "
+        "origin, then the relative scale of a similarity), or of the rows of the 3×4 matrix of an affine transform"
+    )
+    covariance_of: list[str] = Key(description="names of its rows: `rx_rad … z_mm`, `scale`, `m11 … m34_mm`")
+    scales: Vector3 = Key(description="ratios of lengths in b to those in a, along three axes")
+    sigma_mm: float = Key(description="σ per axis of a residual, estimated")
+    redundancy: Finite = Key(
+        description="degrees of freedom of the σ that the covariance rests on (null: given)",
+    )
+    sigma_factor: float | None = Key(description="by how much residuals exceed the σ given with the data")
+    scaled: bool = Key(description="whether the covariance rests on the residuals")
+    threshold_mm: float | None = Key(description="inliers are nearer than this; null by least squares")
+    inlier_errors: Annotated[ErrorFigures, Keys()] = Key(description=f"lengths of the inliers' residuals: {FIGURES}")
+    held_out: Annotated[HeldOutPoints, Keys()] | None = Key(
+        description=f"`folds`; `rows` and `error_mm` of each point tried; {FIGURES} `of_inliers` and `of_all`"
+    )
+    ambiguous: bool = Key(description="whether `alternative` is about as good")
+    alternative: Annotated[Alternative, Keys()] | None = Key(
+        description="another transform that other points agree on: `b_from_a`, `rows`, `apart_mm` (RMS), `turn_rad`"
+    )
+    notes: list[str] = Key(description="what to look at")
+    seed: int = Key(description="of the random samples")
+    samples: int = Key(description="how many were drawn, 0: all there are")
+    lines: Rows = Key(description="for each row of the file its line")
+    inliers: Marks = Key(description="whether it is an inlier")
+    residuals: Rounded = Key(description="b − b_from_a a, frame b")
+    outliers: Rows = Key(description="rows of the outliers, the farthest first")
+    field: Annotated[Field, OF_FIELD] | None = Key(
+        description="systematic residuals over the workspace, null with too few points: `seen` (chance below 1 %), "
+        "`p_value`; `size_mm` RMS length, `length_mm` over which they change, `noise_mm` σ per axis beside them; "
+        "`rows` used (at most 500), `taken_back` rows of outliers that follow the field of the others; "
+        f"{FIGURES} of errors of points by the transform, `plain`, and by transform and field, `corrected`, "
+        "fitted to the others, and "
+        "`sigma_ratio`, RMS of the latter over their σ; `grid`: `xyz_a_mm` in frame a (7³ places over the box of the "
+        "points and a quarter beyond), `error_mm` to expect of b − b_from_a a there, frame b, and its `sigma_mm` per "
+        "axis"
+    )
+    cubes: Annotated[Cubes, Keys()] | None = Key(
+        description="null with too few points: `middle` in a and `sides_mm` of cubes along the axes of a; in row i and "
+        f"column j of `errors`: {FIGURES} of the fit in cube i at the points of cube j that are not in cube j − 1; "
+        "points that the fit used are held out in turn"
+    )
+    robot: Annotated[Any, OF_ROBOT] | None = Key(
+        None,
+        description="with `--robot`: `b_from_base` of the identified robot; `identified`: `rank`, `names`, "
+        "`undetermined`, and `weighting` with `sigma_mm`, as of `identify`; `off_mm`: RMS of a off the robot file's "
+        "positions after a rigid fit; `better` than the transform, held out; `folds`, `rows`, `transform_mm`, "
+        "`kinematics_mm` of each row held out, `wild`: outliers of both; without these, errors of `transform` and "
+        f"`kinematics`: {FIGURES}",
+    )

@@ -31,32 +31,12 @@ from scipy.special import chdtr, chdtrc, chdtri, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.robust import ratio_limit
-from stcal.register.models import Model, Transform, hypotheses, leverages, unit_covariance
-from stcal.register.pairs import Problem
+from stcal.register.transforms import Model, Problem, Transform, hypotheses
 
 CONTRADICTED_AT = 0.01
 """Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 WIDE = 8.0
 """Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Covariance:
-    """``scaled`` : by residuals, not a given σ; ``redundancy`` : degrees of freedom of the σ, infinite if given."""
-
-    matrix: np.ndarray
-    scaled: bool
-    redundancy: float
-
-
-def kept_share(cut: float) -> float:
-    """Returns the fraction of points within ``cut`` σ, from χ²₃."""
-    return float(chdtr(3, cut**2))
-
-
-def kept_variance(cut: float) -> float:
-    """Returns the fraction of the total sum of squares that points within ``cut`` σ contribute, from χ²₅."""
-    return float(chdtr(5, cut**2))
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
@@ -70,8 +50,7 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
         return sigma
 
     def excess(candidate: float) -> float:
-        cut = threshold / candidate
-        return candidate**2 * kept_variance(cut) / kept_share(cut) - sigma**2
+        return candidate**2 * _variance_within(threshold / candidate) - sigma**2
 
     if excess(threshold) < 0:
         return threshold
@@ -79,29 +58,28 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
     return float(root_scalar(excess, method="brentq", bracket=bracket, xtol=1e-9 * sigma, rtol=1e-9).root)
 
 
-def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold: float) -> Covariance:
-    """Returns the covariance of a fit. A given σ is kept unless χ² contradicts it. Cutting off at c σ, ``threshold`` in
-    mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection."""
-    model, noise = inliers.model, inliers.noise
-    redundancy = float(inliers.redundancy)
-    used, scaled = sigma, True
-    if noise.sigma_mm is not None:
-        scaled = bool(chdtrc(redundancy, redundancy * (sigma / noise.sigma_mm) ** 2) < CONTRADICTED_AT)
+def _variance_within(cut: float) -> float:
+    """Returns the variance of residuals within ``cut`` σ, over that of all."""
+    return float(chdtr(5, cut**2) / chdtr(3, cut**2))
+
+
+def covariance_of(
+    inliers: Problem, b_from_a: Transform, sigma: float, threshold: float
+) -> tuple[np.ndarray, bool, float]:
+    """Returns the covariance of a fit, whether residuals scale it, and the degrees of freedom of its σ.
+
+    A given σ is kept unless χ² contradicts it; its degrees of freedom are infinite. Cutting off at c σ, ``threshold``
+    in mm, increases the variance by χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
+    """
+    redundancy, used, scaled = float(inliers.redundancy), sigma, True
+    if inliers.sigma_mm is not None:
+        scaled = bool(chdtrc(redundancy, redundancy * (sigma / inliers.sigma_mm) ** 2) < CONTRADICTED_AT)
         if not scaled:
-            used, redundancy = noise.sigma_mm, np.inf
-    matrix = used**2 * unit_covariance(model, b_from_a, inliers.xyz_a, noise.precision)
+            used, redundancy = inliers.sigma_mm, np.inf
+    matrix = used**2 * inliers.unit_covariance(b_from_a)
     if used > 0 and threshold < WIDE * used:
-        cut = threshold / used
-        matrix = matrix * kept_share(cut) / kept_variance(cut)
-    return Covariance(matrix, scaled, redundancy)
-
-
-def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
-    """Adds a common shift (3,), mm, as an error to the covariance of a fit between two groups of points."""
-    p = len(covariance.matrix)
-    by_step = np.zeros(p)
-    by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm
-    return replace(covariance, matrix=covariance.matrix + np.outer(by_step, by_step))
+        matrix = matrix / _variance_within(threshold / used)
+    return matrix, scaled, redundancy
 
 
 FALSE_ALARMS = 1e-4
@@ -115,16 +93,9 @@ LEAST_SHARE = 0.25
 """Smallest share of a consensus that the number of samples is chosen to find. A smaller one may be missed."""
 CLEAN_PER_WIDE = 3
 """Number of clean samples assumed for each one wide enough to lead to the optimum; measured: every second one does."""
-EXHAUSTIVE = 2000
-"""Largest number of possible samples that are all tried (23 points rigidly)."""
-BATCH = 500
-"""Number of samples scored at once."""
-MOST_SAMPLES = 20_000
-"""Largest number of samples, above any need: ``LEAST_SHARE`` takes 3900 samples of three points, 15 900 of four."""
-REFINED = 6
-"""Number of the best samples of a batch that are refined."""
-MAX_STEPS = 30
-"""Largest number of concentration steps. They end after a few: each lowers the score, and the sets are finite."""
+EXHAUSTIVE, BATCH, MOST_SAMPLES, REFINED = 2000, 500, 20_000, 6
+"""Number of possible samples that are all tried (23 points rigidly); number scored at once; largest number, above any
+need, as ``LEAST_SHARE`` takes 15 900 of four points; number of the best ones of a batch that are refined."""
 TINY = 1e-24
 """Relative square sums, as a share of the points' own, below which they are rounding errors."""
 
@@ -132,21 +103,12 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Score of squared distances (s, n): value of each row (less is better), and the largest square in the row's set."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Consensus:
-    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all were tried."""
-
-    inliers: np.ndarray
-    value: float
-    samples: int = 0
-
-
 def by_scale(model: Model, count: int, total: float) -> Score:
     """Returns the logarithm of the number of false alarms as score; ``total`` : square sum of the fit to all points."""
     k = np.arange(model.sample, count)
     k = k[3 * k > model.parameters]  # sets too small to be trusted are scored, too; if one wins, the result is refused
     a, b = (3 * k - model.parameters) / 2, 3 * (count - k) / 2
-    tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
+    tests = np.log(len(k)) + _log_choices(count, k)
 
     def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ordered = np.sort(square, axis=1)
@@ -157,6 +119,10 @@ def by_scale(model: Model, count: int, total: float) -> Score:
         return value[rows, best], ordered[rows, k[best] - 1]
 
     return score
+
+
+def _log_choices(n: int | np.ndarray, k: int | np.ndarray) -> np.ndarray:
+    return gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
 
 
 def chernoff(share: float | np.ndarray, a: float | np.ndarray, b: float | np.ndarray) -> np.ndarray:
@@ -179,11 +145,16 @@ def by_share(model: Model, count: int) -> Score:
 
 def by_threshold(threshold: float) -> Score:
     """Returns the score by the square sum, cut off at the threshold (MSAC, Torr & Zisserman 2000)."""
+    return lambda square: (np.minimum(square, threshold**2).sum(1), np.full(len(square), threshold**2))
 
-    def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.minimum(square, threshold**2).sum(1), np.full(len(square), threshold**2)
 
-    return score
+@dataclass(frozen=True, slots=True, eq=False)
+class Consensus:
+    """``inliers`` : (n,) that agree; ``value`` : score, less is better; ``samples`` : 0 if all were tried."""
+
+    inliers: np.ndarray
+    value: float
+    samples: int = 0
 
 
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
@@ -205,7 +176,14 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
 
 def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensus | None) -> Consensus | None:
     """Returns the best of the refined samples and of ``best``."""
-    square = _squares_of_many(*hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples]), problem)
+    linear, translation = hypotheses(problem.model, problem.xyz_a[samples], problem.xyz_b[samples])
+    residual = problem.xyz_b.T - translation[:, :, None]
+    residual -= (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
+    if problem.precision.ndim == 3:
+        force = np.einsum("nij,sjn->sin", problem.precision, residual, optimize=True)
+        square = np.maximum(np.einsum("sin,sin->sn", residual, force), 0)
+    else:
+        square = np.einsum("sin,sin->sn", residual, residual) * problem.precision
     value, cut = score(square)
     for i in np.argsort(value, kind="stable")[:REFINED]:
         found = _concentrated(problem, score, square[i] <= cut[i])
@@ -217,9 +195,7 @@ def _best_of(problem: Problem, score: Score, samples: np.ndarray, best: Consensu
 def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consensus | None:
     """Alternates between fitting and selecting the set until the score decreases no more."""
     best = None
-    for _ in range(MAX_STEPS):
-        if inliers.sum() < problem.model.sample:
-            break
+    while inliers.sum() >= problem.model.sample:  # ends after a few: each lowers the score, and the sets are finite
         try:
             square = problem.squares(problem[inliers].fit())
         except (DegenerateError, ConvergenceError):
@@ -232,19 +208,6 @@ def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consen
     return best
 
 
-def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Problem) -> np.ndarray:
-    """Returns the squared distances (s, n) under s transforms."""
-    turned = (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
-    residual = problem.xyz_b.T - translation[:, :, None]
-    residual -= turned
-    precision = problem.noise.precision
-    if precision is not None and precision.ndim == 3:
-        weighted = np.einsum("nij,sjn->sin", precision, residual, optimize=True)
-        return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
-    plain = np.einsum("sin,sin->sn", residual, residual)
-    return plain if precision is None else plain * precision
-
-
 SUBSET = 500
 """Number of points on which samples are scored. It gives σ and shares to 2 %."""
 CLEAN_SETS_WITH_OUTLIER = 0.001
@@ -254,8 +217,6 @@ LEVERAGE_UP_TO = 10_000
 residual."""
 MAX_ROUNDS = 50
 """Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
-NESTED = 6
-"""Depth of consensus within a consensus, as gross errors hide smaller ones."""
 BY_CHANCE = 0.01
 """Largest number of false alarms of a consensus that is accepted, per file."""
 DISTINCT = 5.0
@@ -286,54 +247,46 @@ def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) 
 
     Raises DegenerateError: too few points agree, or no more than by chance. Raises ConvergenceError.
     """
-    rng = np.random.default_rng(seed)
-    count = len(problem)
+    rng, count = np.random.default_rng(seed), len(problem)
     subset = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
     if threshold is None:
-        inliers, samples = _consensus(subset, rng)
+        found = _consensus(subset, rng)
     else:
-        consensus = search(subset, by_threshold(threshold), rng)
-        if consensus is None:
+        found = search(subset, by_threshold(threshold), rng)
+        if found is None:
             raise _too_few_agree(problem.model, count, threshold)
-        inliers, samples = consensus.inliers, consensus.samples
-    start = settled(subset, inliers, threshold, samples)
+    start = settled(subset, found.inliers, threshold, found.samples)
     if count > SUBSET:
         near = problem.squares(start.transform) <= start.threshold**2
-        start = settled(problem, near, threshold, samples)
+        start = settled(problem, near, threshold, found.samples)
     return start
 
 
-def _consensus(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, int]:
-    """Returns the mask of the points that agree, and the number of samples."""
-    rows, samples = np.arange(len(problem)), 0
-    model = problem.model
-    for _ in range(NESTED):
-        if len(rows) <= model.sample or model.redundancy(len(rows) - 1) <= 0:
-            break
+def _consensus(problem: Problem, rng: np.random.Generator) -> Consensus:
+    """Returns the points that agree, by a consensus within a consensus, as gross errors hide smaller ones."""
+    rows, samples, model = np.arange(len(problem)), 0, problem.model
+    while len(rows) > model.sample and model.redundancy(len(rows) - 1) > 0:
         subset = problem[rows]
         total = subset.squares(subset.fit()).sum()
         if total <= len(rows) * subset.rounding_mm() ** 2:
             break
-        consensus = search(subset, by_scale(model, len(rows), total), rng)
-        samples += consensus.samples if consensus is not None else 0
-        if consensus is None or consensus.value > np.log(FALSE_ALARMS):
+        found = search(subset, by_scale(model, len(rows), total), rng)
+        samples += found.samples if found is not None else 0
+        if found is None or found.value > np.log(FALSE_ALARMS) or found.inliers.all():
             break
-        agree = int(consensus.inliers.sum())
+        agree = int(found.inliers.sum())
         if model.redundancy(agree) < LEAST_REDUNDANCY:
             raise DegenerateError(
                 "E-REGISTER-DISAGREE",
                 f"registration: only {agree} of {len(rows)} point pairs agree on one {model.name} transform, at least "
                 f"{-(-(LEAST_REDUNDANCY + model.parameters) // 3)} needed to tell which are wrong; measure more points",
             )
-        rows = rows[consensus.inliers]
-    mask = np.zeros(len(problem), bool)
-    mask[rows] = True
-    return mask, samples
+        rows = rows[found.inliers]
+    return Consensus(np.isin(np.arange(len(problem)), rows), 0.0, samples)
 
 
 def _too_few_agree(model: Model, count: int, threshold: float | None) -> DegenerateError:
-    within = "" if threshold is None else f" within {threshold:.4g} mm"
-    larger = "" if threshold is None else ", or give a larger threshold"
+    within, larger = ("", "") if threshold is None else (f" within {threshold:.4g} mm", ", or give a larger threshold")
     return DegenerateError(
         "E-REGISTER-DISAGREE",
         f"registration: fewer than {model.needed} of {count} point pairs agree on one {model.name} transform{within}; "
@@ -343,9 +296,8 @@ def _too_few_agree(model: Model, count: int, threshold: float | None) -> Degener
 
 def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
     """Updates fit, σ and inliers in turn until the set stays the same; of a cycle, the largest is returned."""
-    model = problem.model
+    model, floor = problem.model, problem.rounding_mm()
     fit_of_set: dict[bytes, Fitted] = {}
-    floor = problem.rounding_mm()
     for _ in range(MAX_ROUNDS):
         count = int(inliers.sum())
         if count < model.needed:
@@ -375,10 +327,9 @@ def _chosen(
     problem: Problem, transform: Transform, square: np.ndarray, used: np.ndarray, sigma: float
 ) -> tuple[float, np.ndarray]:
     """Returns the threshold at the middle of the points, mm, and the mask of the points that pass the test."""
-    total, redundancy = len(problem), problem.model.redundancy(int(used.sum()))
-    beyond = CLEAN_SETS_WITH_OUTLIER / total
+    redundancy, beyond = problem.model.redundancy(int(used.sum())), CLEAN_SETS_WITH_OUTLIER / len(problem)
     outside = 3 * sigma**2 * ratio_limit(beyond, 3, redundancy)
-    if total > LEVERAGE_UP_TO:
+    if len(problem) > LEVERAGE_UP_TO:
         return float(np.sqrt(outside)), square <= outside
     deletion = deletion_squares(problem, transform, used)
     passed = deletion <= outside
@@ -391,11 +342,10 @@ def _chosen(
 def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
     """Returns (n,) squares rᵀ C⁻¹ r of residuals from fits without the point itself, C their covariance at unit noise:
     r (1 − H)⁻¹ r for points used, r (1 + H)⁻¹ r for others, with whitened residuals and H of
-    :func:`~stcal.register.models.leverages` (Cook & Weisberg 1982)."""
-    added = leverages(problem.model, transform, problem.xyz_a, used, problem.noise.precision)
+    :meth:`~stcal.register.transforms.Problem.leverages` (Cook & Weisberg 1982)."""
     own = np.where(used, -1.0, 1.0)[:, None, None]
-    value, vector = np.linalg.eigh(np.eye(3) + own * added)
-    turned = np.einsum("nij,ni->nj", vector, problem.whitened(transform))
+    value, vector = np.linalg.eigh(np.eye(3) + own * problem.leverages(transform, used))
+    turned = np.einsum("nij,ni->nj", vector, problem.whitened(problem.residuals(transform)))
     return (turned**2 / np.maximum(value, 1e-9)).sum(1)
 
 
@@ -403,10 +353,9 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     """Returns the log number of sets that would agree as well if points lay anywhere in a box of sides ``extent`` (3,)
     mm, by default the inliers' along principal axes: Moisan & Stival's (2004) (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over
     k; α(r) is the share of a cube of half side r."""
-    model, every = problem.model, len(problem)
+    size, every = problem.model.sample, len(problem)
     rows = np.arange(every)[:: max(1, every // LEVERAGE_UP_TO)]
-    share = problem[rows]
-    count, k = len(rows), np.arange(model.sample + 1, len(rows) + 1)
+    share, count, k = problem[rows], len(rows), np.arange(size + 1, len(rows) + 1)
     if not len(k):
         return 0.0
     order = np.sort(np.linalg.norm(share.residuals(fitted.transform), axis=1))
@@ -415,21 +364,19 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
         centred = centred - centred.mean(0)
         extent = np.ptp(centred @ np.linalg.eigh(centred.T @ centred)[1], axis=0)
     alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(np.asarray(extent), 1e-300)).prod(1)
-    choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
-    value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
+    choices = _log_choices(count, k) + _log_choices(k, size)
+    value = np.log(count - size) + choices + (k - size) * np.log(np.maximum(alpha, 1e-300))
     return float(value.min())
 
 
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
     """Returns the transform on which outliers agree beyond chance, within the threshold and σ's uncertainty."""
-    model = problem.model
-    outside = np.flatnonzero(~fitted.inliers)
+    model, outside = problem.model, np.flatnonzero(~fitted.inliers)
     if len(outside) <= model.sample or model.redundancy(len(outside)) <= 0:
         return None
     rng = np.random.default_rng(seed + 1)
     tried = outside if len(outside) <= SUBSET else np.sort(rng.choice(outside, SUBSET, replace=False))
     redundancy = model.redundancy(int(fitted.inliers.sum()))
-    # σ may be so large
     threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
     consensus = search(problem[tried], by_threshold(threshold), rng)
     if consensus is None or consensus.inliers.sum() <= model.sample:
@@ -444,9 +391,7 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
         return None  # good points that a tight threshold cut off
     # wrong points lie anywhere as far off the transform found as the farthest of them
     off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
-    alone = Fitted(transform, near, fitted.sigma, threshold)
-    if chance(outliers, alone, np.full(3, 2 * off)) > np.log(BY_CHANCE):
+    found = Fitted(transform, near, fitted.sigma, threshold, consensus.samples)
+    if chance(outliers, found, np.full(3, 2 * off)) > np.log(BY_CHANCE):
         return None
-    mask = np.zeros(len(problem), bool)
-    mask[outside[near]] = True
-    return Fitted(transform, mask, fitted.sigma, threshold, consensus.samples)
+    return replace(found, inliers=np.isin(np.arange(len(problem)), outside[near]))

@@ -8,21 +8,21 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from stcal.geometry.arrays import require_arguments
-from stcal.geometry.camera import Camera
 from stcal.geometry.print_modes import stretch_in_words
-from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
-from stcal.io.json import ByName, Finite, Matrix6, Part, Pose, ResultFile, Shape, Vector
+from stcal.io.json import Finite, Keys, Part, Pose, ResultFile, Shape
 from stcal.io.table import COVARIANCE, POSE, csv_text, pose_cells
-from stcal.locate.calibration import CalibratedLayout
 from stcal.locate.chain import GoalChain, Goals, accepted, uncertain
-from stcal.locate.estimate import Shift
+from stcal.locate.estimate import Merged, ObjPose
 from stcal.locate.exposures import Exposure, SceneFiles
 from stcal.locate.layout import TargetLayout
+from stcal.locate.layout_calibration import AdjustedLayout, CalibratedLayout
 from stcal.locate.patent import ASSUMED, PatentPose
-from stcal.locate.pipeline import Located
-from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, Verdict, columns, macro
+from stcal.locate.scenes import Located
+from stcal.locate.verdict import Verdict
+from stcal.report import document
+from stcal.report.document import Answer, Block, Document, Html, Notes, Section, Table, columns, macro
 from stcal.report.svg import AXIS_COLOURS, COLOURS
 from stcal.report.text import NONE, number
 
@@ -112,7 +112,7 @@ def _overview(results: Sequence[Located]) -> list[list]:
         rows.append(
             [
                 located.name,
-                Verdict(located.verdict.decision),
+                document.Verdict(located.verdict.decision),
                 len(located.merged.seen) if located.merged else 0,
                 len(located.exposures),
                 *(number(v, 2) for v in place),
@@ -131,7 +131,7 @@ def _scene(located: Located, files: SceneFiles, layout: TargetLayout, model: Cam
             check.name,
             f"{check.value:.4g}{check.unit}" if np.isfinite(check.value) else "no other pose",
             f"≥ {check.at_least:.4g}" if check.at_least is not None else f"≤ {check.at_most:.4g}",
-            "yes" if check.passed else Verdict("no"),
+            "yes" if check.passed else document.Verdict("no"),
         ]
         for check in located.verdict.checks
     ]
@@ -176,7 +176,13 @@ def _picture(
     for tag, corners in zip(exposure.tags.tags, exposure.tags.corners_px, strict=True):
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
         tags.append((points, COLOURS[2] if tag in rows else COLOURS[1], str(tag[1]), *corners.mean(0)))
-    count = sum(tag in rows for tag in exposure.tags.tags)
+    count, axes = sum(tag in rows for tag in exposure.tags.tags), []
+    if pose is not None:  # a third of the target long; none if behind the camera
+        length = float(np.ptp(layout.corners_mm.reshape(-1, 2), axis=0).max()) / 3
+        ends = pose @ (length * np.vstack([np.zeros(3), np.eye(3)]))
+        if (ends[:, 2] > 0).all():
+            start, *tips = model.sized(width, height).project(ends)
+            axes = [(start, tip, colour, name) for tip, colour, name in zip(tips, AXIS_COLOURS, "XYZ", strict=True)]
     return {
         "shown_px": width_px,
         "width": width,
@@ -185,33 +191,16 @@ def _picture(
         "caption": f"{exposure.name}: {count} of {len(layout.tags)} tags",
         "jpeg": "data:image/jpeg;base64," + base64.b64encode(thumbnail(grey, width_px)[0].tobytes()).decode(),
         "tags": tags,
-        "axes": [] if pose is None else _axes(pose, layout, model.sized(width, height)),
+        "axes": axes,
     }
 
 
-def _axes(pose: Rigid, layout: TargetLayout, camera: Camera) -> list[tuple]:
-    """Returns (start, tip, colour, name) of X, Y, Z of {obj}, a third of the target long; none if behind the camera."""
-    length = float(np.ptp(layout.corners_mm.reshape(-1, 2), axis=0).max()) / 3
-    ends = pose @ (length * np.vstack([np.zeros(3), np.eye(3)]))
-    if (ends[:, 2] <= 0).any():
-        return []
-    start, *tips = camera.project(ends)
-    return [(start, tip, colour, name) for tip, colour, name in zip(tips, AXIS_COLOURS, "XYZ", strict=True)]
-
-
-class LimitRow(Part):
-    name: str
-    value: Finite
-    at_least: float | None
-    at_most: float | None
-    unit: str
-    passed: bool
-
-
-class VerdictPart(Part):
-    decision: str
-    reasons: list[str]
-    checks: list[LimitRow]
+Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
+"""Rows of the layout's tags."""
+Corners = Annotated[np.ndarray, Shape((None, 4, 2))]
+OF_FIT = Keys("covariance second delta_chi2 rms_px chi2 redundancy p_value rows outliers residuals_px weights")
+OF_PATENT = Keys("exposure second errors_px det_j same exposures")
+OF_ADJUSTED = Keys("poses image_rms_px board_rms_px tag_rms_px stretch shear sigma_px tag_sigma_px")
 
 
 class ExposureRow(Part):
@@ -219,81 +208,30 @@ class ExposureRow(Part):
     tags: Annotated[int, BeforeValidator(lambda tags: tags if isinstance(tags, int) else len(tags))]
 
 
-Rows = Annotated[list[int], BeforeValidator(lambda rows: np.asarray(rows, int).tolist())]
-"""Rows of the layout's tags."""
-OfMethod = BeforeValidator(lambda value: value() if callable(value) else value)
-Corners = Annotated[np.ndarray, Shape((None, 4, 2))]
-Coordinates = Annotated[np.ndarray, Shape((None, 2))]
-
-
-class MergedPart(Part):
-    rows: Rows
-    share: float
-    shifts: list[Shift]
-
-
-class FitPart(Part):
-    covariance: Matrix6
-    second: Pose | None
-    delta_chi2: Finite
-    rms_px: Annotated[float, OfMethod]
-    chi2: float
-    redundancy: int
-    p_value: Annotated[float, OfMethod]
-    rows: Rows
-    outliers: Rows
-    residuals_px: Coordinates
-    weights: Vector
-
-
-class PatentExposureRow(Part):
-    exposure: int
-    tags: int
-    area_px2: float | None
-    candidate: bool
-    poses: tuple[Pose, Pose] | None
-    errors_px: tuple[Finite, Finite] | None
-    det_j: float | None
-
-
-class PatentPart(Part):
-    exposure: int
-    second: Pose
-    errors_px: tuple[Finite, Finite]
-    det_j: float
-    same: bool
-    exposures: list[PatentExposureRow]
-
-
 class SceneRow(Part):
     name: str = Field(description="of the scene")
-    verdict: VerdictPart = Field(
+    verdict: Annotated[Verdict, Keys("decision reasons checks")] = Field(
         description="`decision`, `reasons`, and `checks`: `name`, `value` (null: no other pose), `at_least`, "
         "`at_most`, `unit`, `passed`"
     )
     notes: list[str] = Field(description="what was left out, and other notes")
     exposures: list[ExposureRow] = Field(description="`name` of each readable image, number of `tags` in it")
-    merged: MergedPart | None = Field(
+    merged: Annotated[Merged, Keys("rows share shifts")] | None = Field(
         description="of all exposures: `rows` of the tags seen, `share` of the "
         "corners' stated variance that differs between exposures, `shifts`: between two `exposures`, `tags` in common, "
         "median `shift_px` of their middles, and `sigma_px`"
     )
     camera_from_obj: Pose | None = Field(description="pose, also of rejected and ambiguous scenes")
-    pose: FitPart | None = Field(
+    pose: Annotated[ObjPose, OF_FIT] | None = Field(
         description="not with `--method patent`: `covariance`; `second`, the other pose that fits, or null; "
         "`delta_chi2`, `rms_px`, `chi2`, `redundancy`, `p_value` as in [measure](measure.md#out-what-measure-writes); "
         "`rows` of the tags used, `outliers` among the others, `residuals_px` and `weights` of four corners of each"
     )
-    patent: PatentPart | None = Field(
+    patent: Annotated[PatentPose, OF_PATENT] | None = Field(
         description="only with `--method patent`: `exposure` that is kept, `second` pose, `errors_px` of both, `det_j` "
         "(1/mm²), `same`: both poses are one; `exposures`: `tags` used, `area_px2` of their triangles (null where "
         "others show more tags), `candidate`, and of candidates `poses`, `errors_px`, `det_j`"
     )
-
-
-class GoalsPart(Part):
-    base_from_goal: dict[ByName, Pose]
-    covariance: dict[ByName, Matrix6]
 
 
 class LocatedFile(ResultFile):
@@ -304,7 +242,7 @@ class LocatedFile(ResultFile):
     layout: str = Field(description="the layout's name")
     tags: list[tuple[str, int]] = Field(description="dictionary and id of the layout's tags")
     scenes: list[SceneRow] = Field(description="one object each")
-    goals: GoalsPart | None = Field(
+    goals: Annotated[Goals, Keys("base_from_goal covariance")] | None = Field(
         description="with `--hand-eye` or `--registration`: `base_from_goal` and its `covariance` of accepted scenes"
     )
 
@@ -315,21 +253,6 @@ class LocatedFile(ResultFile):
         return cls.model_validate({**own, "scenes": list(results), "goals": goals})
 
 
-class AdjustedPart(Part):
-    poses: list[Pose]
-    image_rms_px: Vector
-    board_rms_px: float
-    tag_rms_px: float
-    stretch: float
-    shear: float
-    sigma_px: float
-    tag_sigma_px: float
-
-
-class CalibratedTags(Part):
-    tags: list[tuple[str, int]]
-
-
 class CalibratedLayoutFile(ResultFile):
     """Result file of ``locate calibrate``, without the covariance, which the layout file holds."""
 
@@ -338,13 +261,15 @@ class CalibratedLayoutFile(ResultFile):
     images: list[str] = Field(description="that were used")
     left_out: list[str] = Field(description="images without board or tags, and why")
     board_from_obj: Pose = Field(description="where {obj} lies on the board")
-    adjusted: AdjustedPart = Field(
+    adjusted: Annotated[AdjustedLayout, OF_ADJUSTED] = Field(
         description="`poses` camera_from_board of the images; RMS residuals per coordinate of the tags in each, "
         "`image_rms_px`, of the board's points, `board_rms_px`, and of all tags, `tag_rms_px`; how much longer the "
         "board is along its rows than across, `stretch`, and its `shear`, relative; `sigma_px` and `tag_sigma_px` as "
         "in the layout file"
     )
-    layout: CalibratedTags = Field(description="`tags`: dictionary and id; `--out` has the corners")
+    layout: Annotated[TargetLayout, Keys("tags")] = Field(
+        description="`tags`: dictionary and id; `--out` has the corners"
+    )
     counts: Rows = Field(description="number of images that show each tag")
     published: Corners = Field(description="corners before the adjustment")
     deviation_mm: Annotated[list[Finite], BeforeValidator(list)] = Field(

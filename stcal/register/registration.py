@@ -10,46 +10,37 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen, require_arguments
-from stcal.geometry.rigid import best_rotations
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
-from stcal.register.liu2017 import Liu2017Options, liu2017
-from stcal.register.mistakes import (
-    check_mirrored,
-    check_units,
-    mirrored_error,
-    mirrored_ratio,
-    moved_meanwhile,
-    order_note,
-    shifted_rows,
-    two_groups,
-    wider,
-)
-from stcal.register.models import MODELS, parts, squares
-from stcal.register.notes import by_chance, check_extent, check_supports, notes_of
-from stcal.register.pairs import Problem, noise_of
-from stcal.register.result import Alternative, Registration, held_out
-from stcal.register.robust import (
+from stcal.register.consensus import (
     AS_GOOD,
     BY_CHANCE,
-    LEAST_SHARE,
     Fitted,
     alternative_fit,
     chance,
     covariance_of,
     robust_fit,
     settled,
-    shifted_too,
     sigma_within,
 )
+from stcal.register.doubts import (
+    by_chance,
+    check_extent,
+    check_mirrored,
+    check_mirrored_with_outliers,
+    check_supports,
+    check_units,
+    notes_of,
+    wider,
+)
+from stcal.register.groups import moved_meanwhile, order_note, shifted_rows, two_groups
+from stcal.register.liu2017 import Liu2017Options, liu2017
+from stcal.register.registered import Alternative, Registration, held_out
+from stcal.register.transforms import MODELS, RIGID, Problem, problem_of, rotation_of
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9
 """Smallest threshold, mm: the precision of a double for points at a distance up to 1e12 mm."""
-SUSPICIOUS_SHARE = 0.5
-SUSPICIOUS_SIGMA = 0.05
-"""Inlier share below which, and σ as a fraction of the points' RMS distance from their centroid above which, a mirrored
-frame is tried. Both are met long before a mirrored frame is found; the trial costs time only."""
 
 
 @require_arguments
@@ -121,8 +112,8 @@ def register(
         If a fit with covariances did not converge.
     """
     problem = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances, lines)
-    if problem.model.name == "rigid":
-        check_units(problem.xyz_a, problem.xyz_b, seed)
+    if problem.model == RIGID:
+        check_units(problem, seed)
     second = None
     if method == "robust":
         again: Callable[[Problem], Fitted] = partial(robust_fit, threshold=threshold_mm, seed=seed)
@@ -135,7 +126,7 @@ def register(
         fitted = again(problem)
     inside = problem[fitted.inliers]
     if method != "liu2017":  # the baseline runs as published
-        check_mirrored(inside.model, inside.xyz_a, inside.xyz_b)
+        check_mirrored(inside)
         check_extent(inside.model, inside.xyz_a, fitted.sigma)
     if method == "robust" and not fitted.inliers.all():
         check_supports(problem, fitted.inliers, fitted.sigma)
@@ -150,26 +141,29 @@ def register(
             f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
             f"ambiguous answers{moved}",
         )
-    covariance = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
+    covariance, scaled, redundancy = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)
     other = shifted = None
     if method != "liu2017":
         other = wider(inside, fitted.transform)
         shifted = shifted_rows(*((inside, fitted.transform) if other is None else (other.problem, other.transform)))
     if shifted is not None:  # the transform is off by so much if the smaller group is right
-        covariance = shifted_too(covariance, (1 - len(shifted.rows) / shifted.count) * shifted.by_mm)
-    given = problem.noise.sigma_mm
+        off = np.zeros(len(covariance))
+        off[slice(3, None, 4) if len(off) == 12 else slice(3, 6)] = (
+            1 - len(shifted.rows) / shifted.count
+        ) * shifted.by_mm
+        covariance = covariance + np.outer(off, off)
     result = Registration(
         model=problem.model.name,
         method=method,
         b_from_a=fitted.transform,
-        covariance=covariance.matrix,
+        covariance=covariance,
         inliers=fitted.inliers,
         residuals=problem.residuals(fitted.transform),
         sigma_mm=fitted.sigma,
-        redundancy=covariance.redundancy,
+        redundancy=redundancy,
         threshold_mm=fitted.threshold if np.isfinite(fitted.threshold) else None,
-        sigma_factor=None if given is None else fitted.sigma / given,
-        scaled=covariance.scaled,
+        sigma_factor=None if problem.sigma_mm is None else fitted.sigma / problem.sigma_mm,
+        scaled=scaled,
         held_out=held_out(problem, lambda rows: again(problem[rows]).transform, fitted.inliers, folds, seed),
         ambiguous=ambiguous,
         alternative=alternative,
@@ -189,10 +183,12 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
         bad = np.flatnonzero(~np.isfinite(xyz).all(1))
         if len(bad):
             raise InputError("E-ARRAY-NOT-FINITE", f"registration: row {bad[0] + 1} of {name} is not finite; remove it")
-    if model not in MODELS:
-        raise InputError("E-OPTION-VALUE", f"registration: model {model!r}; one of {', '.join(MODELS)} needed")
-    if method not in METHODS:
-        raise InputError("E-OPTION-METHOD", f"registration: method {method!r}; one of {', '.join(METHODS)} needed")
+    for name, value, choices, code in (
+        ("model", model, MODELS, "E-OPTION-VALUE"),
+        ("method", method, METHODS, "E-OPTION-METHOD"),
+    ):
+        if value not in choices:
+            raise InputError(code, f"registration: {name} {value!r}; one of {', '.join(choices)} needed")
     if threshold_mm is not None and not NEAREST_MM <= threshold_mm <= FARTHEST:
         raise InputError(
             "E-OPTION-RANGE",
@@ -207,7 +203,7 @@ def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, 
         raise DegenerateError(
             "E-POINTS-FEW", f"registration: {len(a)} point pairs, {chosen.needed} needed for the {chosen.name} model"
         )
-    return Problem(chosen, a, b, noise_of(len(a), weights, covariances), lines)
+    return problem_of(chosen, a, b, weights, covariances, lines)
 
 
 def _least_squares(problem: Problem) -> Fitted:
@@ -216,10 +212,9 @@ def _least_squares(problem: Problem) -> Fitted:
 
 def _liu2017(problem: Problem, options: Liu2017Options, seed: int) -> Fitted:
     found = liu2017(problem.xyz_a, problem.xyz_b, options, seed)
-    near = found.inliers
-    total = squares(problem.residuals(found.b_from_a)[near]).sum()
-    sigma = float(np.sqrt(total / (3 * near.sum())))
-    return Fitted(found.b_from_a, near, sigma, options.limit_mm, options.tries)
+    total = (problem.residuals(found.b_from_a)[found.inliers] ** 2).sum()
+    sigma = float(np.sqrt(total / (3 * found.inliers.sum())))
+    return Fitted(found.b_from_a, found.inliers, sigma, options.limit_mm, options.tries)
 
 
 def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitted, Fitted | None]:
@@ -229,16 +224,14 @@ def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitte
         if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
             raise by_chance(int(fitted.inliers.sum()), len(problem), fitted.sigma)
     except DegenerateError:
-        _check_mirrored_with_outliers(problem, None, threshold, seed)
+        check_mirrored_with_outliers(problem, None, threshold, seed)
         raise
-    size = np.sqrt(np.var(problem.xyz_a[fitted.inliers], axis=0).sum())
-    if fitted.inliers.mean() < SUSPICIOUS_SHARE or fitted.sigma > SUSPICIOUS_SIGMA * size:
-        _check_mirrored_with_outliers(problem, fitted, threshold, seed)
+    check_mirrored_with_outliers(problem, fitted, threshold, seed)
     inside = np.flatnonzero(fitted.inliers)
     groups = two_groups(problem[inside], np.random.default_rng([seed, 4]))
-    if groups is None or groups.in_space:
+    if groups is None:
         return fitted, alternative_fit(problem, fitted, seed)
-    apart = [problem[inside].squares(t) for t in groups.transforms]
+    apart = [problem[inside].squares(transform) for transform in groups]
     first = np.zeros(len(problem), bool)
     first[inside[apart[0] <= apart[1]]] = True
     second = fitted.inliers & ~first
@@ -257,31 +250,7 @@ def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -
     return Fitted(transform, group, sigma, threshold or float(np.sqrt(square.max())))
 
 
-def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, threshold: float | None, seed: int) -> None:
-    """Refuses points of which far more agree, or agree far better, if a is mirrored."""
-    if problem.model.name == "affine":
-        return
-    flip = np.array([1, 1, -1.0])
-    image = replace(problem, xyz_a=problem.xyz_a * flip)
-    try:
-        mirrored = robust_fit(image, threshold, seed)
-    except DegenerateError:
-        return
-    if mirrored.inliers.mean() < LEAST_SHARE:  # points near any one plane fit
-        return
-    usual = 0.0 if fitted is None else chance(problem, fitted)
-    if chance(image, mirrored) < 2 * usual + np.log(BY_CHANCE) and (
-        fitted is None or mirrored.inliers.sum() > fitted.inliers.sum() or mirrored.sigma < fitted.sigma / 2
-    ):
-        agreeing = problem[mirrored.inliers]
-        times = float(np.sqrt(mirrored_ratio(agreeing.xyz_a, agreeing.xyz_b)[0]))
-        linear = parts(mirrored.transform)[0]
-        rotation = linear / np.cbrt(np.linalg.det(linear))
-        raise mirrored_error(rotation * flip, mirrored.inliers.sum(), len(problem), times)
-
-
 def _alternative(fitted: Fitted, other: Fitted, a: np.ndarray) -> Alternative:
     apart = np.sqrt(np.mean(((fitted.transform @ a - other.transform @ a) ** 2).sum(1)))
-    one, two = (best_rotations(parts(each.transform)[0])[0] for each in (fitted, other))
-    turn = float(Rotation.from_matrix(one @ two.T).magnitude())
-    return Alternative(other.transform, np.flatnonzero(other.inliers), float(apart), turn)
+    turn = Rotation.from_matrix(rotation_of(fitted.transform) @ rotation_of(other.transform).T).magnitude()
+    return Alternative(other.transform, np.flatnonzero(other.inliers), float(apart), float(turn))
