@@ -178,7 +178,7 @@ class Solution:
     ----------
     problem : Adjustment
         The adjustment.
-    values : dict of str to Vector or PoseStack
+    values : dict of str to Vector or Poses
         The members of each block, by its name.
     """
 

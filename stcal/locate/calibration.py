@@ -16,7 +16,7 @@ from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import PoseStack, block_diagonal
+from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
 from stcal.geometry.rigid import Poses, Rigid, align_rigid
@@ -109,16 +109,16 @@ class _Rows:
         stacked = np.concatenate(seen).reshape(len(focal), -1, 2)
         return cls(np.repeat(np.arange(len(images)), counts), stacked, np.concatenate(noise), focal)
 
-    def off(self, poses: PoseStack, xyz: np.ndarray) -> np.ndarray:
+    def off(self, poses: Poses, xyz: np.ndarray) -> np.ndarray:
         """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board."""
         return (self._projected(poses, xyz)[0] - self.seen).reshape(len(xyz), -1)
 
-    def slopes(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, poses: Poses, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns its derivatives by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
         _, by_point, by_pose = self._projected(poses, xyz)
         return by_pose.reshape(len(xyz), -1, 6), by_point @ poses.rotation[self.image][:, None]
 
-    def _projected(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _projected(self, poses: Poses, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         turned = xyz @ np.swapaxes(poses.rotation[self.image], 1, 2)
         return normalised(turned, turned + poses.translation[self.image][:, None])
 
@@ -155,11 +155,11 @@ class _Layout:
         prints = a.block("print", start["print"])
         covariance = tags.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
 
-        def by_board(poses: PoseStack, prints: Vector) -> tuple[np.ndarray, np.ndarray]:
+        def by_board(poses: Poses, prints: Vector) -> tuple[np.ndarray, np.ndarray]:
             by_pose, by_place = board.slopes(poses, self.printed(prints))
             return by_pose, by_place[:, 0] @ self.modes
 
-        def by_tags(poses: PoseStack, corners: Vector) -> tuple[np.ndarray, np.ndarray]:
+        def by_tags(poses: Poses, corners: Vector) -> tuple[np.ndarray, np.ndarray]:
             by_pose, by_place = tags.slopes(poses, self.placed(corners))
             return by_pose, block_diagonal(by_place[..., :2])
 
@@ -245,7 +245,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     """Minimises Huber's loss over 6m + 8n unknowns, poses eliminated. The board is the datum, exact but for how
     printers stretch and bend. Variance components (Förstner 1979) give a factor on its points' σ, and additional σ of
     tags. Raises ConvergenceError."""
-    layout, poses = _Layout.of(images), PoseStack.of(*(image.pose for image in images))
+    layout, poses = _Layout.of(images), Poses.of(image.pose for image in images)
     prints = Vector(np.zeros((1, len(layout.print.spread_mm))))
     values = {"pose": poses, "corners": Vector(start.reshape(-1, 8)), "print": prints}
     noise = layout.first_noise(values)

@@ -7,9 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import covariance_of
@@ -103,6 +102,6 @@ def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:
     error = pose_error(pose.camera_from_target, truth)
     if error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-6, 6):
         return False
-    second = mirrored(PoseStack.of(truth), towards).rotation[0]
+    second = mirrored(Poses.of([truth]), towards).rotation[0]
     off = Rigid(pose.camera_from_target.rotation @ second.T).angle_rad()
     return off < float(np.linalg.norm(error[:3]))

@@ -7,7 +7,7 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.plane import camera_from_plane, fit_homography
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import HandEyePoses
@@ -190,7 +190,7 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
             return NormalEquations.impossible(6)
         return NormalEquations.of(*whitened(view, camera, pose))
 
-    minima = [minimise(start, linearise, perturbed) for start in starts]
+    minima = [minimise(start, linearise, Rigid.moved) for start in starts]
     best = min(minima, key=lambda minimum: (not minimum.converged, minimum.linear.cost))
     return best.required(name, "take the image out")
 

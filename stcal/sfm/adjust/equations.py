@@ -12,11 +12,10 @@ from stcal.adjust.engine import Adjustment, Joined
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.normal_equations import free_motions
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.print_modes import AMPLITUDES
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.faces import Shape
@@ -84,9 +83,9 @@ class Group:
     def values(self) -> dict[str, Any]:
         """Returns its own unknowns at the start."""
         return {
-            self.name(POSES): PoseStack.of(*self.model.camera_from_model),
+            self.name(POSES): Poses.of(self.model.camera_from_model),
             self.name(DOTS): Vector(self.model.xyz_model[self.dots]),
-            self.name(BOARD): PoseStack.of(self.model_from_board),
+            self.name(BOARD): Poses.of([self.model_from_board]),
         }
 
     def at(self, values: Mapping[str, Any]) -> MetricModel:
@@ -98,7 +97,7 @@ class Group:
 
     def board_at(self, values: Mapping[str, Any]) -> Rigid:
         """Returns model_from_board at a state."""
-        return values[self.name(BOARD)].rigid(0)
+        return values[self.name(BOARD)][0]
 
     def board_residual(self, values: Mapping[str, Any]) -> np.ndarray:
         """Returns the adjusted dots minus the design, (e, 3), board frame, mm."""
@@ -220,14 +219,14 @@ class _Gap:
     design: np.ndarray  # (e, 3)
     cells: np.ndarray | None  # (e,) in the common shape
 
-    def _turned(self, board: PoseStack, shape: tuple[Vector, ...]) -> np.ndarray:
+    def _turned(self, board: Poses, shape: tuple[Vector, ...]) -> np.ndarray:
         places = self.design + shape[0].array[self.cells] if shape else self.design
         return places @ board.rotation[0].T
 
-    def residuals(self, dots: Vector, board: PoseStack, *shape: Vector) -> np.ndarray:
+    def residuals(self, dots: Vector, board: Poses, *shape: Vector) -> np.ndarray:
         return dots.array - self._turned(board, shape) - board.translation
 
-    def derivatives(self, dots: Vector, board: PoseStack, *shape: Vector) -> list[np.ndarray]:
+    def derivatives(self, dots: Vector, board: Poses, *shape: Vector) -> list[np.ndarray]:
         unit = np.broadcast_to(np.eye(3), (len(self.design), 3, 3))
         by_board = np.concatenate([skew(self._turned(board, shape)), -unit], axis=2)
         return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]

@@ -12,9 +12,8 @@ from stcal.adjust.engine import Adjustment
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import PARAMETER_NAMES, Camera
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset, fit_plane
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import Poses, skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.scale import find_scale
@@ -36,7 +35,7 @@ def adjust(model: M, camera: Camera) -> M:
             f"group {model.group}: no two images have {MIN_POINTS} circles or corners in common; add images, until two "
             "show each face beside a neighbour",
         )
-    a, poses = Adjustment(), PoseStack.of(*model.camera_from_model)
+    a, poses = Adjustment(), Poses.of(model.camera_from_model)
     few = 2 * len(model.images) <= len(model.labels)  # the larger part of the unknowns is eliminated
     cameras = a.block("poses", poses, eliminate=not few)
     points = a.block("points", Vector(model.xyz_model), eliminate=few)
@@ -60,15 +59,15 @@ def reproject(
     point, image, measured_px = model.point_index, model.image_index, model.corrected_px()
 
     @lru_cache(maxsize=2)
-    def seen(points: Vector, poses: PoseStack) -> np.ndarray:
+    def seen(points: Vector, poses: Poses) -> np.ndarray:
         return np.einsum("nij,nj->ni", poses.rotation[image], points.array[point]) + poses.translation[image]
 
-    def residuals(points: Vector, poses: PoseStack, *lens: Vector) -> np.ndarray:
+    def residuals(points: Vector, poses: Poses, *lens: Vector) -> np.ndarray:
         xyz = seen(points, poses)
         behind = (xyz[:, 2] <= 0).any()
         return np.full_like(measured_px, np.inf) if behind else camera_at(*lens).project(xyz) - measured_px
 
-    def derivatives(points: Vector, poses: PoseStack, *lens: Vector) -> list[np.ndarray]:
+    def derivatives(points: Vector, poses: Poses, *lens: Vector) -> list[np.ndarray]:
         xyz, camera, own = seen(points, poses), camera_at(*lens), poses[image]
         by_pose, by_point = jacobians(xyz, own.rotation, own.translation, camera)
         return [by_point, by_pose, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
@@ -77,15 +76,15 @@ def reproject(
     a.factor(residuals, list(zip(on, (point, image, None), strict=False)), derivatives=derivatives, root=root, **known)
 
 
-def placed(model: M, poses: PoseStack, points: Vector) -> M:
+def placed(model: M, poses: Poses, points: Vector) -> M:
     """Returns the model with these poses and points."""
-    rigid = tuple(poses.rigid(i) for i in range(len(poses)))
+    rigid = tuple(poses[i] for i in range(len(poses)))
     return replace(model, camera_from_model=rigid, xyz_model=points.array)
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Returns the derivatives of the projections (px) by poses, left perturbed, (n, 2, 6), and by points, (n, 2, 3)."""
-    own = PoseStack.of(*model.camera_from_model)[model.image_index]
+    own = Poses.of(model.camera_from_model)[model.image_index]
     return jacobians(model.xyz_camera(), own.rotation, own.translation, camera)
 
 

@@ -92,8 +92,7 @@ def place_with_camera(
     """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
     corners = Corners.of(observations, faces)
     _require_sizes(corners, camera)
-    none = np.zeros((16, 0))
-    body = settled_body(place_body(corners, camera), corners, none, np.zeros((0, 0)), camera)
+    body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
     return _named(body, corners, camera)
 
 
@@ -123,22 +122,21 @@ def place_and_find_camera(
 
 def _require_sizes(corners: Corners, camera: Camera) -> None:
     """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
-    wrong = wrong_sizes(corners, camera)
-    if not wrong.factors:
+    wrong, alike = wrong_sizes(corners, camera)
+    if not wrong:
         return
-    names = [corners.faces[face].id for face in wrong.factors]
-    if wrong.alike < len(names):
-        factors = list(wrong.factors.values())
+    names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
+    if alike < len(names):
         told = f"face {names[-1]} is {factors[-1] / factors[0]:.3g} times as large against face {names[0]}"
         raise MappingError(
             "E-BODY-SIZES",
             f"target: sizes of faces {' and '.join(names)} contradict one another: by the photographs, {told} as "
             "target.toml states; measure the side of each print, and correct it",
         )
-    told = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, wrong.factors.values(), strict=True))
+    told = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
     raise MappingError(
         "E-BODY-SIZES",
-        f"target: the photographs show {told} times as large as target.toml states, and the sizes of {wrong.alike} "
+        f"target: the photographs show {told} times as large as target.toml states, and the sizes of {alike} "
         "other faces agree with one another; measure the side of its print, and correct it",
     )
 
@@ -159,8 +157,8 @@ def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
 def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
     placed = np.flatnonzero(body.placed_faces).tolist()
     return PlacedBody(
-        {corners.faces[f].id: body.body_from_face.rigid(f) for f in placed},
-        {corners.images[i]: body.camera_from_body.rigid(i) for i in np.flatnonzero(body.placed_images).tolist()},
+        {corners.faces[f].id: body.body_from_face[f] for f in placed},
+        {corners.images[i]: body.camera_from_body[i] for i in np.flatnonzero(body.placed_images).tolist()},
         tuple(corners.faces[f] for f in placed),
         camera,
         tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
