@@ -11,10 +11,8 @@ from stcal.geometry.normal_equations import blocks_of
 from stcal.geometry.rigid import Poses
 from stcal.geometry.robust import huber_cost, huber_weights
 
-PoseStack = Poses
-"""Members that are poses, moved by left perturbations."""
-STEP = 1e-6
-"""Step of numerical derivatives, as a share of 1, or of the unknown's size where that is more."""
+PoseStack = Poses  # members that are poses, moved by left perturbations
+STEP = 1e-6  # step of numerical derivatives, as a share of 1, or of the unknown's size where that is more
 
 
 class Values(Protocol):

@@ -36,8 +36,7 @@ LEFT = 1e-9
 """Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 LOOSE = 1e-10
 """Share of each unknown's information that is added where σ are sought, so that undetermined ones do no harm."""
-AT_ONCE = 10_000
-"""Number of rows whose derivatives are multiplied at once; it bounds the memory."""
+AT_ONCE = 10_000  # number of rows whose derivatives are multiplied at once; it bounds the memory
 
 
 @dataclass(eq=False)

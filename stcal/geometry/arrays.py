@@ -27,8 +27,7 @@ from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
 
-LONGEST = 100
-"""Number of characters up to which the ``repr`` of a value stands in that of a result."""
+LONGEST = 100  # number of characters up to which the repr of a value stands in that of a result
 MYPY = False
 """True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
 
@@ -93,8 +92,7 @@ class Brief(ByValue):
         return f"{type(self).__name__}({', '.join(shown)})"
 
 
-TOLD = {"notes", "doubts"}
-"""Fields whose sentences a ``repr`` has in full."""
+TOLD = {"notes", "doubts"}  # fields whose sentences a repr has in full
 
 
 def _brief(value: object) -> str:
@@ -106,8 +104,7 @@ def _brief(value: object) -> str:
     return text if len(text) <= LONGEST else f"<{type(value).__name__}>"
 
 
-Rule = tuple[Callable[[Any], bool], str]
-"""Whether a value is of a type, and the type in words."""
+Rule = tuple[Callable[[Any], bool], str]  # whether a value is of a type, and the type in words
 NO_RULE: tuple[Rule, bool] = ((lambda _: True), ""), False
 P = ParamSpec("P")
 R = TypeVar("R")

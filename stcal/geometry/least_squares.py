@@ -17,14 +17,12 @@ SETTLED = 1e-12
 by more than 1e-4 σ, and the remaining error is far smaller."""
 LEAST_GAIN = 1e-12
 """Decrease that rounding alone predicts for exact data, in units of σ²: a step of a millionth of σ."""
-ROUNDING = 1e-12
-"""Share of the cost by which rounding may seem to raise the cost at the minimum."""
+ROUNDING = 1e-12  # share of the cost by which rounding may seem to raise the cost at the minimum
 MAX_DAMPING = 1e12
 UNKEPT, KEPT = 1e-8, 0.1
 """A descent ends if the predicted decrease is at most ``UNKEPT``, in units of σ², and the actual decrease is less than
 the share ``KEPT`` of it: what remains is rounding."""
-TRUSTED = 0.5
-"""Ratio of actual to predicted decrease above which the damping shrinks; below ``KEPT`` it grows."""
+TRUSTED = 0.5  # ratio of actual to predicted decrease above which the damping shrinks; below KEPT it grows
 DAMPED = 1e-4
 """Largest predicted decrease of an undamped step at which a damped descent counts as ended, in units of σ²: a step of a
 hundredth of σ. Where the derivatives neglect the curvature of the residuals, only damped steps lower the cost."""

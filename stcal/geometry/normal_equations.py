@@ -12,8 +12,7 @@ SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
 
 TINY = 1e-300
-LARGE = 100
-"""Number of unknowns of a block from which on its inverse is computed from Cholesky's factors."""
+LARGE = 100  # number of unknowns of a block from which on its inverse is computed from Cholesky's factors
 
 
 @dataclass(frozen=True, slots=True, eq=False)

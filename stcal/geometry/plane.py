@@ -213,13 +213,11 @@ OUTLIER = 6.0
 6·10⁷ (Rayleigh)."""
 MAX_OUTLIER_SHARE = 1 / 3
 """Largest share of outliers among the observed points; beyond it the inliers are no trustworthy majority."""
-SAME = 1.0
-"""Distance, in σ, below which two minima count as one: the covariance covers both."""
+SAME = 1.0  # distance, in σ, below which two minima count as one: the covariance covers both
 WIDER = 1.1
 """Factor of increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's
 loss."""
-MAX_SIGMA_RAD = 0.5
-"""Largest σ of a usable rotation; beyond it linear error propagation is meaningless."""
+MAX_SIGMA_RAD = 0.5  # largest σ of a usable rotation; beyond it linear error propagation is meaningless
 Descend = Callable[[Poses, float], Minima]
 """Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""
 

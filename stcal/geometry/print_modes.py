@@ -17,10 +17,8 @@ BEND_SHARE = 0.01
 """σ of a sheet's bends out of its plane, likewise: 1 mm on 200 mm, more than that of any board in use."""
 LEAST_SHARE = 1e-3
 """A mode that moves the points by less than this share of what it moves others by is not told by them."""
-AMPLITUDES = (1e-3, 10.0)
-"""Smallest and largest factor on these σ."""
-PRIOR_LOGS = np.log(10.0)
-"""σ of the logarithm of the factor before the data are seen."""
+AMPLITUDES = (1e-3, 10.0)  # smallest and largest factor on these σ
+PRIOR_LOGS = np.log(10.0)  # σ of the logarithm of the factor before the data are seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,8 +23,7 @@ Order = Literal["wxyz", "xyzw"]
 order of the columns."""
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
-SMALL_RAD = 1e-3
-"""Angle below which the next term of a series is rounding error."""
+SMALL_RAD = 1e-3  # angle below which the next term of a series is rounding error
 
 
 def skew(v: ArrayLike) -> np.ndarray:

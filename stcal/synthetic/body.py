@@ -21,17 +21,14 @@ from stcal.io.cameras.read import save_camera
 from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile, new_dataset, write_images
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
-DRAWING_PX = 2000
-"""Longer side of the drawing of a face, px."""
-CIRCLE_CORNERS = 360
-"""Corners of the polygon that a circle is drawn as."""
+DRAWING_PX = 2000  # longer side of the drawing of a face, px
+CIRCLE_CORNERS = 360  # corners of the polygon that a circle is drawn as
 SAMPLES, LATTICE = 13, 8
 """Samples of a pixel: a Fibonacci lattice, shifted at random from pixel to pixel. An edge along the pixel rows is then
 exactly in place; a grid of points would place it in steps."""
 EDGE_SIGMA_PX = 0.1
 """σ of the shift that ink, light and the camera's response give the edges of all tags alike."""
-BEND_MM = 0.02
-"""σ of a point of a printed face about its plane."""
+BEND_MM = 0.02  # σ of a point of a printed face about its plane
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 SHOWN_DEG, SQUARE_DEG = 60.0, 45.0
@@ -41,8 +38,7 @@ ENOUGH_VIEWS, ENOUGH_SQUARE = 5, 2
 """Number of photographs that show each face, and of those that show it squarely, as far as there are enough of them."""
 TRIALS, CHOICES = 2000, 24
 """Number of poses that are tried for a photograph, and number of suitable ones of which the best is taken."""
-BORDER = 0.01
-"""Free border of the image, in image widths: faces are not quite where the design has them."""
+BORDER = 0.01  # free border of the image, in image widths: faces are not quite where the design has them
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
-REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
-"""Groups of Zhang & Wei (2017), sec. 2."""
+REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))  # groups of Zhang & Wei (2017), sec. 2.
 
 # Drawings of the second design: id, x, y, radius in mm, in a drawing frame with the origin in a corner of the face.
 _TOP = [
@@ -133,8 +132,7 @@ def tag_dodecahedron(
 
 
 MOST_WIDTH_MM = 10_000.0
-MIN_CELL_PX = 2.0
-"""Width of a tag's cell below which its corners are several times less exact."""
+MIN_CELL_PX = 2.0  # width of a tag's cell below which its corners are several times less exact
 
 
 Body = Literal["cube", "dodecahedron"]

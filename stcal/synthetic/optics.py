@@ -15,12 +15,10 @@ from stcal.geometry.camera import Camera
 
 SHARP_PX = 0.01
 """Radius of a circle of confusion below which nothing is blurred: it moves no centre by 1e-4 px."""
-WIDEST_PX = 20.0
-"""Largest circle of confusion that is rendered, radius: the time grows with its square."""
+WIDEST_PX = 20.0  # largest circle of confusion that is rendered, radius: the time grows with its square
 HIGHEST_WAVE = 3.0
 """Highest wave number that matters, in 1/σ of the Gaussian blur, which lets through 1 % of it."""
-LEAST_SIGMA_PX = 0.35
-"""σ of the blur by a pixel's own area, about 1/√12."""
+LEAST_SIGMA_PX = 0.35  # σ of the blur by a pixel's own area, about 1/√12
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +146,7 @@ def _moved(share: np.ndarray, source_from_square: np.ndarray) -> np.ndarray:
     return cv2.warpAffine(share, source_from_square, share.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
-DARKEST = 1e-3
-"""Least grey value, as a share of white. The photograph holds no information below."""
+DARKEST = 1e-3  # least grey value, as a share of white. The photograph holds no information below.
 
 
 FULL_WELL, READ_NOISE = 10_000.0, 8.0

@@ -22,10 +22,8 @@ WALL_REACH = 3.0
 """Half the side of the wall, in widths of the view. An oblique view reaches far; cells out of view cost little."""
 LAMP_REACH_MM = 1000.0
 TABLE_BELOW_MM = 50.0
-FAINT = 0.12
-"""Reflectance of the table that clutter has, which shows circles alone."""
-SHIFT = 4
-"""Fractional bits of cv2's fixed-point pixels."""
+FAINT = 0.12  # reflectance of the table that clutter has, which shows circles alone
+SHIFT = 4  # fractional bits of cv2's fixed-point pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,13 +222,10 @@ def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
 
 SUBSAMPLES = 8
 """Number of cells per pixel side at a rim. A cell that the rim crosses counts by its linear share."""
-FINE = 4
-"""Number of squares per pixel side on which a circle is blurred."""
+FINE = 4  # number of squares per pixel side on which a circle is blurred
 RIM_REACH_PX = 1.5
-SPREAD_BY_DISTORTION = 1.3
-"""Largest factor by which the lens distortion may enlarge a circle of confusion."""
-HOLE_SHARE = 0.4
-"""Radius of the hole in a dot that tells a board from its turns, in radii of the dot."""
+SPREAD_BY_DISTORTION = 1.3  # largest factor by which the lens distortion may enlarge a circle of confusion
+HOLE_SHARE = 0.4  # radius of the hole in a dot that tells a board from its turns, in radii of the dot
 STEEP_RAD = np.radians(75)
 FULL_SCALE = 255.0
 

@@ -23,8 +23,7 @@ FACE_MARGIN_MM = 15.0
 """How far a plate is assumed to reach beyond the rims of its circles, mm, if the design states no outline."""
 BOARD_MARGIN_MM = 15.0
 SENSOR_WIDTH_MM = 22.3
-FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM
-"""Focal length in image widths of a 24 mm lens on this sensor."""
+FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM  # focal length in image widths of a 24 mm lens on this sensor
 CONVEX_TOLERANCE_MM = 5.0
 
 
@@ -396,8 +395,7 @@ def _seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
     return replace(scene, camera=Camera.of(camera, "OPENCV_FISHEYE"), groups=groups)
 
 
-MAX_FOUND_TILT_RAD = np.radians(70)
-"""Largest tilt at which a circle must be found, in rad."""
+MAX_FOUND_TILT_RAD = np.radians(70)  # largest tilt at which a circle must be found, in rad
 MAX_SHOWN_TILT_RAD = np.radians(89)
 RIM_POINTS = 72
 NEAR_BORDER = 3.0

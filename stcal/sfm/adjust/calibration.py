@@ -26,8 +26,7 @@ from stcal.sfm.adjust.scale import Scale, find_scale
 from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of, with_differences
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
-FLATNESS_MM = 0.02
-"""σ of the circles off the plane of their face where none is stated."""
+FLATNESS_MM = 0.02  # σ of the circles off the plane of their face where none is stated
 MOST_FLATNESS_MM = 1e6
 Solve = Literal["joint", "chain", "paper"]
 

@@ -25,10 +25,8 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 
 CIRCLES, DOTS, BOARD, SHAPE, CAMERA, POSES = "circles", "dots", "board", "shape", "camera", "poses"
 """Names of blocks; those of a group end with its name. The first three are kinds of rows, too."""
-SHARED = CIRCLES, CAMERA, SHAPE
-"""Blocks that all groups share, the last if the board keeps its shape."""
-FREE_DIRECTIONS = 6
-"""Number of free directions: a rigid motion of the world changes nothing."""
+SHARED = CIRCLES, CAMERA, SHAPE  # blocks that all groups share, the last if the board keeps its shape
+FREE_DIRECTIONS = 6  # number of free directions: a rigid motion of the world changes nothing
 
 
 def normalised(model: GroupModel, camera: Camera) -> np.ndarray:

@@ -125,8 +125,7 @@ class Shape:
 
 
 FrameKind = Literal["plane", "three-point"]
-MIN_KNOWN = 3
-"""Smallest number of points of a face of known shape that place it."""
+MIN_KNOWN = 3  # smallest number of points of a face of known shape that place it
 MIN_PLACING = 4
 """Smallest number of mapped circles that can place the others of their face. Three determine the placement, a fourth
 shows how good it is."""

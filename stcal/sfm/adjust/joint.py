@@ -40,14 +40,12 @@ from stcal.sfm.adjust.equations import (
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import MetricModel
 
-Values = dict[str, Any]
-"""Unknowns by block."""
+Values = dict[str, Any]  # unknowns by block
 ShapeFactors = tuple[float, float, float]
 """``print_factor``, ``bend_factor`` and ``print_amplitude`` of faces of known shape."""
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
-NEAR = 1e-8
-"""The same where a result is the start of another one: a hundredth of σ."""
+NEAR = 1e-8  # the same where a result is the start of another one: a hundredth of σ
 NEARLY = 1e-6
 """The same where parts of the images are compared, or the σ of faces of known shape are estimated: a tenth of σ."""
 MAX_STEPS = 100
@@ -185,8 +183,7 @@ SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
 """Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
 """Degrees of freedom that the stated σ of such faces are worth, in addition to their deviations."""
-LEAST_FACTOR = 0.1
-"""Smallest such factor: print may be better than stated, but is never exact."""
+LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but is never exact
 
 
 def _with_shape_factors(setting: Setting, values: Values, factors: ShapeFactors) -> tuple[Setting, Values]:

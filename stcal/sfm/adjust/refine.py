@@ -22,8 +22,7 @@ from stcal.sfm.data.model import MIN_POINTS, GroupModel, M, Outlier, WorldModel
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 MAX_STEPS = 50
-DAMPING = 1e-10
-"""Relative damping, which holds the seven free directions of the world."""
+DAMPING = 1e-10  # relative damping, which holds the seven free directions of the world
 NO_PARAMETERS = np.zeros((len(PARAMETER_NAMES), 0))
 
 
@@ -97,8 +96,7 @@ def jacobians(
 
 
 MAX_ROUNDS = 20
-SETTLED_PX = 1e-5
-"""Largest change of corrections that have settled, in px: far below any centring noise."""
+SETTLED_PX = 1e-5  # largest change of corrections that have settled, in px: far below any centring noise
 OUTLIER_RMS = 6.0
 """Limit of a residual, as a multiple of the residuals' robust RMS length, √2 σ. Observations that exceed it, and twice
 this multiple of their own σ, are named and left out."""

@@ -14,10 +14,8 @@ from stcal.labels import CircleLabel, Label, dot_cells
 from stcal.sfm.data.model import ImageObservations, WorldModel
 
 MIN_DOTS = 4
-EDGE_SIGMA_PX = 0.1
-"""σ of the shift that all edges of all tags share."""
-MIN_CORNERS = 3
-"""Smallest number of corners that determine the scale of a face of known shape."""
+EDGE_SIGMA_PX = 0.1  # σ of the shift that all edges of all tags share
+MIN_CORNERS = 3  # smallest number of corners that determine the scale of a face of known shape
 ScaleSource = Literal["board", "faces", "distances", "drawing"]
 
 

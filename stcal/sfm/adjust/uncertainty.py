@@ -26,8 +26,7 @@ from stcal.sfm.adjust.equations import (
 from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
 from stcal.sfm.adjust.joint import Adjusted, JointResult, points_of, scale_of
 
-STEP_MM = 1e-3
-"""Step of the central differences, in mm."""
+STEP_MM = 1e-3  # step of the central differences, in mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)

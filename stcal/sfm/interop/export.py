@@ -76,8 +76,7 @@ def _list(texts) -> str:
     return "[ " + ", ".join(map(_quoted, texts)) + " ]"
 
 
-PLATE_M = 1e-4
-"""Height of the cylinders that show circles. Their outer ends lie in the faces' planes."""
+PLATE_M = 1e-4  # height of the cylinders that show circles. Their outer ends lie in the faces' planes.
 MM_M = 1e-3
 
 
@@ -144,8 +143,7 @@ def _escaped(text: str) -> str:
     return text.replace("$(", "$$(").replace("${", "$${")
 
 
-ROOT = "target"
-"""Default name of the target frame."""
+ROOT = "target"  # default name of the target frame
 
 
 @dataclass(frozen=True, slots=True)

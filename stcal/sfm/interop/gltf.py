@@ -11,10 +11,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.poses.programs import metres, xyzw
 from stcal.sfm.interop.export_content import BOARD_RGB, Circle, Content
 
-EDGES = 48
-"""Number of edges of a disc. Its triangles leave out 0.3 % of its area."""
-CAMERA_SHARE = 0.06
-"""Depth of a camera's pyramid as a share of the scene's extent."""
+EDGES = 48  # number of edges of a disc. Its triangles leave out 0.3 % of its area.
+CAMERA_SHARE = 0.06  # depth of a camera's pyramid as a share of the scene's extent
 
 
 MM_M = 1e-3
@@ -22,8 +20,7 @@ FLOAT, UNSIGNED = 5126, 5125
 VERTICES, INDICES = 34962, 34963
 LINES, TRIANGLES = 1, 4
 NEAR_M = 0.01
-RINGS, SEGMENTS = 8, 12
-"""Numbers of rings and segments of the ball that shows σ."""
+RINGS, SEGMENTS = 8, 12  # numbers of rings and segments of the ball that shows σ
 Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 """Quaternion x y z w that turns the target's Z to glTF's Y, which points up."""
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])

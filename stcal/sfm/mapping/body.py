@@ -21,29 +21,22 @@ from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma
 from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier
 
-MIN_CORNERS = 4
-"""Smallest number of corners of a view of a face: they determine its homography."""
+MIN_CORNERS = 4  # smallest number of corners of a view of a face: they determine its homography
 SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
 """Largest differences of two poses of one face relative to another that agree: rotation, and translation as a share of
 the distance of the faces."""
-MOST_VOTES = 250
-"""Most images that vote on how two faces lie; time and memory grow with their square."""
-LEAST_SIGMA_PX = 0.05
-"""σ that print, lens and detector leave to any corner."""
+MOST_VOTES = 250  # most images that vote on how two faces lie; time and memory grow with their square
+LEAST_SIGMA_PX = 0.05  # σ that print, lens and detector leave to any corner
 LEAST_PAIRS, ROBUST_SIZES = 2, 10
 """Smallest number of images of two faces that tell the ratio of their sizes, and number of robust rounds."""
 MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
 """Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
 LEAST_SIGMA_OFF = 0.02
 """σ of such a logarithm that the reflections of views and a rough camera leave to any."""
-LEAST_FOCAL = 0.1
-"""Smallest focal length of the camera, as a share of that at the start."""
-BETTER = 0.2
-"""Share by which another pose of a face must fit its corners better."""
-BY_CHANCE = 0.01
-"""Number of sound corners in a run that may be taken for gross errors."""
-SHARING = 2
-"""Number of corners that share the error of an edge."""
+LEAST_FOCAL = 0.1  # smallest focal length of the camera, as a share of that at the start
+BETTER = 0.2  # share by which another pose of a face must fit its corners better
+BY_CHANCE = 0.01  # number of sound corners in a run that may be taken for gross errors
+SHARING = 2  # number of corners that share the error of an edge
 PASSES, ROBUST_ROUNDS = 3, 3
 MAX_STEPS = 100
 FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)

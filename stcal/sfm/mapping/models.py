@@ -22,8 +22,7 @@ from stcal.sfm.data.model import GroupModel, ImageObservations, M, MetricModel, 
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
-LOG_NOTHING = 4
-"""Level of COLMAP's log that prints nothing. Errors are raised as exceptions."""
+LOG_NOTHING = 4  # level of COLMAP's log that prints nothing. Errors are raised as exceptions.
 KEYPOINT_TOLERANCE_PX = 0.002
 """Largest deviation of a keypoint from the database. Steps of float32: 0.0005 px at x = 5000, 0.002 px at x = 30
 000."""

@@ -205,14 +205,10 @@ def triangulate(xy_a: np.ndarray, xy_b: np.ndarray, b_from_a: Rigid) -> tuple[np
 GraphKind = Literal["all", "sparse"]
 SPARSE_FROM = 80
 """Largest set of images that gets all pairs. Above it the sparse graph is faster (scripts/studies/scale_study.py)."""
-MIN_SHARED = 6
-"""Smallest number of common labels of a pair of images that is written."""
-SKELETON = 20
-"""Number of images of a group that are mapped first. Smaller groups are mapped as a whole."""
-MIN_VIEWS = 3
-"""Smallest number of views of every circle in the skeleton, if the group has that many."""
-NEIGHBOURS = 3
-"""Smallest number of skeleton images that each image outside the skeleton is paired with."""
+MIN_SHARED = 6  # smallest number of common labels of a pair of images that is written
+SKELETON = 20  # number of images of a group that are mapped first. Smaller groups are mapped as a whole.
+MIN_VIEWS = 3  # smallest number of views of every circle in the skeleton, if the group has that many
+NEIGHBOURS = 3  # smallest number of skeleton images that each image outside the skeleton is paired with
 MIN_DOTS = 6
 
 

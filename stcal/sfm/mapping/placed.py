@@ -34,12 +34,10 @@ from stcal.sfm.mapping.models import assemble
 from stcal.sfm.mapping.pairs import PairScore
 
 BY_FACES = "faces of known shape, placed together"
-LENS = "OPENCV"
-"""Model of an unknown camera."""
+LENS = "OPENCV"  # model of an unknown camera
 SIGMA_FOCAL, SIGMA_SQUARE = 0.5, 2e-3
 """Relative σ of the focal length of an unknown camera, and of the ratio of its two focal lengths."""
-SIGMA_CENTRE = 0.03
-"""σ of its principal point, in longer image sides."""
+SIGMA_CENTRE = 0.03  # σ of its principal point, in longer image sides
 SIGMA_RADIAL, SIGMA_TANGENTIAL = np.array([0.3, 0.1]), 0.003
 """σ of its distortion, as shares of a corner's distance from the middle of the image: lenses of cameras have no more,
 and few or small faces would take noise for it."""
