@@ -39,7 +39,7 @@ def timed_advice() -> float:
     """Seconds of ``advise`` over many images, by its function: labels simulated, the geometry that of a run."""
     from stcal.geometry.rigid import Rigid
     from stcal.sfm.adjust.chain import CalibratedTarget
-    from stcal.sfm.adjust.joint import covariance_of
+    from stcal.sfm.adjust.joint import unmoved
     from stcal.sfm.planning.advise import Known, advise
     from stcal.sfm.planning.forecast import CentreNoise, Setup, observe, true_models
     from stcal.sfm.planning.views import known_scene
@@ -52,7 +52,7 @@ def timed_advice() -> float:
     poses, groups = dict(scene.target_from_face), dict.fromkeys(scene.groups, Rigid())
     start = CalibratedTarget(scene.reference_face, poses, scene.circles_target, groups)
     setup = Setup(scene.target, scene.board, scene.camera, start, "plane", 0.02, None, 0.0)
-    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm)
+    joint = unmoved(models, setup.board, setup.camera, setup.flatness_mm).result(1.0)
     known = Known(tuple(models), joint, setup, noise, known_scene(models, joint, setup, "OPENCV"))
     begin = time.perf_counter()
     advise(known)

@@ -3,7 +3,7 @@ has poses of its cameras, dots, and a pose of its board of its own."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -112,6 +112,18 @@ class Group:
         return np.flatnonzero(np.isin(self.model.point_index, self.circles if kind == CIRCLES else self.dots))
 
 
+class ShapeFactors(NamedTuple):
+    """Factors on the stated σ of faces of known shape, in their plane and off it, and ``amplitude`` of the smooth
+    deviations of their prints."""
+
+    in_plane: float = 1.0
+    off_plane: float = 1.0
+    amplitude: float = AMPLITUDES[0]
+
+
+AS_STATED, UNKNOWN_SHAPES = ShapeFactors(), ShapeFactors(amplitude=1.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
     """Constants of one minimisation."""
@@ -125,9 +137,7 @@ class Setting:
     basis: np.ndarray  # (16, q) derivative of the camera's parameters by those that are adjusted
     prior: np.ndarray
     huber: float
-    print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
-    bend_factor: float = 1.0  # off their plane
-    print_amplitude: float = AMPLITUDES[0]  # of the smooth deviations of their prints
+    factors: ShapeFactors = AS_STATED
 
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
@@ -299,22 +309,16 @@ def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
     """Yields the faces of known shape, with their stated σ; none for a state that a step has sent to infinity."""
     if not np.isfinite(xyz).all():
         return
-    off, known = setting.bend_factor * setting.flatness_mm, known_points(setting.labels, setting.board)
+    off, known = setting.factors.off_plane * setting.flatness_mm, known_points(setting.labels, setting.board)
     # What the sizes of all prints have in common counts once: each alone may be off by more.
     alone = float(np.sqrt(len(known)))
     for face, members in known:
         design = face.places_mm(setting.labels[i].circle for i in members)
-        within = setting.print_factor * (face.sigma_mm or 1.0)
+        within = setting.factors.in_plane * (face.sigma_mm or 1.0)
         weight = np.tile([within**-2, within**-2, 0.0 if np.isinf(off) else off**-2], (len(members), 1))
         try:
-            yield Shape.of(
-                members,
-                design,
-                xyz[members],
-                weight,
-                alone * face.size_sigma,
-                setting.print_amplitude,
-            )
+            size_sigma = alone * face.size_sigma
+            yield Shape.of(members, design, xyz[members], weight, size_sigma, setting.factors.amplitude)
         except DegenerateError:  # corners on a line
             continue
 
