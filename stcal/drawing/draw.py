@@ -186,11 +186,6 @@ def draw(
     net : bool
         Whether the plates of a target are unfolded into one net on one sheet, by their outlines and rough poses.
 
-    Returns
-    -------
-    Drawn
-        ``path``, the ``parts`` that are drawn, and the ``sheets``.
-
     Raises
     ------
     InputError

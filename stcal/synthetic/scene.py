@@ -121,20 +121,15 @@ class Scene(Brief):
 
     Parameters
     ----------
-    target, board : TargetDesign, BoardDesign
-        Designs of what is photographed.
-    camera : Camera
-        The camera, as it really is.
+    target, board, camera : TargetDesign, BoardDesign, Camera
+        Designs of what is photographed, and the camera as it really is.
     target_from_face : dict of Rigid
-        Three-point frames through the circles as really placed, by face id. The first face of the design is the
-        reference: its frame is the target frame.
+        Three-point frames through the circles as really placed, by face id; that of the first face is the target frame.
     circles_target : dict of (3,) array
         Centres of the circles as really placed, by label, target frame, mm.
     groups : dict of Group
         Board and views of each group, by name.
-    seed : int
-        Of all that is random, noise of the photographs included.
-    margin_mm : float
+    seed, margin_mm : int, float
         As in the options.
     """
 
@@ -445,20 +440,13 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     size = np.array([scene.camera.width, scene.camera.height])
     centre = scene.camera.project(xyz)
     shown = (tilt <= MAX_SHOWN_TILT_RAD) & ((centre > -0.5) & (centre < size - 0.5)).all(1)
-    whole = _whole(scene.camera, xyz, normal, radius, centre)
+    reach = NEAR_BORDER * scene.camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
+    whole = ((centre > reach[:, None]) & (centre < size - 1 - reach[:, None])).all(1)
+    near = np.flatnonzero(~whole)  # the rims near the border alone are computed
+    rim = scene.camera.project(rim_points(xyz[near], normal[near], radius[near]))
+    whole[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
     findable = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
     return ImageCircles(tuple(labels), xyz, normal, radius, tilt, centre, findable).rows(shown)
-
-
-def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.ndarray:
-    """Returns the mask of the circles whose rims lie in the image. Only rims near its border are computed."""
-    size = np.array([camera.width, camera.height])
-    reach = NEAR_BORDER * camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
-    inside = ((centre_px > reach[:, None]) & (centre_px < size - 1 - reach[:, None])).all(1)
-    near = np.flatnonzero(~inside)
-    rim = camera.project(rim_points(xyz[near], normal[near], radius[near]))
-    inside[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
-    return inside
 
 
 def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:

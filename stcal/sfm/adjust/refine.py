@@ -13,7 +13,7 @@ from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import PARAMETER_NAMES, Camera
 from stcal.geometry.plane import circle_image_offset, fit_plane
-from stcal.geometry.rigid import Poses, skew
+from stcal.geometry.rigid import Poses, by_pose
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.scale import find_scale
@@ -68,8 +68,8 @@ def reproject(
 
     def derivatives(points: Vector, poses: Poses, *lens: Vector) -> list[np.ndarray]:
         xyz, camera, own = seen(points, poses), camera_at(*lens), poses[image]
-        by_pose, by_point = jacobians(xyz, own.rotation, own.translation, camera)
-        return [by_point, by_pose, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
+        of_poses, by_point = jacobians(xyz, own.rotation, own.translation, camera)
+        return [by_point, of_poses, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
 
     root = model.whiten(np.tile(np.eye(2), (len(image), 1, 1)))
     a.factor(residuals, list(zip(on, (point, image, None), strict=False)), derivatives=derivatives, root=root, **known)
@@ -77,8 +77,7 @@ def reproject(
 
 def placed(model: M, poses: Poses, points: Vector) -> M:
     """Returns the model with these poses and points."""
-    rigid = tuple(poses[i] for i in range(len(poses)))
-    return replace(model, camera_from_model=rigid, xyz_model=points.array)
+    return replace(model, camera_from_model=tuple(poses), xyz_model=points.array)
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -92,7 +91,7 @@ def jacobians(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns :func:`projection_jacobians` of points (n, 3) in cameras with poses (n, 3, 3), (n, 3)."""
     by_camera = camera.projection_jacobian(xyz)
-    return np.concatenate([-by_camera @ skew(xyz - translation), by_camera], axis=2), by_camera @ rotation
+    return by_pose(by_camera, xyz - translation), by_camera @ rotation
 
 
 MAX_ROUNDS = 20

@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import require_arguments, rms
-from stcal.geometry.rigid import Poses, Rigid, align_similarity
+from stcal.geometry.rigid import Rigid, align_similarity
 from stcal.io.json import read_json
 from stcal.parallel import Progress, scratch_folder
 from stcal.report.text import number, text_table
@@ -262,18 +262,13 @@ def _faces(
     for face in sorted(a.keys() | b.keys()):
         rows[face] = None
         if face in a and face in b:
-            difference = _off(a[face], b[face])
+            difference = a[face].difference(b[face])
             rows[face] = FaceDifference(
                 translation_um=MICRO * float(np.linalg.norm(difference[3:])),
                 rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(difference[:3]))),
                 sigmas=_sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
             )
     return rows
-
-
-def _off(pose: Rigid, other: Rigid) -> np.ndarray:
-    """Returns the rotation vector (rad) and translation (mm) from ``other`` to ``pose`` in their common frame, (6,)."""
-    return Poses.of([pose]).difference(Poses.of([other]))[0]
 
 
 def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float:
@@ -302,14 +297,13 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
         for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
             if name not in poses:
                 continue
-            target_from_a, target_from_b = pose.inverse(), poses[name].inverse()
-            turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
+            off = pose.inverse().difference(poses[name].inverse())
             rows.append(
                 CameraDifference(
                     image=name,
-                    position_um=MICRO * float(np.linalg.norm(target_from_a.translation - target_from_b.translation)),
-                    rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
-                    sigmas=_sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6)),
+                    position_um=MICRO * float(np.linalg.norm(off[3:])),
+                    rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(off[:3]))),
+                    sigmas=_sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6)),
                 )
             )
     return sorted(rows, key=lambda row: row.image)

@@ -1,6 +1,5 @@
 """Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, 
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
 from stcal.sfm.interop import gltf
-from stcal.sfm.interop.export_content import Content, content_of
+from stcal.sfm.interop.export_content import Content, content_of, require_new
 from stcal.sfm.runs.saved import AnyRun, saved_run
 
 COLUMNS = (
@@ -181,7 +180,7 @@ class ExportedRun:
 
 @require_arguments
 def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
-    """Writes faces and circles to a new file, with σ and cameras if the form holds them.
+    """Writes faces and circles to a new file, with σ and cameras if the form holds them, and returns the content.
 
     Parameters
     ----------
@@ -194,11 +193,6 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
         Form in place of that of the suffix.
     name : str
         Name of the target frame, and prefix of the other frames' names.
-
-    Returns
-    -------
-    ExportedRun
-        ``path``, ``form``, and the ``content``.
 
     Raises
     ------
@@ -215,10 +209,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
     form = form or suffixes[path.suffix.lower()]
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
-    if os.path.lexists(path):
-        raise InputError("E-OUTPUT-EXISTS", f"{path}: exists, and nothing is overwritten; give a new file")
-    if not path.parent.is_dir():
-        raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
+    require_new(path)
     content = content_of(saved_run(run), name)
     written = FORMS[form].write(content)
     save(path, written)

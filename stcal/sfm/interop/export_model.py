@@ -72,11 +72,6 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
     form : {"colmap-bin", "colmap-txt", "nvm", "bundler"}
         The format.
 
-    Returns
-    -------
-    ExportedModel
-        Paths of model and ``labels``, counts of ``images`` and ``points``, and the ideal camera of NVM and Bundler, px.
-
     Raises
     ------
     InputError

@@ -112,7 +112,11 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         below += _cameras(content, buffer, mesh, node)
     below_up = node(name=content.root, children=below, extras={"said": content.said(), "sigma_drawn_times": factor})
     up = node(name="y_up", rotation=Y_UP, children=[below_up])
-    colours = [*(content.rgb[face] for face in content.faces), (40, 40, 40), BOARD_RGB]
+    materials = []
+    for rgb in (*(content.rgb[face] for face in content.faces), (40, 40, 40), BOARD_RGB):
+        linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in rgb]
+        surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        materials.append({"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}})
     tree = {
         "asset": {"version": "2.0", "generator": content.said()[0]},
         "extensionsUsed": [UNLIT],
@@ -120,7 +124,7 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         "scenes": [{"nodes": [up]}],
         "nodes": nodes,
         "meshes": meshes,
-        "materials": [_material(rgb) for rgb in colours],
+        "materials": materials,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
     }
@@ -150,13 +154,6 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
 def _lens(content: Content) -> dict:
     """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
     camera = content.camera
-    parameters = {
-        "model": camera.colmap_model,
-        "size_px": [camera.width, camera.height],
-        "focal_px": list(map(float, camera.focal)),
-        "centre_px": list(map(float, camera.centre)),
-        "distortion": list(map(float, camera.distortion)),
-    }
     return {
         "name": "camera",
         "type": "perspective",
@@ -165,7 +162,13 @@ def _lens(content: Content) -> dict:
             "aspectRatio": float(camera.width / camera.focal[0] / (camera.height / camera.focal[1])),
             "znear": NEAR_M,
         },
-        "extras": parameters,
+        "extras": {
+            "model": camera.colmap_model,
+            "size_px": [camera.width, camera.height],
+            "focal_px": camera.focal.tolist(),
+            "centre_px": camera.centre.tolist(),
+            "distortion": camera.distortion.tolist(),
+        },
     }
 
 
@@ -197,12 +200,6 @@ def _exaggeration(content: Content) -> float:
 
 def _placed(pose: Rigid) -> dict:
     return {"translation": metres(pose), "rotation": xyzw(pose)}
-
-
-def _material(rgb: tuple[int, int, int]) -> dict:
-    linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in rgb]
-    surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    return {"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}}
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:
