@@ -12,20 +12,15 @@ from stcal.geometry.normal_equations import Reduction, inverse_and_size, reduce
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equations:
-    """Normal equations of k kept and of m eliminated unknowns, of ``a`` numbers each.
+    """Normal equations of k kept and of m eliminated unknowns, of ``a`` numbers each."""
 
-    ``square`` : sum of the squares of all residuals; ``count`` : their number; ``normal`` : (k, k); ``right`` : (k,),
-    minus half the gradient; ``block`` : (m, a, a) of each eliminated unknown; ``block_right`` : (m, a); ``cross`` : (m,
-    a, k) mixed parts.
-    """
-
-    square: float
-    count: float
-    normal: np.ndarray
-    right: np.ndarray
-    block: np.ndarray
-    block_right: np.ndarray
-    cross: np.ndarray
+    square: float  # sum of the squares of all residuals
+    count: float  # of the residuals
+    normal: np.ndarray  # (k, k)
+    right: np.ndarray  # (k,) minus half the gradient
+    block: np.ndarray  # (m, a, a) of each eliminated unknown
+    block_right: np.ndarray  # (m, a)
+    cross: np.ndarray  # (m, a, k) mixed parts
 
     @classmethod
     def nothing(cls, kept: int, eliminated: tuple[int, int] = (0, 1)) -> "Equations":
@@ -75,19 +70,14 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A linearised adjustment in p parts with a σ each; what is sought is x = log (σ / present σ) (p,).
+    """A linearised adjustment in p parts with a σ each; what is sought is x = log (σ / present σ) (p,)."""
 
-    ``each`` : p equations of the parts at their present σ; ``fixed`` : equations of what has a known σ; ``expected``,
-    ``doubt`` : (p,) mean and σ of the prior of x, ``doubt`` infinite without a prior; ``caution`` : (p,) redundancy
-    that is not counted; ``held`` : see :meth:`Equations.alone`.
-    """
-
-    each: Sequence[Equations]
-    fixed: Equations
-    expected: np.ndarray | float = 0.0
-    doubt: np.ndarray | float = np.inf
-    caution: np.ndarray | float = 0.0
-    held: float = 0.0
+    each: Sequence[Equations]  # p of the parts at their present σ
+    fixed: Equations  # of what has a known σ
+    expected: np.ndarray | float = 0.0  # (p,) mean of the prior of x
+    doubt: np.ndarray | float = np.inf  # (p,) σ of the prior
+    caution: np.ndarray | float = 0.0  # (p,) redundancy that is not counted
+    held: float = 0.0  # see :meth:`Equations.alone`
 
     @cached_property
     def _flat(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -304,7 +304,6 @@ def _registration(way: _Way) -> list[Shape]:
 
 
 def _sheet(title: str, width: float, height: float, shapes: tuple[Shape, ...], clip=None, cuts: bool = False) -> Sheet:
-    """Return a sheet with its scale bars and its title."""
     bars = [moved(shape, EDGE, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
     instruction = "1:1: print at 100 %, not fitted to the page, and measure the bars"
     if clip is not None:

@@ -53,12 +53,11 @@ L = TypeVar("L", bound=Linear)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one problem, or of h problems at once: cost, normal matrix (..., k, k), and half the gradient
-    of the cost (..., k). A parameter that nothing determines is not moved."""
+    """Normal equations of one problem, or of h problems at once. A parameter that nothing determines is not moved."""
 
     cost: float | np.ndarray
-    normal: np.ndarray
-    gradient: np.ndarray
+    normal: np.ndarray  # (..., k, k)
+    gradient: np.ndarray  # (..., k) half of that of the cost
 
     @classmethod
     def of(cls, residual: np.ndarray, jacobian: np.ndarray) -> "NormalEquations":
@@ -85,13 +84,12 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum(Generic[S, L]):
-    """End of a descent after a number of ``steps``: the state, the problem linearised about it, whether it is a
-    minimum, and the decrease of the cost that the last step promised, in σ²."""
+    """End of a descent."""
 
     state: S
-    linear: L
-    converged: np.ndarray
-    promised: np.ndarray
+    linear: L  # the problem linearised about the state
+    converged: np.ndarray  # whether it is a minimum
+    promised: np.ndarray  # decrease of the cost that the last step promised, in σ²
     steps: int
 
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
@@ -197,17 +195,21 @@ class Normal(NormalEquations):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minima:
-    """h poses at their minima: ``cost`` (h,), ``normal`` (h, 6, 6), ``length`` (h, n) residuals in σ, ``settled``."""
+    """h poses at their minima."""
 
     poses: Poses
-    cost: np.ndarray
-    normal: np.ndarray
-    length: np.ndarray
-    settled: np.ndarray
+    cost: np.ndarray  # (h,)
+    normal: np.ndarray  # (h, 6, 6)
+    length: np.ndarray  # (h, n) of the residuals in σ
+    settled: np.ndarray  # (h,)
 
     def rows(self, index) -> "Minima":
         """Return the minima that a list, a mask or a slice selects."""
         return Minima(self.poses[index], self.cost[index], self.normal[index], self.length[index], self.settled[index])
+
+    def ordered(self) -> "Minima":
+        """Return the minima by their costs."""
+        return self.rows(np.argsort(self.cost, kind="stable"))
 
     def plus(self, other: "Minima") -> "Minima":
         """Return these minima followed by those of ``other``."""

@@ -1,7 +1,5 @@
-"""Planes, circles on them and their images, homographies, and the two poses from which a camera may see a plane.
-
-The two poses are those of Collins & Bartoli (2014). The centre of an ellipse is not the image of the circle's
-centre."""
+"""Planes, circles on them and their images, homographies, and the two poses from which a camera may see a plane
+(Collins & Bartoli 2014). The centre of an ellipse is not the image of the circle's centre."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -53,11 +51,11 @@ of the distance."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """The plane ``normal · xyz = offset``, normal (3,) of unit length; ``rms`` : spread of the fitted points."""
+    """The plane ``normal · xyz = offset``."""
 
-    normal: Array
+    normal: Array  # (3,) of unit length
     offset: float
-    rms: float
+    rms: float  # spread of the fitted points
 
     def __post_init__(self):
         freeze(self, "normal", (3,), "plane normal")
@@ -272,7 +270,7 @@ def two_minima(
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
         descend = descend_near(poses[[0]])
-        minima = _ordered(descend(poses, HUBER * sigma))
+        minima = descend(poses, HUBER * sigma).ordered()
         poses = minima.poses
         wider = robust_sigma(minima.length[0], 2)
         if wider <= WIDER * sigma:
@@ -283,13 +281,9 @@ def two_minima(
     is_double = distinct(minima.poses, minima.normal[0], sigma)
     if planar and not is_double:
         again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
-        minima = _ordered(minima.rows([0]).plus(again))
+        minima = minima.rows([0]).plus(again).ordered()
         is_double = distinct(minima.poses, minima.normal[0], sigma)
     return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), sigma)
-
-
-def _ordered(found: Minima) -> Minima:
-    return found.rows(np.argsort(found.cost, kind="stable"))
 
 
 def weights_of(length: np.ndarray) -> np.ndarray:
@@ -311,14 +305,13 @@ def covariance_of_both(covariance: np.ndarray, away: np.ndarray, delta_chi2: flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """h poses after one step of generalised least squares, with residuals (h, n, 2) to first order, normal matrices, χ²
-    (h,), and squared lengths of the steps in σ, (h,)."""
+    """h poses after one step of generalised least squares."""
 
     poses: Poses
-    residual: np.ndarray
-    normal: np.ndarray
-    chi2: np.ndarray
-    moved2: np.ndarray
+    residual: np.ndarray  # (h, n, 2) to first order
+    normal: np.ndarray  # (h, 6, 6)
+    chi2: np.ndarray  # (h,)
+    moved2: np.ndarray  # (h,) squared lengths of the steps, in σ
 
 
 def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: Poses) -> Weighed:
@@ -338,12 +331,11 @@ def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, pos
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanePoses:
-    """Both poses camera_from_plane that agree with a homography about a point to first order; the determinant of its
-    derivative there; and ``foreshortening``, the cosine between the plane's normal and the line of sight."""
+    """Both poses camera_from_plane that agree with a homography about a point to first order."""
 
     poses: tuple[Rigid, Rigid]
-    determinant: float
-    foreshortening: float
+    determinant: float  # of the homography's derivative there
+    foreshortening: float  # cosine between the plane's normal and the line of sight
 
 
 def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:

@@ -202,7 +202,6 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
 
 
 def _in_first_face(poses: Mapping[str, Rigid]) -> dict[str, Rigid]:
-    """Returns poses of faces, by face id, in the frame of the first one."""
     first = next(iter(poses.values())).inverse()
     return {face_id: first @ pose for face_id, pose in poses.items()}
 

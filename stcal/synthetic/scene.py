@@ -221,7 +221,12 @@ def make_scene(
     made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
     target_from_face, circles = _made_target(target, nominal, options, made)
     _check_convex(target, target_from_face, options.margin_mm)
-    camera = _made_camera(options, made)
+    focal = options.focal_px or FOCAL_PER_WIDTH * options.width
+    centre = (np.array([options.width, options.height]) - 1) / 2
+    centre = centre + options.centre_sigma * options.width * made.standard_normal(2)
+    lens = np.pad(options.distortion, (0, 8 - len(options.distortion)))
+    kind = "FULL_OPENCV" if lens[4:].any() else "OPENCV" if lens.any() else "PINHOLE"
+    camera = Camera(options.width, options.height, [focal, focal], centre, lens, colmap_model=kind)
     common = board.sigma_mm * made.standard_normal((len(board.labels()), 3)) if options.one_board else None
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
@@ -267,17 +272,6 @@ def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[
     return {face: target_from_any @ frame for face, frame in frames.items()}, circles
 
 
-def _made_camera(options: SceneOptions, rng) -> Camera:
-    focal = options.focal_px or FOCAL_PER_WIDTH * options.width
-    centre = (np.array([options.width, options.height]) - 1) / 2
-    centre = centre + options.centre_sigma * options.width * rng.standard_normal(2)
-    distortion = np.zeros(8)
-    distortion[: len(options.distortion)] = options.distortion
-    model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    camera = Camera(options.width, options.height, np.array([focal, focal]), centre, distortion)
-    return Camera.of(camera, model)
-
-
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
     pairs = combinations([face.id for face in target.faces], 2)
     normal = {face: pose.rotation[:, 2] for face, pose in target_from_face.items()}
@@ -298,8 +292,7 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
 
 def _made_group(pair, target, board, camera, target_from_face, circles, options, errors, rng) -> Group:
     """Returns a group; ``errors`` : of the places of the board's dots, mm, drawn here if None."""
-    name = group_name(pair)
-    labels = [target.face(face).labels() for face in pair]
+    name, labels = group_name(pair), [target.face(face).labels() for face in pair]
     normals = [target_from_face[face].rotation[:, 2] for face in pair]
     axes = viewing_axes(normals[0], normals[1], f"group {name}")
     dots = np.pad(board.xy_mm(), ((0, 0), (0, 1)))

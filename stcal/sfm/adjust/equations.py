@@ -188,56 +188,42 @@ class Setting:
         return Joined(parts, SHARED if self.common else SHARED[:2], free_directions)
 
     def _add(self, a: Adjustment, group: Group, values: Mapping[str, Any], circles: Block, camera: Block) -> None:
-        """Adds the rows of a group."""
         model, few = group.model, is_dots_first_cheaper(group)
         poses = a.block(group.name(POSES), values[group.name(POSES)], eliminate=not few)
-        of_circles = replace(model, labels=self.labels, xyz_model=values[CIRCLES].array, point_index=group.place())
-        self._reproject(a, of_circles.observed(group.observations(CIRCLES)), (circles, poses, camera), CIRCLES)
+        points = [(CIRCLES, self.labels, circles)]
+        if len(group.dots):
+            dots = a.block(group.name(DOTS), values[group.name(DOTS)], eliminate=few)
+            points.append((DOTS, tuple(model.labels[i] for i in group.dots), dots))
+        for kind, labels, block in points:
+            own = replace(model, labels=labels, xyz_model=values[block.name].array, point_index=group.place())
+            on = (block, poses, camera)[: 2 + bool(self.basis.shape[1])]
+            seen = own.observed(group.observations(kind))
+            reproject(a, seen, on, self.camera_at, self.basis, kind=kind, loss=Huber(self.huber))
         if not len(group.dots):
             return
-        dots = a.block(group.name(DOTS), values[group.name(DOTS)], eliminate=few)
-        board = a.block(group.name(BOARD), values[group.name(BOARD)])
-        of_dots = replace(
-            model,
-            labels=tuple(model.labels[i] for i in group.dots),
-            xyz_model=values[group.name(DOTS)].array,
-            point_index=group.place(),
-        )
-        self._reproject(a, of_dots.observed(group.observations(DOTS)), (dots, poses, camera), DOTS)
-        on = [(dots, np.arange(len(group.dots))), (board, None)]
+        # Dots minus their places on the board, mm: dot = pose · (design + shape).
+        cells = np.searchsorted(self.cells(), group.cells)
+        ends = [(dots, np.arange(len(group.dots))), (a.block(group.name(BOARD), values[group.name(BOARD)]), None)]
         if self.common:
-            on.append((a.blocks[SHARED.index(SHAPE)], np.searchsorted(self.cells(), group.cells)))
-        gap = _Gap(group.design, on[-1][1])
-        a.factor(gap.residuals, on, self.own_sigma_mm(), gap.derivatives, kind=BOARD)
+            ends.append((a.blocks[SHARED.index(SHAPE)], cells))
 
-    def _reproject(self, a: Adjustment, model: MetricModel, on: tuple[Block, Block, Block], kind: str) -> None:
-        used = on if self.basis.shape[1] else on[:2]
-        reproject(a, model, used, self.camera_at, self.basis, kind=kind, loss=Huber(self.huber))
+        def turned(board: Poses, shape: tuple[Vector, ...]) -> np.ndarray:
+            return (group.design + shape[0].array[cells] if shape else group.design) @ board.rotation[0].T
+
+        def residuals(dots: Vector, board: Poses, *shape: Vector) -> np.ndarray:
+            return dots.array - turned(board, shape) - board.translation
+
+        def derivatives(dots: Vector, board: Poses, *shape: Vector) -> list[np.ndarray]:
+            unit = np.broadcast_to(np.eye(3), (len(dots), 3, 3))
+            by_board = np.concatenate([skew(turned(board, shape)), -unit], axis=2)
+            return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]
+
+        a.factor(residuals, ends, self.own_sigma_mm(), derivatives, kind=BOARD)
 
 
 def is_dots_first_cheaper(group: Group) -> bool:
     """True if the cameras of a group are fewer unknowns than its dots."""
     return 6 * len(group.model.images) < 3 * len(group.dots)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Gap:
-    """Dots minus their places on a board, mm: dot = pose · (design + shape)."""
-
-    design: np.ndarray  # (e, 3)
-    cells: np.ndarray | None  # (e,) in the common shape
-
-    def _turned(self, board: Poses, shape: tuple[Vector, ...]) -> np.ndarray:
-        places = self.design + shape[0].array[self.cells] if shape else self.design
-        return places @ board.rotation[0].T
-
-    def residuals(self, dots: Vector, board: Poses, *shape: Vector) -> np.ndarray:
-        return dots.array - self._turned(board, shape) - board.translation
-
-    def derivatives(self, dots: Vector, board: Poses, *shape: Vector) -> list[np.ndarray]:
-        unit = np.broadcast_to(np.eye(3), (len(self.design), 3, 3))
-        by_board = np.concatenate([skew(self._turned(board, shape)), -unit], axis=2)
-        return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]
 
 
 @dataclass(slots=True, eq=False)

@@ -346,7 +346,6 @@ def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
 
 
 def _robust_sigma(setting: Setting, values: Values) -> float:
-    """Returns the robust σ of the normalised residuals per axis."""
     camera = setting.camera(values)
     length = np.concatenate([np.linalg.norm(normalised(g.at(values), camera), axis=1) for g in setting.groups])
     return max(robust_sigma(length, 2), 1e-6)
@@ -370,7 +369,6 @@ def _common_share(setting: Setting, values: Values) -> float:
 
 
 def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: float | None = None) -> JointResult:
-    """Returns the result with its covariances."""
     values, groups, camera = solution.values, setting.groups, setting.camera(solution.values)
     models = tuple(group.at(values) for group in groups)
     xyz = values[CIRCLES].array

@@ -31,8 +31,6 @@ BOARD_RGB = (150, 150, 150)
 
 
 class _Report(Part):
-    """The parts of ``report.json`` that are exported."""
-
     camera: ReportCamera
     scene: Space
 

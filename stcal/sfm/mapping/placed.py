@@ -125,18 +125,18 @@ def _require_sizes(corners: Corners, camera: Camera) -> None:
         return
     names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
     if alike < len(names):
-        told = f"face {names[-1]} is {factors[-1] / factors[0]:.3g} times as large against face {names[0]}"
-        raise MappingError(
-            "E-BODY-SIZES",
-            f"target: sizes of faces {' and '.join(names)} contradict one another: by the photographs, {told} as "
-            "target.toml states; measure the side of each print, and correct it",
+        told = (
+            f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
+            f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states; measure the "
+            "side of each print"
         )
-    told = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
-    raise MappingError(
-        "E-BODY-SIZES",
-        f"target: the photographs show {told} times as large as target.toml states, and the sizes of {alike} "
-        "other faces agree with one another; measure the side of its print, and correct it",
-    )
+    else:
+        each = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
+        told = (
+            f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other faces "
+            "agree with one another; measure the side of its print"
+        )
+    raise MappingError("E-BODY-SIZES", f"target: {told}, and correct it")
 
 
 def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
