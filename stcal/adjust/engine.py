@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Rows, Values, numbers
-from stcal.adjust.components import Components, Equations
+from stcal.adjust.components import Components, Equations, sigma_factor
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise
@@ -182,9 +182,13 @@ class Solution:
     problem: Adjustment
     values: dict[str, Any]
 
-    @cached_property
+    @property
     def cost(self) -> float:
         """Cost of the state, in σ²."""
+        return self._cost
+
+    @cached_property
+    def _cost(self) -> float:
         return sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in self.rows) + sum(
             prior.cost(self.values) for prior in self.problem.priors
         )
@@ -379,7 +383,7 @@ class Solution:
         """Return the factor on the σ of a kind that its residuals ask for (Förstner 1979)."""
         own = [rows for rows in self.rows if rows.factor.kind == kind]
         square = sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in own)
-        return float(np.sqrt(square / max(self.redundancy(kind), 1.0)))
+        return sigma_factor(square, self.redundancy(kind))
 
     def components(self, kinds: Sequence[str], caution: float | np.ndarray = 0.0) -> Components:
         """Return what all residuals tell together about the σ of some ``kinds``, those of the others being known.

@@ -114,10 +114,9 @@ def _rule(hint: Any, may_be_infinite: bool = False) -> Rule | None:
         words = f"a tuple, each {each[0][1]}," if count is None else f"a tuple of {', '.join(r[1] for r in each)}"
 
         def admits(value: object) -> bool:
-            is_row = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
-            return (
-                is_row and count in (None, len(value)) and all(each[i % len(each)][0](v) for i, v in enumerate(value))
-            )
+            if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str):
+                return False
+            return count in (None, len(value)) and all(each[i % len(each)][0](v) for i, v in enumerate(value))
 
         return admits, words
     if origin in (dict, Mapping):

@@ -9,6 +9,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import root_scalar
 
 from stcal.adjust.blocks import Huber, Vector
+from stcal.adjust.components import sigma_factor
 from stcal.adjust.engine import Adjustment, Solution
 from stcal.boards.design import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges
@@ -21,7 +22,6 @@ from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homogr
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
 from stcal.geometry.rigid import Poses, Rigid, align_rigid
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.geometry.variances import sigma_factor
 from stcal.locate.estimate import normalised
 from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
