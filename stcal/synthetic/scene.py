@@ -171,24 +171,16 @@ def make_scene(
     nominal: dict[str, Rigid] | None = None,
     camera: Camera | CameraModel | None = None,
 ) -> Scene:
-    """Makes a scene; the same arguments give the same scene.
+    """Returns target, board and camera as really made, and views of groups; the same arguments give the same scene.
 
     Parameters
     ----------
-    options : SceneOptions, optional
-    target : TargetDesign, optional
-        Design of the target; the reference design by default.
-    board : BoardDesign, optional
-        Design of the board; the reference board by default.
+    options, target, board : optional
+        Options, and designs of target and board; the defaults and the reference designs if None.
     nominal : dict of Rigid, optional
         Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
     camera : Camera, optional
         The camera, in place of the one that the options describe.
-
-    Returns
-    -------
-    Scene
-        Target, board and camera as really made, and the views of each group.
 
     Raises
     ------

@@ -126,19 +126,12 @@ def calibrate(
     prior: CameraPrior | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Calibrate the target from the groups' models (lengths not yet in mm, eccentricity corrections settled).
+    """Calibrates the target from the groups' models (lengths not yet in mm, eccentricity corrections settled).
 
     ``prior`` : intrinsics of the camera as observations, for options that refine them; ``progress`` : called with
-    (``faces``, done, total) after the chain, each joint adjustment, and the covariances.
-
-    Raises
-    ------
-    ScaleError
-        A group's board is not mapped.
-    MappingError
-        No face is mapped, the reference face is not mapped, or a face is not linked to it.
-    ConvergenceError
-        The adjustment finds no minimum.
+    (``faces``, done, total) after the chain, each joint adjustment, and the covariances. ScaleError: a group's board is
+    not mapped. MappingError: no face is mapped, or the reference face is not, or nothing is linked to it.
+    ConvergenceError: there is no minimum.
     """
     published = options.solve == "paper"
     prior = prior if options.refine_camera else None
