@@ -34,7 +34,7 @@ from stcal.geometry.plane import (
     weigh,
     weights_of,
 )
-from stcal.geometry.rigid import ImageFit, Poses, Rigid, skew
+from stcal.geometry.rigid import ImageFit, Poses, Rigid, by_pose
 from stcal.io.cameras.model import CameraPrior
 from stcal.locate.layout import TargetLayout
 
@@ -103,7 +103,7 @@ def normalised(turned: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndar
     depth = np.where(np.abs(xyz[..., 2]) > NEAR_DEPTH, xyz[..., 2], NEAR_DEPTH)[..., None]
     uv = xyz[..., :2] / depth
     by_point = np.concatenate([np.broadcast_to(np.eye(2), (*uv.shape, 2)), -uv[..., None]], axis=-1) / depth[..., None]
-    return uv, by_point, np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+    return uv, by_point, by_pose(by_point, turned)
 
 
 def descent_near(problem: PlanarProblem, pose: Poses) -> Descend:

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.adjust.blocks import Huber
 from stcal.adjust.engine import Adjustment
 from stcal.geometry.plane import circle_image_offset
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.model import ImageObservations
@@ -356,8 +356,7 @@ class PlaneBundle:
         turned, placed, xyz = self.placed(planes, poses)
         by_point = self.by_point(xyz)
         by_world = by_point @ poses.rotation[self.image]
-        by_plane = np.concatenate([-by_world @ skew(turned), by_world], axis=2)
-        return by_plane, np.concatenate([-by_point @ skew(placed), by_point], axis=2)
+        return by_pose(by_world, turned), by_pose(by_point, placed)
 
     def by_point(self, xyz_camera: np.ndarray) -> np.ndarray:
         """Returns the derivatives of images by points in the camera frame, (n, 2, 3), px/mm."""
