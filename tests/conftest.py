@@ -26,7 +26,7 @@ from hypothesis import HealthCheck, settings
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust.chain import chain_faces
 from stcal.sfm.adjust.faces import faces_of_group
-from stcal.sfm.adjust.joint import adjust_jointly
+from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
@@ -180,7 +180,7 @@ class LabelsOnly:
             m.metric(Similarity(1.0, chained.target_from_group[m.group]) @ Similarity(scales[m.group], Rigid()))
             for m in models
         ]
-        joint = adjust_jointly(metric, board, camera)
+        joint = adjusted(metric, board, camera).result()
         return calibrated_target(joint, chained, target, "plane"), joint
 
 

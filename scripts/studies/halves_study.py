@@ -28,7 +28,7 @@ from stcal.boards.file import load_flat_board
 from stcal.design import BoardDesign, reference_board
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import block_diagonal, perturbed
+from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Poses, skew
 from stcal.handeye.solve import handeye
@@ -160,7 +160,7 @@ def of_measuring(run: Path, other: Path) -> None:
     motion = np.tile(np.eye(6), (len(names), 1))
     for _ in range(5):
         off = each.difference(Poses.of([mean] * len(names))).ravel()
-        mean = perturbed(mean, np.linalg.solve(motion.T @ weight @ motion, motion.T @ weight @ off))
+        mean = mean.moved(np.linalg.solve(motion.T @ weight @ motion, motion.T @ weight @ off))
     off = each.difference(Poses.of([mean] * len(names))).ravel()
     print(row_of("measure: cube, two cameras, real", len(names), [off @ weight @ off / (len(off) - 6)]))
 

@@ -7,16 +7,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from stcal.adjust.components import Equations
-from stcal.geometry.least_squares import PoseStack as PoseStack
 from stcal.geometry.normal_equations import blocks_of
+from stcal.geometry.rigid import Poses
 from stcal.geometry.robust import huber_cost, huber_weights
 
-STEP = 1e-6
-"""Step of numerical derivatives, as a share of 1, or of the unknown's size where that is more."""
+PoseStack = Poses  # members that are poses, moved by left perturbations
+STEP = 1e-6  # step of numerical derivatives, as a share of 1, or of the unknown's size where that is more
 
 
 class Values(Protocol):
-    """The members of a block, such as a :class:`Vector` or a :class:`~stcal.geometry.least_squares.PoseStack`."""
+    """The members of a block, such as a :class:`Vector` or :class:`~stcal.geometry.rigid.Poses`."""
 
     @property
     def dim(self) -> int:
@@ -89,7 +89,7 @@ class Block:
     ----------
     name : str
         Its name.
-    start : Vector or PoseStack
+    start : Vector or Poses
         Its n members at the start.
     eliminate : bool
         Whether it is eliminated.

@@ -1,4 +1,5 @@
-"""Normal equations by kind of residual, and from them the σ of each kind: restricted maximum likelihood."""
+"""Variance components by restricted maximum likelihood (REML, Patterson & Thompson 1971): σ of each kind of residual
+from normal equations by kind, and variances of covariances that are sums of components."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -12,20 +13,15 @@ from stcal.geometry.normal_equations import Reduction, inverse_and_size, reduce
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equations:
-    """Normal equations of k kept and of m eliminated unknowns, of ``a`` numbers each.
+    """Normal equations of k kept and of m eliminated unknowns, of ``a`` numbers each."""
 
-    ``square`` : sum of the squares of all residuals; ``count`` : their number; ``normal`` : (k, k); ``right`` : (k,),
-    minus half the gradient; ``block`` : (m, a, a) of each eliminated unknown; ``block_right`` : (m, a); ``cross`` : (m,
-    a, k) mixed parts.
-    """
-
-    square: float
-    count: float
-    normal: np.ndarray
-    right: np.ndarray
-    block: np.ndarray
-    block_right: np.ndarray
-    cross: np.ndarray
+    square: float  # sum of the squares of all residuals
+    count: float  # of the residuals
+    normal: np.ndarray  # (k, k)
+    right: np.ndarray  # (k,) minus half the gradient
+    block: np.ndarray  # (m, a, a) of each eliminated unknown
+    block_right: np.ndarray  # (m, a)
+    cross: np.ndarray  # (m, a, k) mixed parts
 
     @classmethod
     def nothing(cls, kept: int, eliminated: tuple[int, int] = (0, 1)) -> "Equations":
@@ -75,19 +71,14 @@ class Equations:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """A linearised adjustment in p parts with a σ each; what is sought is x = log (σ / present σ) (p,).
+    """A linearised adjustment in p parts with a σ each; what is sought is x = log (σ / present σ) (p,)."""
 
-    ``each`` : p equations of the parts at their present σ; ``fixed`` : equations of what has a known σ; ``expected``,
-    ``doubt`` : (p,) mean and σ of the prior of x, ``doubt`` infinite without a prior; ``caution`` : (p,) redundancy
-    that is not counted; ``held`` : see :meth:`Equations.alone`.
-    """
-
-    each: Sequence[Equations]
-    fixed: Equations
-    expected: np.ndarray | float = 0.0
-    doubt: np.ndarray | float = np.inf
-    caution: np.ndarray | float = 0.0
-    held: float = 0.0
+    each: Sequence[Equations]  # p of the parts at their present σ
+    fixed: Equations  # of what has a known σ
+    expected: np.ndarray | float = 0.0  # (p,) mean of the prior of x
+    doubt: np.ndarray | float = np.inf  # (p,) σ of the prior
+    caution: np.ndarray | float = 0.0  # (p,) redundancy that is not counted
+    held: float = 0.0  # see :meth:`Equations.alone`
 
     @cached_property
     def _flat(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -136,3 +127,49 @@ class Components:
         bounds, begin = -2 * np.column_stack([high, low]), [-2 * np.clip(x, low, high) for x in starts]
         fits = [minimize(downhill, logs, jac=True, method="L-BFGS-B", bounds=bounds) for logs in begin]
         return -min(fits, key=lambda fit: fit.fun).x / 2
+
+
+def component_variances(
+    residuals: np.ndarray,
+    jacobian: np.ndarray,
+    known: np.ndarray,
+    free: np.ndarray,
+    first: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    caution: float = 0.0,
+) -> np.ndarray:
+    """Return restricted maximum-likelihood variances (f,) of covariances that are sums of components.
+
+    Of residuals (m, a) near a solution and their derivatives (m, a, k) by what was solved for; ``known`` : (m, a, a)
+    part of the covariances; ``free`` : (f, m, a, a) components, each to be multiplied by its variance, from ``first``
+    (f,) and within ``bounds``; ``caution`` : redundancy of each variance that is not counted.
+    """
+    flat = jacobian.reshape(-1, jacobian.shape[2])
+    u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+    jacobian = u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)  # an orthonormal basis of its columns
+
+    def cost(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        theta = np.exp(logs)
+        spread = known + np.tensordot(theta, free, 1)
+        inverse = np.linalg.inv(spread)
+        weighted = inverse @ jacobian
+        normal = np.einsum("mai,maj->ij", jacobian, weighted)
+        covariance = np.linalg.inv(normal)
+        remaining = residuals - jacobian @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
+        fitted = np.einsum("mab,mb->ma", inverse, remaining)
+        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * remaining).sum()
+        gradient = np.einsum("mab,kmba->k", inverse, free)
+        weighted_free = np.einsum("kmab,mbj->kmaj", free, weighted)
+        gradient = gradient - np.einsum("mai,kmaj,ij->k", weighted, weighted_free, covariance, optimize=True)
+        gradient = gradient - np.einsum("ma,kmab,mb->k", fitted, free, fitted, optimize=True)
+        return float(value - caution * logs.sum()), gradient * theta - caution
+
+    limits = np.log(np.column_stack(bounds))
+    optimum = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})
+    return np.exp(optimum.x)
+
+
+def sigma_factor(square: float, redundancy: float) -> float:
+    """Return the factor on σ that makes the sum of squares over σ² equal its redundancy (Förstner 1979); one step of an
+    iteration if other σ are estimated too."""
+    return float(np.sqrt(square / max(redundancy, 1.0)))

@@ -1,9 +1,7 @@
 """One adjustment by least squares: blocks of unknowns, factors that tie them, elimination, σ, and influence.
 
-An unknown is a member of a block: a pose of all poses, a point of all points. A factor states residuals row by row;
-each row depends on one member of each block that the factor is on, or on a block of a single member. Blocks of many
-members that no row ties to one another are eliminated (Schur complement), so that a step costs as little as one of the
-others alone.
+A factor states residuals row by row; each row depends on one member of each block that the factor is on, or on a block
+of a single member. A block of many members that no row ties to one another is eliminated (Schur complement).
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -16,7 +14,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from stcal.adjust.blocks import Block, Factor, Huber, Known, Prior, Rows, Values, numbers
-from stcal.adjust.components import Components, Equations
+from stcal.adjust.components import Components, Equations, sigma_factor
 from stcal.errors import InputError
 from stcal.geometry.clusters import ByClusters, by_clusters
 from stcal.geometry.least_squares import SETTLED, Minimum, block_diagonal, minimise
@@ -36,8 +34,7 @@ LEFT = 1e-9
 """Share of a direction's information that must be left without a cluster; else the cluster alone determined it."""
 LOOSE = 1e-10
 """Share of each unknown's information that is added where σ are sought, so that undetermined ones do no harm."""
-AT_ONCE = 10_000
-"""Number of rows whose derivatives are multiplied at once; it bounds the memory."""
+AT_ONCE = 10_000  # number of rows whose derivatives are multiplied at once; it bounds the memory
 
 
 @dataclass(eq=False)
@@ -178,7 +175,7 @@ class Solution:
     ----------
     problem : Adjustment
         The adjustment.
-    values : dict of str to Vector or PoseStack
+    values : dict of str to Vector or Poses
         The members of each block, by its name.
     """
 
@@ -233,7 +230,6 @@ class Solution:
         return replace(sums, square=square, count=count)
 
     def _of(self, kinds: Collection[str] | None) -> list[Rows]:
-        """Return the residuals of some kinds, or all."""
         return self.rows if kinds is None else [own for rows in self.rows if (own := rows.of_kinds(kinds))]
 
     @cached_property
@@ -344,7 +340,6 @@ class Solution:
 
     @cached_property
     def _each(self) -> dict[str, np.ndarray]:
-        """The ways of each kept unknown by itself."""
         return self._ways(np.eye(self.kept))
 
     def without(self, cluster: int) -> dict[str, Any]:
@@ -388,7 +383,7 @@ class Solution:
         """Return the factor on the σ of a kind that its residuals ask for (Förstner 1979)."""
         own = [rows for rows in self.rows if rows.factor.kind == kind]
         square = sum(float(rows.factor.loss.cost(rows.length).sum()) for rows in own)
-        return float(np.sqrt(square / max(self.redundancy(kind), 1.0)))
+        return sigma_factor(square, self.redundancy(kind))
 
     def components(self, kinds: Sequence[str], caution: float | np.ndarray = 0.0) -> Components:
         """Return what all residuals tell together about the σ of some ``kinds``, those of the others being known.
@@ -505,22 +500,21 @@ class JoinedSolution:
         return max((self.parts[0].places[name].stop for name in self.problem.shared), default=0)
 
     @cached_property
-    def reductions(self) -> tuple[Reduction, ...]:
-        """Elimination of each part's own kept unknowns."""
+    def reductions(self) -> list[tuple[Solution, Reduction]]:
+        """The parts, each with the elimination of its own kept unknowns."""
         s = self.count
-        return tuple(reduce(p.normal[None, s:, s:], p.right[None, s:], p.normal[None, s:, :s]) for p in self.parts)
+        return [(p, reduce(p.normal[None, s:, s:], p.right[None, s:], p.normal[None, s:, :s])) for p in self.parts]
 
     @cached_property
     def normal(self) -> np.ndarray:
         """Normal matrix of the shared unknowns, all others eliminated."""
-        s, each = self.count, zip(self.parts, self.reductions, strict=True)
-        return np.sum([part.normal[:s, :s] - own.normal for part, own in each], axis=0)
+        s = self.count
+        return np.sum([part.normal[:s, :s] - own.normal for part, own in self.reductions], axis=0)
 
     @cached_property
     def right(self) -> np.ndarray:
         """Right side of the shared unknowns."""
-        each = zip(self.parts, self.reductions, strict=True)
-        return np.sum([part.right[: self.count] - own.right for part, own in each], axis=0)
+        return np.sum([part.right[: self.count] - own.right for part, own in self.reductions], axis=0)
 
     @cached_property
     def inverse(self) -> np.ndarray:
@@ -539,7 +533,7 @@ class JoinedSolution:
         shared = np.linalg.solve(held, self.right)
         gain = 2 * float(shared @ self.right) - float(shared @ self.normal @ shared)
         steps = []
-        for part, reduction in zip(self.parts, self.reductions, strict=True):
+        for part, reduction in self.reductions:
             kept = np.concatenate([shared, reduction.back(shared)[0]])
             gain += reduction.gain + part.reduction.gain
             steps += [kept, part.reduction.back(kept).ravel()]
@@ -549,7 +543,7 @@ class JoinedSolution:
     def whole(self) -> tuple[Solution, ...]:
         """The parts, each with the covariance of its unknowns that all parts together leave."""
         found = []
-        for part, reduction in zip(self.parts, self.reductions, strict=True):
+        for part, reduction in self.reductions:
             by = reduction.from_kept[0]
             mixed = -by @ self.inverse
             covariance = np.block([[self.inverse, mixed.T], [mixed, reduction.inverse[0] - mixed @ by.T]])
@@ -560,6 +554,5 @@ class JoinedSolution:
     def by_clusters(self, block: Block) -> ByClusters:
         """Return the covariance of a shared block by how the clusters of observations differ."""
         normal, along = _alone(self.normal, self.parts[0].places[block.name])
-        each = zip(self.parts, self.reductions, strict=True)
-        ways = [(part, np.concatenate([along, -own.from_kept[0] @ along])) for part, own in each]
+        ways = [(part, np.concatenate([along, -own.from_kept[0] @ along])) for part, own in self.reductions]
         return _by_clusters(normal, (told for part, way in ways for told in part.told(way)))

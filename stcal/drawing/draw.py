@@ -21,8 +21,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.io.files import save
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
-CAPITAL_SHARE = 0.72
-"""Height of a capital as a share of the font's size."""
+CAPITAL_SHARE = 0.72  # height of a capital as a share of the font's size
 DASH = "3 1.5"
 
 
@@ -78,10 +77,6 @@ def _number(value: float) -> str:
 
 
 POINT_MM = 25.4 / 72
-FONT = "Helvetica"
-"""One of the fonts that every reader of PDF has. Greek letters and signs that it lacks come from Symbol."""
-DASH_WIDTHS = (20, 10)
-"""Lengths of a dash and of the gap after it in PDF, in widths of the line."""
 
 
 def pdf(sheets: Sequence[Sheet]) -> bytes:
@@ -114,18 +109,28 @@ def _add(canvas, shape: Shape) -> None:
         canvas.saveState()
         canvas.translate(shape.x, shape.y)
         canvas.rotate(90 if shape.turned else 0)
-        canvas.setFont(FONT, shape.height / CAPITAL_SHARE)
+        canvas.setFont("Helvetica", shape.height / CAPITAL_SHARE)  # which every reader has; its Greek is Symbol's
         draw = {"start": canvas.drawString, "middle": canvas.drawCentredString, "end": canvas.drawRightString}
         draw[shape.anchor](0, 0, shape.words)
         canvas.restoreState()
     elif isinstance(shape, Disc):
-        canvas.drawPath(_circle(canvas, shape), stroke=0, fill=1)
+        arcs = 8  # leave the circle by less than 5 parts in a million of its radius
+        angle = np.arange(2 * arcs + 1) * np.pi / arcs
+        unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)[::2]
+        along = 4 / 3 * np.tan(np.pi / (2 * arcs)) * np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+        ends, before, after = ([shape.x, shape.y] + shape.radius * at for at in (unit, unit - along, unit + along))
+        path = canvas.beginPath()
+        path.moveTo(*ends[0].tolist())
+        for arc in zip(after[:-1], before[1:], ends[1:], strict=True):
+            path.curveTo(*np.concatenate(arc).tolist())
+        path.close()
+        canvas.drawPath(path, stroke=0, fill=1)
     elif isinstance(shape, Area):
         canvas.drawPath(_outline(canvas, shape.lines), stroke=0, fill=1, fillMode=0)  # even-odd
     else:
         canvas.setStrokeColor(colour)
         canvas.setLineWidth(shape.width)
-        canvas.setDash([shape.width * each for each in DASH_WIDTHS] if shape.dashed else [])
+        canvas.setDash([20 * shape.width, 10 * shape.width] if shape.dashed else [])
         canvas.drawPath(_outline(canvas, [shape.points], shape.closed))
 
 
@@ -140,37 +145,18 @@ def _outline(canvas, lines: Sequence[np.ndarray], closed: bool = True):
     return path
 
 
-ARCS = 8
-"""Number of Bézier arcs of a circle: they leave it by less than 5 parts in a million of its radius."""
-
-
-def _circle(canvas, disc: Disc):
-    angle = np.arange(2 * ARCS + 1) * np.pi / ARCS
-    unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)[::2]
-    along = 4 / 3 * np.tan(np.pi / (2 * ARCS)) * np.stack([-unit[:, 1], unit[:, 0]], axis=1)
-    ends, before, after = ([disc.x, disc.y] + disc.radius * each for each in (unit, unit - along, unit + along))
-    path = canvas.beginPath()
-    path.moveTo(*ends[0].tolist())
-    for arc in zip(after[:-1], before[1:], ends[1:], strict=True):
-        path.curveTo(*np.concatenate(arc).tolist())
-    path.close()
-    return path
-
-
 SUFFIXES = (".pdf", ".svg")
-OWN = "own"
-"""Value of ``paper`` for pages as large as their content."""
-MARGIN_MM = 10.0
+OWN = "own"  # value of paper for pages as large as their content
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """A drawing that was written: its ``parts`` and ``sheets``; ``paper`` : name of the paper, or ``own``."""
+    """A drawing that was written."""
 
     path: Path
     parts: list[Part]
     sheets: list[Sheet]
-    paper: str
+    paper: str  # its name, or ``own``
 
 
 Design = TargetDesign | BoardDesign | FlatBoard | BoardSet
@@ -181,7 +167,7 @@ def draw(
     design: Design | str | Path,
     out: str | Path,
     paper: str = "",
-    margin_mm: float = MARGIN_MM,
+    margin_mm: float = 10.0,
     net: bool = False,
 ) -> Drawn:
     """Draw a target or a board 1:1 to a file, whose suffix gives the form: ``.pdf`` or ``.svg``.
@@ -199,11 +185,6 @@ def draw(
         Distance from the outermost circles to the edge of a plate without an outline, mm.
     net : bool
         Whether the plates of a target are unfolded into one net on one sheet, by their outlines and rough poses.
-
-    Returns
-    -------
-    Drawn
-        ``path``, the ``parts`` that are drawn, and the ``sheets``.
 
     Raises
     ------
@@ -236,7 +217,17 @@ def draw(
         sheets = [one_sheet([part], f"{title}, {part.name}" if len(parts) > 1 else title) for part in parts]
     else:
         sheets = [one_sheet(parts, title)]
-    save(path, content_of(sheets, path))
+    if path.suffix.lower() == ".svg" and len(sheets) > 1:
+        raise InputError(
+            "E-DRAW-SHEETS", f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none"
+        )
+    largest = max(max(sheet.width, sheet.height) for sheet in sheets)
+    if path.suffix.lower() == ".pdf" and largest > MOST_MM:
+        raise InputError(
+            "E-DRAW-SHEETS",
+            f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF; take --paper or .svg",
+        )
+    save(path, pdf(sheets) if path.suffix.lower() == ".pdf" else svg(sheets[0]))
     return Drawn(path, parts, sheets, paper)
 
 
@@ -276,23 +267,6 @@ def paper_for(parts: Sequence[Part]) -> str | None:
         except InputError:  # more sheets than are drawn
             continue
     return None
-
-
-def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
-    """Return the content of a file in the form of its suffix."""
-    if path.suffix.lower() == ".pdf":
-        largest = max(max(sheet.width, sheet.height) for sheet in sheets)
-        if largest > MOST_MM:
-            raise InputError(
-                "E-DRAW-SHEETS",
-                f"{path}: page of {largest:.0f} mm, at most {MOST_MM:.0f} mm in a PDF; take --paper or .svg",
-            )
-        return pdf(sheets)
-    if len(sheets) > 1:
-        raise InputError(
-            "E-DRAW-SHEETS", f"{path}: {len(sheets)} sheets, an SVG holds one; take .pdf, a larger --paper, or none"
-        )
-    return svg(sheets[0])
 
 
 def _paper(path: Path, paper: str) -> str:

@@ -1,7 +1,4 @@
-"""A folding net: plates that share an edge in space, unfolded into one plane, with glue tabs on the other edges.
-
-The plates are the faces' ``outline_mm``, placed by their rough poses.
-"""
+"""A folding net: plates (``outline_mm`` at rough poses) that share an edge in space, unfolded into one plane."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -9,34 +6,41 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.drawing.parts import Area, Disc, Line, Part, Shape, Text, as_seen, corners_of, face_part, words_with_room
+from stcal.drawing.parts import (
+    Area,
+    Disc,
+    Line,
+    Part,
+    Shape,
+    Text,
+    as_seen,
+    box_of,
+    corners_of,
+    face_part,
+    words_with_room,
+)
 from stcal.errors import InputError
 from stcal.io.design import ROUGH_KEYS
 
 TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
 """Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
-TAB_MM, TAB_SHARE = 10.0, 0.25
-"""Largest width of a tab, mm, and as a share of its edge."""
+TAB_MM, TAB_SHARE = 10.0, 0.25  # largest width of a tab, mm, and as a share of its edge
 SKETCH, SKETCH_OF_CIRCLES = 1 / 8, 1 / 5
 """Scale of the sketch that names the faces, and of one that numbers their circles too."""
 APART = 15.0
-LETTERS, SMALL_LETTERS = 2.0, 1.2
-"""Height of names, and of the numbers of circles in the sketch, mm."""
+LETTERS, SMALL_LETTERS = 2.0, 1.2  # height of names, and of the numbers of circles in the sketch, mm
 IN_CORNER = 3.0
 """Distance of the name of a printed face from the corner of its plate, mm: in the white about a tag."""
-PLACES = 17
-"""Number of places, across and up, where a name in the sketch may have room between the numbers."""
-TOUCH = 1e-3
-"""Overlap of plates that counts as rounding, mm."""
+TOUCH = 1e-3  # overlap of plates that counts as rounding, mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plate:
-    """A face with net_from_face: rotation ``turn`` (2, 2) and ``shift`` (2,) into the net's plane."""
+    """A face with net_from_face."""
 
     face: FaceDesign
-    turn: np.ndarray
-    shift: np.ndarray
+    turn: np.ndarray  # (2, 2)
+    shift: np.ndarray  # (2,)
 
     def place(self, xy) -> np.ndarray:
         """Return points of the face in the net's plane."""
@@ -167,8 +171,7 @@ def _part(plates: list[_Plate], target: TargetDesign, shared, folds) -> Part:
             words = f"under {partner[0]}"
             at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
             shapes.append(Text(*at, words, LETTERS, "middle", turned=not level))
-    every = np.concatenate([*(plate.corners() for plate in plates), *tabs])
-    box = np.array([every.min(0), every.max(0)])
+    box = box_of(np.concatenate([*(plate.corners() for plate in plates), *tabs]))
     sketch = _sketch(plates, box[1, 0] + APART, box[1, 1])
     return Part("net", corners_of(box), (*grounds, *shapes, *sketch), lines=tuple(lines))
 
@@ -203,7 +206,7 @@ def _name(face: str, corners: np.ndarray, words: list[Text]) -> Text:
     """Return the name of a face within a plate of the sketch, near its middle, if there is room between ``words``."""
     middle, half = corners.mean(0), np.ptp(corners, axis=0) / 2
     inner = np.maximum(half - Text(0, 0, face, LETTERS, "middle").box()[1], 0)
-    grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, PLACES)]), axis=-1).reshape(-1, 2) * inner
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, 17)]), axis=-1).reshape(-1, 2) * inner
     grid = np.concatenate([np.zeros((1, 2)), grid[np.argsort(np.linalg.norm(grid, axis=1), kind="stable")]])
     free = words_with_room(middle + grid, [face] * len(grid), LETTERS, words)
     x, y = middle.tolist()

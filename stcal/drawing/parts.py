@@ -1,7 +1,4 @@
-"""Parts of a drawing, a plate for each face of a target and a sheet for each board, and their elements.
-
-Elements are discs, areas, lines and words; mm, X to the right, Y upwards.
-"""
+"""Plates of a target's faces and sheets of boards as discs, areas, lines and words; mm, X to the right, Y upwards."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -32,18 +29,18 @@ WIDTH_PER_HEIGHT = 0.85
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A filled circle. ``name`` : its label."""
+    """A filled circle."""
 
     x: float
     y: float
     radius: float
     ink: Ink
     layer: Layer = "PATTERN"
-    name: str = ""
+    name: str = ""  # its label
 
     def box(self) -> np.ndarray:
         """Return the bounding box, (2, 2): smallest and largest coordinates."""
-        return np.array([[self.x - self.radius, self.y - self.radius], [self.x + self.radius, self.y + self.radius]])
+        return np.array([[self.x, self.y]]) + self.radius * np.array([[-1.0], [1.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,9 +52,7 @@ class Area:
     layer: Layer = "PATTERN"
 
     def box(self) -> np.ndarray:
-        """Return the bounding box, (2, 2): smallest and largest coordinates."""
-        points = np.concatenate(self.lines)
-        return np.array([points.min(0), points.max(0)])
+        return box_of(np.concatenate(self.lines))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,25 +67,23 @@ class Line:
     dashed: bool = False
 
     def box(self) -> np.ndarray:
-        """Return the bounding box, (2, 2): smallest and largest coordinates."""
-        return np.array([self.points.min(0), self.points.max(0)])
+        return box_of(self.points)
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Words from (x, y) on the base line; ``height`` : of capitals; ``turned`` : upwards instead of along X."""
+    """Words from (x, y) on the base line."""
 
     x: float
     y: float
     words: str
-    height: float = 2.5
+    height: float = 2.5  # of capitals
     anchor: Literal["start", "middle", "end"] = "start"
-    turned: bool = False
+    turned: bool = False  # upwards instead of along X
     ink: Ink = "black"
     layer: Layer = "LABELS"
 
     def box(self) -> np.ndarray:
-        """Return the approximate bounding box, (2, 2): smallest and largest coordinates."""
         length = WIDTH_PER_HEIGHT * self.height * len(self.words)
         before = {"start": 0.0, "middle": length / 2, "end": length}[self.anchor]
         box = np.array([[-before, -0.4 * self.height], [length - before, 1.2 * self.height]])
@@ -102,10 +95,15 @@ class Text:
 Shape: TypeAlias = Disc | Area | Line | Text
 
 
-def extent(shapes) -> np.ndarray:
-    """Return the bounding box of all shapes, (2, 2): smallest and largest coordinates."""
-    boxes = np.array([shape.box() for shape in shapes])
-    return np.array([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+def box_of(points: np.ndarray) -> np.ndarray:
+    """Return the bounding box of points (..., 2), (2, 2): smallest and largest coordinates."""
+    flat = points.reshape(-1, 2)
+    return np.array([flat.min(0), flat.max(0)])
+
+
+def extent(shapes: Iterable[Shape]) -> np.ndarray:
+    """Return the bounding box of all shapes, (2, 2)."""
+    return box_of(np.array([shape.box() for shape in shapes]))
 
 
 def moved(shape: Shape, x: float, y: float) -> Shape:
@@ -143,8 +141,6 @@ def said_mm(value: float) -> str:
 
 Spans: TypeAlias = tuple[tuple[int, float, float, str], ...]
 """Lengths with their axis, both ends, and words."""
-NAMED_TAGS = 6
-"""Largest number of tags that the name of a part lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,10 +201,6 @@ def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> P
     return _part(f"{name}: {description}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
 
 
-HOLE = 0.5
-"""Radius of the hole of a ring over the radius of its dot."""
-
-
 def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: float) -> Part:
     xy, radii = board.xy_mm() * [1, -1], board.radii_mm()
     names = board.labels() if isinstance(board, BoardDesign) else [""] * len(xy)
@@ -226,8 +218,9 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
         in_rows = np.column_stack(np.divmod(np.arange(len(xy)), board.columns))
         cells = board.cells() if isinstance(board, BoardDesign) else in_rows
         holed = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
+        hole = 0.5  # of the radius of the dot
         other: Polarity = "bright" if board.polarity == "dark" else "dark"
-        dots += _discs(xy[holed], HOLE * radii[holed], [""] * int(holed.sum()), other)
+        dots += _discs(xy[holed], hole * radii[holed], [""] * int(holed.sum()), other)
     return _part(description, dots, board.polarity, margin_mm, tuple(spans))
 
 
@@ -254,11 +247,11 @@ def _squares_said(board: SquaresOrTags) -> tuple[str, Spans]:
 
 def _tags_said(layout: TagLayout) -> tuple[str, Spans]:
     """Return as :func:`_squares_said`; the side of a tag that lies along the axes is what to measure."""
-    names = ", ".join(f"{tag}" for _, tag in layout.tags) if len(layout.tags) <= NAMED_TAGS else f"{len(layout.tags)}"
+    names = ", ".join(f"{tag}" for _, tag in layout.tags) if len(layout.tags) <= 6 else f"{len(layout.tags)}"
     families = ", ".join(dict.fromkeys(family for family, _ in layout.tags))
     description = f"tag{'s' if len(layout.tags) > 1 else ''} {names} of {families}"
     for corners in layout.corners_mm * [1, -1]:
-        low, high = corners.min(0), corners.max(0)
+        low, high = box_of(corners)
         if np.abs(np.abs(corners - (low + high) / 2) - (high - low) / 2).max() < 1e-6:
             ends = zip(low.tolist(), high.tolist(), strict=True)
             return description, tuple((axis, a, b, said_mm(b - a)) for axis, (a, b) in enumerate(ends))

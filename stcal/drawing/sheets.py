@@ -6,30 +6,42 @@ from itertools import compress, product
 
 import numpy as np
 
-from stcal.drawing.parts import WIDTH_PER_HEIGHT, Disc, Line, Part, Shape, Text, extent, moved, said_mm, words_with_room
+from stcal.drawing.parts import (
+    WIDTH_PER_HEIGHT,
+    Disc,
+    Line,
+    Part,
+    Shape,
+    Text,
+    box_of,
+    extent,
+    moved,
+    said_mm,
+    words_with_room,
+)
 from stcal.errors import InputError
 
-APART = 6.0
-"""Distance from a part to its first dimension, and between dimensions, mm."""
+APART = 6.0  # distance from a part to its first dimension, and between dimensions, mm
 ARROW = 1.5
-CUT_FROM, CUT_TO = 1.5, 5.0
-"""Distances from the outline at which cut marks begin and end, mm."""
+CUT_FROM, CUT_TO = 1.5, 5.0  # distances from the outline at which cut marks begin and end, mm
 LETTERS = 2.0
 ROW = 4.0
 COLUMN_GAP = 3.0
-PLAN, PLAN_LETTERS = 45.0, 1.5
-"""Longer side of the plan of a plate, and height of its numbers, mm."""
-BAR, SHORT_BAR = 100.0, 50.0
-"""Lengths of scale bars, mm."""
+PLAN, PLAN_LETTERS = 45.0, 1.5  # longer side of the plan of a plate, and height of its numbers, mm
+BAR, SHORT_BAR = 100.0, 50.0  # lengths of scale bars, mm
 
 
 def framed(part: Part, bare: bool = False) -> list[Shape]:
     """Return the part with its outline and, unless ``bare``, its name above, cut marks, and dimensions."""
-    box = np.array([part.outline.min(0), part.outline.max(0)])
+    box = box_of(part.outline)
     lines = part.lines or (Line(part.outline, "CUT", width=0.1, closed=True),)
     if bare:
         return [*part.shapes, *lines]
-    shapes: list[Shape] = [*part.shapes, *lines, *([] if part.lines else _cut_marks(box))]
+    shapes: list[Shape] = [*part.shapes, *lines]
+    for right, above, axis in product((0, 1), (0, 1), (0, 1)) if not part.lines else ():
+        outwards = np.where(np.arange(2) == axis, [2 * right - 1, 2 * above - 1], 0)
+        ends = np.array([box[right, 0], box[above, 1]]) + np.array([[CUT_FROM], [CUT_TO]]) * outwards
+        shapes.append(Line(ends, "CUT", width=0.1))
     for axis in (0, 1):
         spans = [span for span in part.spans if span[0] == axis]
         outer = (axis, float(box[0, axis]), float(box[1, axis]), said_mm(box[1, axis] - box[0, axis]))
@@ -54,21 +66,14 @@ def table(part: Part, below: bool) -> list[Shape]:
     for number, row in enumerate(rows, 1):
         places = zip(row, ends.tolist(), strict=True)
         shapes += [Text(end - COLUMN_GAP, y - ROW * number, word, LETTERS, "end") for word, end in places]
-    corner = (float(ends[-1]), y + LETTERS) if below else (x, y - ROW * len(part.table))
-    return [*shapes, *_plan(part, np.array(corner))]
-
-
-def _plan(part: Part, corner: np.ndarray) -> list[Shape]:
-    """Return a plan of a plate with the circles' numbers, which a detector on the plate itself may take for circles."""
-    low, high = part.outline.min(0), part.outline.max(0)
+    # The circles' numbers stand in a plan: a detector may take those on the plate itself for circles.
+    corner = np.array((float(ends[-1]), y + LETTERS) if below else (x, y - ROW * len(part.table)))
+    low, high = box_of(part.outline)
     scale, left_above = min(PLAN / float((high - low).max()), 1.0), np.array([low[0], high[1]])
     discs = [shape for shape in part.pattern() if isinstance(shape, Disc)]
     places = corner + scale * (np.array([(disc.x, disc.y) for disc in discs]) - left_above)
-    ids = [row[0] for row in part.table[2:]]
-    return [
-        Line(corner + scale * (part.outline - left_above), "LABELS", closed=True),
-        *words_with_room(places, ids, PLAN_LETTERS),
-    ]
+    shapes.append(Line(corner + scale * (part.outline - left_above), "LABELS", closed=True))
+    return [*shapes, *words_with_room(places, [row[0] for row in part.table[2:]], PLAN_LETTERS)]
 
 
 def scale_bars(width: float, height: float) -> list[Shape]:
@@ -91,15 +96,6 @@ def scale_bars(width: float, height: float) -> list[Shape]:
         at = (middle, 3.5) if axis == 0 else (3.0 + LETTERS, middle)
         shapes.append(Text(*at, words, LETTERS, "middle", turned=axis == 1, layer="DIMENSIONS"))
     return shapes
-
-
-def _cut_marks(box: np.ndarray) -> list[Shape]:
-    marks: list[Shape] = []
-    for right, above, axis in product((0, 1), (0, 1), (0, 1)):
-        outwards = np.where(np.arange(2) == axis, [2 * right - 1, 2 * above - 1], 0)
-        ends = np.array([box[right, 0], box[above, 1]]) + np.array([[CUT_FROM], [CUT_TO]]) * outwards
-        marks.append(Line(ends, "CUT", width=0.1))
-    return marks
 
 
 def _dimension(axis: int, low: float, high: float, words: str, edge: float, away: float) -> list[Shape]:
@@ -131,23 +127,16 @@ PAPERS = {
     "Tabloid": (279.4, 431.8),
 }
 """Width and height, mm."""
-EDGE = 8.0
-"""Width of the border that printers leave white, mm."""
-SIDE, FOOT = 10.0, 14.0
-"""Widths at the left and the bottom of a page for the scale bars and their text, mm."""
+EDGE = 8.0  # width of the border that printers leave white, mm
+SIDE, FOOT = 10.0, 14.0  # widths at the left and the bottom of a page for the scale bars and their text, mm
 FURNITURE = np.array([2 * EDGE + SIDE, 2 * EDGE + FOOT])
 """Part of a page's width and height that is not available for parts, mm."""
-OVERLAP = 10.0
-"""Overlap of neighbouring sheets, mm."""
-CROSS = 2.5
-"""Half the length of a registration mark, mm."""
-CLEAR = 1.0
-"""Distance from a seam to the circles and squares that it passes, mm."""
-BETWEEN = 12.0
-"""Distance of parts on one sheet, mm."""
+OVERLAP = 10.0  # overlap of neighbouring sheets, mm
+CROSS = 2.5  # half the length of a registration mark, mm
+CLEAR = 1.0  # distance from a seam to the circles and squares that it passes, mm
+BETWEEN = 12.0  # distance of parts on one sheet, mm
 MOST_SHEETS = 500
-MOST_MM = 5000.0
-"""Largest side of a page in a PDF, mm."""
+MOST_MM = 5000.0  # largest side of a page in a PDF, mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,8 +183,8 @@ def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
 
     A part that is larger than a sheet only by its dimensions and its table is drawn without them.
     """
-    split = [min(_ways(part, paper), key=lambda way: (way.cuts(), way.count(), way.bare)) for part in parts]
-    total = sum(way.count() for way in split)
+    split = [min(_ways(part, paper), key=lambda way: (way.cuts, way.count, way.bare)) for part in parts]
+    total = sum(way.count for way in split)
     if total > MOST_SHEETS:
         raise InputError(
             "E-DRAW-SHEETS", f"--paper {paper}: {total} sheets, at most {MOST_SHEETS}; take a larger paper, or none"
@@ -209,44 +198,40 @@ def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Way:
-    """A layout of a part on a paper: the shapes, their extent, the paper's size, and the seams along X and Y."""
+    """A layout of a part on a paper."""
 
     shapes: list[Shape]
-    box: np.ndarray
-    size: tuple[float, float]
-    seams: tuple[list[float], list[float]]
-    pattern: np.ndarray
+    box: np.ndarray  # extent of the shapes
+    size: tuple[float, float]  # of the paper
+    seams: tuple[list[float], list[float]]  # along X and Y
+    cuts: bool  # whether a seam runs through a circle, square or tag
     bare: bool
 
-    def cuts(self) -> bool:
-        """Return True if a seam runs through a circle, square or tag; ``pattern`` : their boxes, (n, 2, 2)."""
-        low, high = np.moveaxis(self.pattern, 1, 0)
-        return any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in self.seams[k])
-
+    @property
     def count(self) -> int:
-        """Return the number of sheets."""
+        """Number of sheets."""
         return (len(self.seams[0]) + 1) * (len(self.seams[1]) + 1)
 
 
 def _ways(part: Part, paper: str) -> list[_Way]:
     """Return the layouts of a part: portrait and landscape, with the table beside and below, or bare on one sheet."""
-    ways = []
-    boxes = np.array([shape.box() for shape in part.pattern()])
+    ways, boxes = [], np.array([shape.box() for shape in part.pattern()])
     drawn = [(False, [*framed(part), *table(part, below)]) for below in (True, False)]
     if not part.lines:  # the pieces of a net need their names
         drawn.append((True, framed(part, bare=True)))
     for (bare, shapes), turned in product(drawn, (False, True)):
         width, height = PAPERS[paper]
         size = (height, width) if turned else (width, height)
-        box = extent(shapes)
-        room = np.array(size) - FURNITURE
+        box, room = extent(shapes), np.array(size) - FURNITURE
         words = np.array([shape.box() for shape in shapes if isinstance(shape, Text)]).reshape(-1, 2, 2)
         across, down = (
             seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k], words[:, :, k])
             for k in (0, 1)
         )
-        way = _Way(shapes, box, size, (across, down), boxes, bare)
-        if not bare or way.count() == 1:
+        low, high = np.moveaxis(boxes, 1, 0)
+        cuts = any(((low[:, k] < at) & (high[:, k] > at)).any() for k in (0, 1) for at in (across, down)[k])
+        way = _Way(shapes, box, size, (across, down), cuts, bare)
+        if not bare or way.count == 1:
             ways.append(way)
     return ways
 
@@ -281,14 +266,14 @@ def _free(last: float, first: float, taken: np.ndarray) -> float | None:
 
 
 def _tiles(way: _Way, title: str) -> list[Sheet]:
-    if way.count() == 1:
+    if way.count == 1:
         shift = [EDGE + SIDE - float(way.box[0, 0]), way.size[1] - EDGE - float(way.box[1, 1])]
         sheet = _sheet(title, *way.size, tuple(moved(shape, *shift) for shape in way.shapes))
         return [replace(sheet, bare=way.bare)]
-    pieces = []  # start and end of each piece along X, and along Y
-    for seams, low, high in zip(way.seams, *way.box.tolist(), strict=True):
-        begins, ends = [seam - OVERLAP / 2 for seam in seams], [seam + OVERLAP / 2 for seam in seams]
-        pieces.append(list(zip([low, *begins], [*ends, high], strict=True)))
+    pieces = [  # start and end of each piece along X, and along Y
+        [*zip([low, *(at - OVERLAP / 2 for at in seams)], [*(at + OVERLAP / 2 for at in seams), high], strict=True)]
+        for seams, low, high in zip(way.seams, *way.box.tolist(), strict=True)
+    ]
     shapes = [*way.shapes, *_registration(way)]
     boxes = [shape.box() for shape in shapes]
     sheets = []
@@ -298,8 +283,8 @@ def _tiles(way: _Way, title: str) -> list[Sheet]:
             clip = np.array([[left, below], [right, above]])
             inside = [(box[0] <= clip[1]).all() and (box[1] >= clip[0]).all() for box in boxes]
             shapes_of_sheet = tuple(moved(shape, *shift) for shape in compress(shapes, inside))
-            place = f"sheet {len(sheets) + 1} of {way.count()}: row {row}, column {column}"
-            sheets.append(_sheet(f"{title}; {place}", *way.size, shapes_of_sheet, clip + shift, way.cuts()))
+            place = f"sheet {len(sheets) + 1} of {way.count}: row {row}, column {column}"
+            sheets.append(_sheet(f"{title}; {place}", *way.size, shapes_of_sheet, clip + shift, way.cuts))
     return sheets
 
 
@@ -319,7 +304,6 @@ def _registration(way: _Way) -> list[Shape]:
 
 
 def _sheet(title: str, width: float, height: float, shapes: tuple[Shape, ...], clip=None, cuts: bool = False) -> Sheet:
-    """Return a sheet with its scale bars and its title."""
     bars = [moved(shape, EDGE, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
     instruction = "1:1: print at 100 %, not fitted to the page, and measure the bars"
     if clip is not None:

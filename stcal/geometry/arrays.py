@@ -7,18 +7,7 @@ from functools import lru_cache, wraps
 from inspect import signature
 from numbers import Integral, Real
 from types import UnionType
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Literal,
-    NoReturn,
-    ParamSpec,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -27,8 +16,7 @@ from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
 
-LONGEST = 100
-"""Number of characters up to which the ``repr`` of a value stands in that of a result."""
+LONGEST = 100  # number of characters up to which the repr of a value stands in that of a result
 MYPY = False
 """True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
 
@@ -82,8 +70,8 @@ def _same(one: Any, two: Any) -> bool:
 
 
 class Brief(ByValue):
-    """Base of results with many values, made with ``@dataclass(eq=False, repr=False)``, that show themselves in one
-    line: with plain values, notes, and the size of everything else."""
+    """Base of results, made with ``@dataclass(eq=False, repr=False)``, that show plain values, notes, and the size of
+    everything else in one line."""
 
     __slots__ = ()
 
@@ -93,8 +81,7 @@ class Brief(ByValue):
         return f"{type(self).__name__}({', '.join(shown)})"
 
 
-TOLD = {"notes", "doubts"}
-"""Fields whose sentences a ``repr`` has in full."""
+TOLD = {"notes", "doubts"}  # fields whose sentences a repr has in full
 
 
 def _brief(value: object) -> str:
@@ -106,15 +93,13 @@ def _brief(value: object) -> str:
     return text if len(text) <= LONGEST else f"<{type(value).__name__}>"
 
 
-Rule = tuple[Callable[[Any], bool], str]
-"""Whether a value is of a type, and the type in words."""
-NO_RULE: tuple[Rule, bool] = ((lambda _: True), ""), False
+Rule = tuple[Callable[[Any], bool], str]  # whether a value is of a type, and the type in words
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def _rule(hint: Any, may_be_infinite: bool = False) -> Rule | None:
-    """Return the rule of a field's type; None for arrays, which :func:`freeze` judges, and for functions."""
+    """Return the rule of a type; None for arrays, which :func:`freeze` judges, and for functions."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Literal:
         return (lambda v: any(v is w or (isinstance(v, str) and v == w) for w in parts)), " or ".join(map(str, parts))
@@ -124,7 +109,16 @@ def _rule(hint: Any, may_be_infinite: bool = False) -> Rule | None:
         words = " or ".join(rule[1] for rule in known)
         return None if len(known) < len(rules) else ((lambda v: any(admits(v) for admits, _ in known)), words)
     if origin in (tuple, list, Sequence) and parts:
-        return _rule_of_sequence(origin, parts)
+        count = None if origin is not tuple or Ellipsis in parts else len(parts)
+        each = [_rule(part) or (lambda _: True, "value") for part in parts if part is not Ellipsis]
+        words = f"a tuple, each {each[0][1]}," if count is None else f"a tuple of {', '.join(r[1] for r in each)}"
+
+        def admits(value: object) -> bool:
+            if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str):
+                return False
+            return count in (None, len(value)) and all(each[i % len(each)][0](v) for i, v in enumerate(value))
+
+        return admits, words
     if origin in (dict, Mapping):
         (is_key, key), (is_value, value) = (_rule(part) or (lambda _: True, "value") for part in parts)
         words = f"a mapping from {key} to {value}"
@@ -147,40 +141,25 @@ PLAIN: dict[Any, Rule] = {
 }
 
 
-def _rule_of_sequence(origin: Any, parts: tuple) -> Rule:
-    count = None if origin is not tuple or Ellipsis in parts else len(parts)
-    rules = [_rule(part) or (lambda _: True, "value") for part in parts if part is not Ellipsis]
-    words = f"a tuple, each {rules[0][1]}," if count is None else f"a tuple of {', '.join(rule[1] for rule in rules)}"
-
-    def admits(value: object) -> bool:
-        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or count not in (None, len(value)):
-            return False
-        return all(rules[i % len(rules)][0](entry) for i, entry in enumerate(value))
-
-    return admits, words
-
-
-def _is_choice(hint: Any) -> bool:
-    return any(get_origin(part) is Literal for part in (hint, *get_args(hint)))
-
-
-def _refuse(what: str, name: str, value: object, words: str, is_choice: bool) -> NoReturn:
-    if is_choice:
+def _require(what: str, name: str, value: object, known: tuple[Rule, Any] | None) -> None:
+    """Refuse a value that is not of its type, by the rule and the hint of it."""
+    if known is None or known[0][0](value):
+        return
+    words, hint = known[0][1], known[1]
+    if any(get_origin(part) is Literal for part in (hint, *get_args(hint))):
         words = words.removesuffix(" or None")
         raise InputError("E-OPTION-VALUE", f"{what}: {name} {_brief(value)}: not a choice; use {words}")
     raise InputError("E-FIELD-TYPE", f"{what}: {name} {_brief(value)}: {words} needed")
 
 
 @lru_cache
-def _rules(kind: type) -> dict[str, tuple[Rule, bool]]:
-    """Return the rules of a dataclass's fields, and whether each one is a choice of words."""
-    hints, found = get_type_hints(kind), {}
-    for entry in fields(kind):
-        hint = hints[entry.name]
-        rule = _rule(hint, isinstance(entry.default, float) and math.isinf(entry.default))
-        if rule and entry.init:
-            found[entry.name] = rule, _is_choice(hint)
-    return found
+def _rules(kind: type) -> dict[str, tuple[Rule, Any]]:
+    """Return the rules and hints of a dataclass's fields."""
+    hints = get_type_hints(kind)
+    ends = {
+        each.name: isinstance(each.default, float) and math.isinf(each.default) for each in fields(kind) if each.init
+    }
+    return {name: (rule, hints[name]) for name, end in ends.items() if (rule := _rule(hints[name], end))}
 
 
 def require_fields(instance: object, what: str, **least: float) -> None:
@@ -188,10 +167,9 @@ def require_fields(instance: object, what: str, **least: float) -> None:
 
     Numbers must be finite, and at least ``least`` by field. Arrays are left to :func:`freeze`.
     """
-    for name, ((admits, words), is_choice) in _rules(type(instance)).items():
+    for name, known in _rules(type(instance)).items():
         value = getattr(instance, name)
-        if not admits(value):
-            _refuse(what, name, value, words, is_choice)
+        _require(what, name, value, known)
         if name in least and value is not None and value < least[name]:
             raise InputError("E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed")
 
@@ -201,17 +179,14 @@ def require_arguments(function: Callable[P, R]) -> Callable[P, R]:
     bind = signature(function).bind
 
     @lru_cache
-    def rules() -> dict[str, tuple[Rule, bool]]:
-        hints = get_type_hints(function)
-        return {name: (rule, _is_choice(hint)) for name, hint in hints.items() if (rule := _rule(hint))}
+    def rules() -> dict[str, tuple[Rule, Any]]:
+        return {name: (rule, hint) for name, hint in get_type_hints(function).items() if (rule := _rule(hint))}
 
     @wraps(function)
     def judged(*args: P.args, **kwargs: P.kwargs) -> R:
         for name, value in bind(*args, **kwargs).arguments.items():
             _require_unmasked(value, f"{function.__name__}: {name}")
-            (admits, words), is_choice = rules().get(name, NO_RULE)
-            if not admits(value):
-                _refuse(function.__name__, name, value, words, is_choice)
+            _require(function.__name__, name, value, rules().get(name))
         return function(*args, **kwargs)
 
     return judged

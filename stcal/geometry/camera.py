@@ -9,18 +9,15 @@ from stcal.errors import ConvergenceError, InputError, named
 from stcal.geometry.arrays import Array, ByValue, freeze, frozen, require_arguments, require_fields
 
 MAX_NEWTON_STEPS = 50
-COEFFICIENTS = 12
-"""Number of distortion coefficients."""
+COEFFICIENTS = 12  # number of distortion coefficients
 WIDEST_RAD = np.radians(89.0)
 """Largest angle from the axis that an equidistant camera may see: points of the plane Z = 1 are within 57 of it."""
-NEAR_AXIS = 1e-8
-"""Largest squared radius at which the series expansion is exact to rounding."""
+NEAR_AXIS = 1e-8  # largest squared radius at which the series expansion is exact to rounding
 UNDISTORT_TOLERANCE = 1e-12
 """Largest error of the inverse distortion, in normalised coordinates (1e-8 px at f = 10 000 px)."""
 COLMAP_PIXEL_ORIGIN = 0.5
 """COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
-DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
-"""Numbers of distortion coefficients that OpenCV knows."""
+DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)  # numbers of distortion coefficients that OpenCV knows
 COLMAP_LAYOUT = {
     "SIMPLE_PINHOLE": [(0, 1), 2, 3],
     "PINHOLE": [0, 1, 2, 3],
@@ -34,19 +31,14 @@ COLMAP_LAYOUT = {
     "THIN_PRISM_FISHEYE": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14],
 }
 """Indices of COLMAP's parameters in :data:`PARAMETER_NAMES`, by camera model."""
-COLMAP_MODELS = tuple(COLMAP_LAYOUT)
-"""Camera models that stcal supports."""
+COLMAP_MODELS = tuple(COLMAP_LAYOUT)  # camera models that stcal supports
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-FISHEYE = "FISHEYE"
-"""Part of the names of COLMAP's equidistant models."""
+FISHEYE = "FISHEYE"  # part of the names of COLMAP's equidistant models
 
 
-MAX_FOCAL_RATIO = 10.0
-"""Largest ratio between fx and fy; anamorphic lenses have 2."""
-FARTHEST = 1e12
-"""Largest value of any parameter, whose square does not overflow."""
-MAX_SIDE_PX = 1_000_000
-"""Longest image side that a camera file may state, px."""
+MAX_FOCAL_RATIO = 10.0  # largest ratio between fx and fy; anamorphic lenses have 2
+FARTHEST = 1e12  # largest value of any parameter, whose square does not overflow
+MAX_SIDE_PX = 1_000_000  # longest image side that a camera file may state, px
 LEAST_SHARE_OF_SIDE = 0.015
 """Share of the longer side that focal length or principal point of every lens exceed; lengths in mm do not."""
 

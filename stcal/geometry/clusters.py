@@ -26,15 +26,12 @@ LEAST_TOLD = 1e-14
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ByClusters:
-    """Covariance (q, q) of the parameters, never below the ``independent`` one, of independent errors.
+    """Covariance of q parameters, never below that of independent errors."""
 
-    ``differ`` : ratio of σ by which clusters differ more than those explain; ``freedom`` : (q,) effective degrees.
-    """
-
-    covariance: np.ndarray
-    independent: np.ndarray
-    differ: float
-    freedom: np.ndarray
+    covariance: np.ndarray  # (q, q)
+    independent: np.ndarray  # (q, q) of independent errors
+    differ: float  # ratio of σ by which clusters differ more than those explain
+    freedom: np.ndarray  # (q,) effective degrees
 
 
 def released(values: np.ndarray, share: np.ndarray, power: float = 0.5) -> np.ndarray:

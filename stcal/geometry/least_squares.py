@@ -1,14 +1,14 @@
 """Least squares on a manifold: the package's only descent, for one problem or many, also with several minima."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, fields
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses
 from stcal.geometry.robust import huber_cost, huber_weights
 
 MAX_STEPS = 200
@@ -17,14 +17,12 @@ SETTLED = 1e-12
 by more than 1e-4 σ, and the remaining error is far smaller."""
 LEAST_GAIN = 1e-12
 """Decrease that rounding alone predicts for exact data, in units of σ²: a step of a millionth of σ."""
-ROUNDING = 1e-12
-"""Share of the cost by which rounding may seem to raise the cost at the minimum."""
+ROUNDING = 1e-12  # share of the cost by which rounding may seem to raise the cost at the minimum
 MAX_DAMPING = 1e12
 UNKEPT, KEPT = 1e-8, 0.1
 """A descent ends if the predicted decrease is at most ``UNKEPT``, in units of σ², and the actual decrease is less than
 the share ``KEPT`` of it: what remains is rounding."""
-TRUSTED = 0.5
-"""Ratio of actual to predicted decrease above which the damping shrinks; below ``KEPT`` it grows."""
+TRUSTED = 0.5  # ratio of actual to predicted decrease above which the damping shrinks; below KEPT it grows
 DAMPED = 1e-4
 """Largest predicted decrease of an undamped step at which a damped descent counts as ended, in units of σ²: a step of a
 hundredth of σ. Where the derivatives neglect the curvature of the residuals, only damped steps lower the cost."""
@@ -55,12 +53,11 @@ L = TypeVar("L", bound=Linear)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """Normal equations of one problem, or of h problems at once: cost, normal matrix (..., k, k), and half the gradient
-    of the cost (..., k). A parameter that nothing determines is not moved."""
+    """Normal equations of one problem, or of h problems at once. A parameter that nothing determines is not moved."""
 
     cost: float | np.ndarray
-    normal: np.ndarray
-    gradient: np.ndarray
+    normal: np.ndarray  # (..., k, k)
+    gradient: np.ndarray  # (..., k) half of that of the cost
 
     @classmethod
     def of(cls, residual: np.ndarray, jacobian: np.ndarray) -> "NormalEquations":
@@ -87,13 +84,12 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum(Generic[S, L]):
-    """End of a descent after a number of ``steps``: the state, the problem linearised about it, whether it is a
-    minimum, and the decrease of the cost that the last step promised, in σ²."""
+    """End of a descent."""
 
     state: S
-    linear: L
-    converged: np.ndarray
-    promised: np.ndarray
+    linear: L  # the problem linearised about the state
+    converged: np.ndarray  # whether it is a minimum
+    promised: np.ndarray  # decrease of the cost that the last step promised, in σ²
     steps: int
 
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
@@ -169,63 +165,10 @@ def minimise(
     return Minimum(state, current, converged, promised, steps)
 
 
-def perturbed(pose: Rigid, step: np.ndarray) -> Rigid:
-    """Return a pose after a left perturbation (6,): rotation (rad) and translation."""
-    turn = Rigid.exp(step)
-    return Rigid(turn.rotation @ pose.rotation, pose.translation + turn.translation)
-
-
 MAX_POSE_STEPS = 60
 ACCEPTED = 1e-2
 """Largest predicted decrease, in σ², that counts as settled after the last step: a tenth of σ. In a flat valley steps
 are many and short."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseStack:
-    """A stack of h poses for inner loops; unlike :class:`~stcal.geometry.rigid.Poses` it is not checked.
-
-    Parameters
-    ----------
-    rotation : (h, 3, 3) array
-        Rotation matrices.
-    translation : (h, 3) array
-        Translations.
-    """
-
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    @classmethod
-    def of(cls, *poses: Rigid) -> "PoseStack":
-        """Return the stack of single poses."""
-        return cls(np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
-
-    @property
-    def dim(self) -> int:
-        """Number of unknowns of a pose."""
-        return 6
-
-    def rigid(self, row: int) -> Rigid:
-        """Return the pose of one row."""
-        return Rigid(self.rotation[row], self.translation[row])
-
-    def __len__(self) -> int:
-        return len(self.translation)
-
-    def moved(self, step: np.ndarray) -> "PoseStack":
-        """Return the poses after left perturbations (h, 6)."""
-        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-        return PoseStack(turn @ self.rotation, self.translation + step[:, 3:])
-
-    def __getitem__(self, rows) -> "PoseStack":
-        return PoseStack(self.rotation[rows], self.translation[rows])
-
-    def plus(self, other: "PoseStack") -> "PoseStack":
-        """Return these poses, then those of ``other``."""
-        return PoseStack(
-            np.concatenate([self.rotation, other.rotation]), np.vstack([self.translation, other.translation])
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -252,28 +195,32 @@ class Normal(NormalEquations):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minima:
-    """h poses at their minima: ``cost`` (h,), ``normal`` (h, 6, 6), ``length`` (h, n) residuals in σ, ``settled``."""
+    """h poses at their minima."""
 
-    poses: PoseStack
-    cost: np.ndarray
-    normal: np.ndarray
-    length: np.ndarray
-    settled: np.ndarray
+    poses: Poses
+    cost: np.ndarray  # (h,)
+    normal: np.ndarray  # (h, 6, 6)
+    length: np.ndarray  # (h, n) of the residuals in σ
+    settled: np.ndarray  # (h,)
 
     def rows(self, index) -> "Minima":
         """Return the minima that a list, a mask or a slice selects."""
         return Minima(self.poses[index], self.cost[index], self.normal[index], self.length[index], self.settled[index])
 
+    def ordered(self) -> "Minima":
+        """Return the minima by their costs."""
+        return self.rows(np.argsort(self.cost, kind="stable"))
+
     def plus(self, other: "Minima") -> "Minima":
         """Return these minima followed by those of ``other``."""
         names = ("cost", "normal", "length", "settled")
         both = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
-        return Minima(self.poses.plus(other.poses), *both)
+        return Minima(self.poses + other.poses, *both)
 
 
 def descend(
-    evaluate: Callable[[PoseStack], Normal],
-    poses: PoseStack,
+    evaluate: Callable[[Poses], Normal],
+    poses: Poses,
     settled: float,
     hopeless: float = np.inf,
 ) -> Minima:
@@ -282,7 +229,7 @@ def descend(
     result = minimise(
         poses,
         evaluate,
-        lambda stack, step: stack.moved(step),
+        Poses.moved,
         select=select_rows,
         damping=1e-6,
         settled=settled,
@@ -298,11 +245,11 @@ def descend(
 def select_rows(take: np.ndarray, new, old):
     """Return the rows of the new poses, or normal equations, where ``take`` (h,) is True, else of the old ones."""
 
-    def rows(name: str) -> np.ndarray:
-        a, b = getattr(new, name), getattr(old, name)
-        return np.where(take.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-    return type(new)(*(rows(field.name) for field in fields(new)))
+    made = copy(new)
+    for field in fields(new):
+        a, b = getattr(new, field.name), getattr(old, field.name)
+        object.__setattr__(made, field.name, np.where(take.reshape(-1, *[1] * (a.ndim - 1)), a, b))
+    return made
 
 
 def block_diagonal(blocks: np.ndarray) -> np.ndarray:

@@ -12,30 +12,27 @@ SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
 
 TINY = 1e-300
-LARGE = 100
-"""Number of unknowns of a block from which on its inverse is computed from Cholesky's factors."""
+LARGE = 100  # number of unknowns of a block from which on its inverse is computed from Cholesky's factors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduction:
-    """Elimination of m blocks of ``a`` unknowns each from the normal equations of k other unknowns.
+    """Elimination of m blocks of ``a`` unknowns each from the normal equations of k other unknowns."""
 
-    ``normal`` : (k, k) and ``right`` : (k,) are to be subtracted from those of the others; ``step`` : (m, a) of the
-    blocks if the others stay, of which ``from_kept`` : (m, a, k) times their step is subtracted; ``gain`` : of ``step``
-    alone.
-    """
-
-    normal: np.ndarray
+    normal: np.ndarray  # (k, k) to be subtracted from that of the others, as ``right`` (k,)
     right: np.ndarray
-    step: np.ndarray
-    from_kept: np.ndarray
-    block: np.ndarray
-    gain: float
+    step: np.ndarray  # (m, a) of the blocks if the others stay
+    from_kept: np.ndarray  # (m, a, k) times the step of the others is subtracted from ``step``
+    block: np.ndarray  # (m, a, a)
+    gain: float  # of ``step`` alone
 
     @property
     def inverse(self) -> np.ndarray:
-        """Inverses (m, a, a) of the blocks, computed anew each time."""
-        return _inverses(self.block)
+        """Inverses (m, a, a) of the blocks, computed anew each time; of large ones by Cholesky's factors, three times
+        as fast."""
+        if self.block.shape[1] < LARGE:
+            return np.linalg.inv(self.block) if len(self.block) else self.block
+        return np.stack([inverse_and_size(matrix)[0] for matrix in self.block])
 
     def back(self, kept: np.ndarray) -> np.ndarray:
         """Return the steps (m, a) of the blocks that belong to a step (k,) of the other unknowns."""
@@ -52,24 +49,13 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
         inverse = np.linalg.inv(block)
         from_kept, step = inverse @ cross, (inverse @ right[..., None])[..., 0]
     else:
-        both = np.stack([_solved(*each) for each in zip(block, cross, right, strict=True)])
+        both = np.column_stack([cross.reshape(m * a, k), right.ravel()]).reshape(m, a, k + 1)
+        for own, solved in zip(block, both, strict=True):  # an inverse takes three times as long
+            factor, fault = dpotrf(own, lower=True)
+            solved[:] = np.linalg.solve(own, solved) if fault else dpotrs(factor, solved, lower=True)[0]
         from_kept, step = np.ascontiguousarray(both[..., :k]), both[..., k]
     flat, weighted = cross.reshape(m * a, k), from_kept.reshape(m * a, k)
     return Reduction(flat.T @ weighted, weighted.T @ right.ravel(), step, from_kept, block, float((right * step).sum()))
-
-
-def _solved(block: np.ndarray, cross: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions (a, k + 1) of one symmetric block by Cholesky; an inverse takes three times as long."""
-    both = np.column_stack([cross, right])
-    factor, fault = dpotrf(block, lower=True)
-    return np.linalg.solve(block, both) if fault else dpotrs(factor, both, lower=True)[0]
-
-
-def _inverses(block: np.ndarray) -> np.ndarray:
-    """Return the inverses of symmetric matrices (m, a, a); of large ones by Cholesky's factors, three times as fast."""
-    if block.shape[1] < LARGE:
-        return np.linalg.inv(block) if len(block) else block
-    return np.stack([inverse_and_size(matrix)[0] for matrix in block])
 
 
 def inverse_and_size(normal: np.ndarray) -> tuple[np.ndarray, float]:

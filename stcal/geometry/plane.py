@@ -1,18 +1,15 @@
-"""Planes, circles on them and their images, homographies, and the two poses from which a camera may see a plane.
-
-The two poses are those of Collins & Bartoli (2014). The centre of an ellipse is not the image of the circle's
-centre."""
+"""Planes, circles on them and their images, homographies, and the two poses from which a camera may see a plane
+(Collins & Bartoli 2014). The centre of an ellipse is not the image of the circle's centre."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.least_squares import Minima, NormalEquations, PoseStack, minimise, perturbed
-from stcal.geometry.rigid import Rigid, best_rotations, skew
+from stcal.geometry.least_squares import Minima, NormalEquations, minimise
+from stcal.geometry.rigid import Poses, Rigid, best_rotations, by_pose, perspective, skew
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
 
@@ -54,11 +51,11 @@ of the distance."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """The plane ``normal · xyz = offset``, normal (3,) of unit length; ``rms`` : spread of the fitted points."""
+    """The plane ``normal · xyz = offset``."""
 
-    normal: Array
+    normal: Array  # (3,) of unit length
     offset: float
-    rms: float
+    rms: float  # spread of the fitted points
 
     def __post_init__(self):
         freeze(self, "normal", (3,), "plane normal")
@@ -200,15 +197,12 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
         p = rotated + pose.translation
         if (p[:, 2] <= 0).any():
             return NormalEquations.impossible(6)
-        by_point = np.zeros((len(p), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1 / p[:, 2]
-        by_point[:, :, 2] = -p[:, :2] / p[:, 2:] ** 2
-        by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
-        return NormalEquations.of((p[:, :2] / p[:, 2:] - xy_normalised).ravel(), by_pose.reshape(-1, 6))
+        xy, by_point = perspective(p)
+        return NormalEquations.of((xy - xy_normalised).ravel(), by_pose(by_point, rotated).reshape(-1, 6))
 
     if ((camera_from_plane @ xyz)[:, 2] <= 0).any():
         raise DegenerateError("E-POINTS-BEHIND", "planar pose: points behind the camera")
-    minimum = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
+    minimum = minimise(camera_from_plane, linearise, Rigid.moved, least_gain=EXACT, max_steps=MAX_STEPS)
     return minimum.required("planar pose", "check that the points are numbered rightly").state
 
 
@@ -217,14 +211,12 @@ OUTLIER = 6.0
 6·10⁷ (Rayleigh)."""
 MAX_OUTLIER_SHARE = 1 / 3
 """Largest share of outliers among the observed points; beyond it the inliers are no trustworthy majority."""
-SAME = 1.0
-"""Distance, in σ, below which two minima count as one: the covariance covers both."""
+SAME = 1.0  # distance, in σ, below which two minima count as one: the covariance covers both
 WIDER = 1.1
 """Factor of increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's
 loss."""
-MAX_SIGMA_RAD = 0.5
-"""Largest σ of a usable rotation; beyond it linear error propagation is meaningless."""
-Descend = Callable[[PoseStack, float], Minima]
+MAX_SIGMA_RAD = 0.5  # largest σ of a usable rotation; beyond it linear error propagation is meaningless
+Descend = Callable[[Poses, float], Minima]
 """Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""
 
 
@@ -241,34 +233,28 @@ class PlaneMinima:
         return OUTLIER * self.robust_sigma
 
 
-def mirrored(poses: PoseStack, target_from_plane: Rigid) -> PoseStack:
+def mirrored(poses: Poses, target_from_plane: Rigid) -> Poses:
     """Return h poses camera_from_target with the depths about the plane's origin mirrored along the line of sight."""
     middle = poses.rotation @ target_from_plane.translation + poses.translation
     sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     mirror = np.eye(3) - 2 * sight[:, :, None] * sight[:, None, :]
     axis = target_from_plane.rotation[:, 2]
     rotation = mirror @ poses.rotation @ (np.eye(3) - 2 * np.outer(axis, axis))
-    return PoseStack(rotation, middle - rotation @ target_from_plane.translation)
+    return Poses(rotation, middle - rotation @ target_from_plane.translation)
 
 
-def step_between(pose: PoseStack, second: PoseStack) -> np.ndarray:
-    """Return the left perturbation (6,), rad and mm, from one pose to a second; both are stacks of one pose."""
-    turn = Rotation.from_matrix(second.rotation[0] @ pose.rotation[0].T).as_rotvec()
-    return np.concatenate([turn, second.translation[0] - pose.translation[0]])
-
-
-def distinct(poses: PoseStack, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
+def distinct(poses: Poses, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
     """Return True if the second of two poses differs significantly from the first, of the normal matrix (6, 6).
 
     ``robust_sigma`` : of the residuals, in stated σ: where these are too small, so is σ of the pose.
     """
-    step = step_between(poses[[0]], poses[[1]])
+    step = poses[1].difference(poses[0])
     return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
 
 
 def two_minima(
-    descend_near: Callable[[PoseStack], Descend],
-    start: PoseStack,
+    descend_near: Callable[[Poses], Descend],
+    start: Poses,
     target_from_plane: Rigid,
     failure: str,
     planar: bool = True,
@@ -280,11 +266,11 @@ def two_minima(
     middle of the points, Z along the normal; ``planar`` : whether all points are in the plane, so that two starts that
     end alike may have been on one side, and the mirror image of their minimum is tried.
     """
-    poses = start.plus(mirrored(start, target_from_plane)) if len(start) == 1 else start
+    poses = start + mirrored(start, target_from_plane) if len(start) == 1 else start
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
         descend = descend_near(poses[[0]])
-        minima = _ordered(descend(poses, HUBER * sigma))
+        minima = descend(poses, HUBER * sigma).ordered()
         poses = minima.poses
         wider = robust_sigma(minima.length[0], 2)
         if wider <= WIDER * sigma:
@@ -295,13 +281,9 @@ def two_minima(
     is_double = distinct(minima.poses, minima.normal[0], sigma)
     if planar and not is_double:
         again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
-        minima = _ordered(minima.rows([0]).plus(again))
+        minima = minima.rows([0]).plus(again).ordered()
         is_double = distinct(minima.poses, minima.normal[0], sigma)
     return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), sigma)
-
-
-def _ordered(found: Minima) -> Minima:
-    return found.rows(np.argsort(found.cost, kind="stable"))
 
 
 def weights_of(length: np.ndarray) -> np.ndarray:
@@ -323,17 +305,16 @@ def covariance_of_both(covariance: np.ndarray, away: np.ndarray, delta_chi2: flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """h poses after one step of generalised least squares, with residuals (h, n, 2) to first order, normal matrices, χ²
-    (h,), and squared lengths of the steps in σ, (h,)."""
+    """h poses after one step of generalised least squares."""
 
-    poses: PoseStack
-    residual: np.ndarray
-    normal: np.ndarray
-    chi2: np.ndarray
-    moved2: np.ndarray
+    poses: Poses
+    residual: np.ndarray  # (h, n, 2) to first order
+    normal: np.ndarray  # (h, 6, 6)
+    chi2: np.ndarray  # (h,)
+    moved2: np.ndarray  # (h,) squared lengths of the steps, in σ
 
 
-def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: PoseStack) -> Weighed:
+def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: Poses) -> Weighed:
     """Return the step of h poses that weights the points by the full covariance (h, 2n, 2n) of their residuals (h, n,
     2); ``by_pose`` : (h, n, 2, 6) negative derivatives by left perturbations."""
     h = len(residual)
@@ -350,12 +331,11 @@ def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, pos
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanePoses:
-    """Both poses camera_from_plane that agree with a homography about a point to first order; the determinant of its
-    derivative there; and ``foreshortening``, the cosine between the plane's normal and the line of sight."""
+    """Both poses camera_from_plane that agree with a homography about a point to first order."""
 
     poses: tuple[Rigid, Rigid]
-    determinant: float
-    foreshortening: float
+    determinant: float  # of the homography's derivative there
+    foreshortening: float  # cosine between the plane's normal and the line of sight
 
 
 def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:

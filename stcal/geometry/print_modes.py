@@ -1,8 +1,5 @@
-"""Smooth deviations of a printed plane from its drawing, as printers and paper have them, and how large they are.
-
-A printer feeds paper at another rate than it moves its head: a print is longer in one direction, sheared, and by less
-curved; a sheet bends. All points of the plane follow together, by far more than each deviates by itself.
-"""
+"""Smooth deviations of a printed plane from its drawing, and how large they are: a print is longer in one direction,
+sheared, and by less curved; a sheet bends. All points follow together, by far more than each deviates by itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,24 +14,18 @@ BEND_SHARE = 0.01
 """σ of a sheet's bends out of its plane, likewise: 1 mm on 200 mm, more than that of any board in use."""
 LEAST_SHARE = 1e-3
 """A mode that moves the points by less than this share of what it moves others by is not told by them."""
-AMPLITUDES = (1e-3, 10.0)
-"""Smallest and largest factor on these σ."""
-PRIOR_LOGS = np.log(10.0)
-"""σ of the logarithm of the factor before the data are seen."""
+AMPLITUDES = (1e-3, 10.0)  # smallest and largest factor on these σ
+PRIOR_LOGS = np.log(10.0)  # σ of the logarithm of the factor before the data are seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintModes:
-    """Smooth deviations of n points: ``modes`` (3n, m), orthonormal, and the σ of their coordinates, (m,) mm.
+    """Smooth deviations of n points, without that of their size."""
 
-    The size is not among them. ``affine`` : whether stretch and shear are the first two, which points on a line do not
-    tell; ``amplitude`` : factor on the σ of printers and paper.
-    """
-
-    modes: np.ndarray
-    spread_mm: np.ndarray
-    affine: bool
-    amplitude: float = 1.0
+    modes: np.ndarray  # (3n, m), orthonormal
+    spread_mm: np.ndarray  # (m,) σ of their coordinates
+    affine: bool  # whether stretch and shear are the first two, which points on a line do not tell
+    amplitude: float = 1.0  # factor on the σ of printers and paper
 
     @classmethod
     def of(cls, xy: np.ndarray) -> "PrintModes":
@@ -94,9 +85,8 @@ class PrintModes:
     def as_found(self, off_mm: np.ndarray, covariance: np.ndarray, sigma_mm: float) -> "PrintModes":
         """Return the modes with the amplitude that explains deviations (n, 3), adjusted with this one, best;
         ``covariance`` : (m, m) of the modes' coordinates after the adjustment."""
-        told = Told(
-            self.modes.T @ off_mm.ravel(), covariance, np.full(len(self.spread_mm), sigma_mm**2), self.spread_mm
-        )
+        own = np.full(len(self.spread_mm), sigma_mm**2)
+        told = Told(self.modes.T @ off_mm.ravel(), covariance, own, self.spread_mm)
         return replace(self, amplitude=found_amplitude([told], self.amplitude))
 
 
@@ -114,13 +104,12 @@ def stretch_in_words(what: str, stretch: float, shear: float) -> list[str]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """What an adjustment tells about the modes of one print: ``mean`` (m,) and ``covariance`` (m, m) of their
-    coordinates, the variance ``own`` (m,) that they have anyway, and ``spread`` (m,) at an amplitude of 1, mm."""
+    """What an adjustment tells about the coordinates of the modes of one print, mm."""
 
-    mean: np.ndarray
-    covariance: np.ndarray
-    own: np.ndarray
-    spread: np.ndarray
+    mean: np.ndarray  # (m,)
+    covariance: np.ndarray  # (m, m)
+    own: np.ndarray  # (m,) variance that they have anyway
+    spread: np.ndarray  # (m,) at an amplitude of 1
 
     def prior(self, amplitude: float) -> np.ndarray:
         """Return the variances (m,) of the coordinates before the data."""

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,10 +23,7 @@ Order = Literal["wxyz", "xyzw"]
 order of the columns."""
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
-
-
-SMALL_RAD = 1e-3
-"""Angle below which the next term of a series is rounding error."""
+SMALL_RAD = 1e-3  # angle below which the next term of a series is rounding error
 
 
 def skew(v: ArrayLike) -> np.ndarray:
@@ -35,6 +32,21 @@ def skew(v: ArrayLike) -> np.ndarray:
     m = np.zeros((*v.shape[:-1], 3, 3))
     m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return m - np.swapaxes(m, -1, -2)
+
+
+def by_pose(by_point: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """Return derivatives (..., 6) by a left perturbation of the pose that turned points to ``turned`` (..., 3) before
+    its translation, from those (..., 3) by the points."""
+    return np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+
+
+def perspective(xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ideal coordinates (..., 2) of points (..., 3) before a camera, and their derivatives (..., 2, 3)."""
+    depth = xyz_camera[..., 2:]
+    by_point = np.zeros((*depth.shape[:-1], 2, 3))
+    by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth[..., 0]
+    by_point[..., 2] = -xyz_camera[..., :2] / depth**2
+    return xyz_camera[..., :2] / depth, by_point
 
 
 def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
@@ -63,8 +75,41 @@ else:
     Turn = Array  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
 
 
+class _Frames:
+    """What one transform a_from_b and a stack of them share; all arrays with leading axes (...)."""
+
+    __slots__ = ()
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    @classmethod
+    def _of(cls, rotation: np.ndarray, translation: np.ndarray) -> Self:
+        """Return the transform of a product of rotations, which is one."""
+        made = object.__new__(cls)
+        for name, values in (("rotation", rotation), ("translation", translation)):
+            object.__setattr__(made, name, values)
+            values.flags.writeable = False
+        return made
+
+    def matrix(self) -> np.ndarray:
+        """Return the homogeneous matrix, (..., 4, 4)."""
+        m = np.zeros((*self.translation.shape[:-1], 4, 4))
+        m[..., :3, :3], m[..., :3, 3], m[..., 3, 3] = self.rotation, self.translation, 1.0
+        return m
+
+    def moved(self, step: np.ndarray) -> Self:
+        """Return the transform after a left perturbation (..., 6), rad and mm: exp(w) R, t + dt."""
+        turn = Rotation.from_rotvec(step[..., :3]).as_matrix()
+        return self._of(turn @ self.rotation, self.translation + step[..., 3:])
+
+    def difference(self, other: Self) -> np.ndarray:
+        """Return the motion (..., 6) from ``other`` to this: rotation vector (rad) and translation (mm) in frame a."""
+        turn = Rotation.from_matrix(self.rotation @ np.swapaxes(other.rotation, -1, -2)).as_rotvec()
+        return np.concatenate([turn, self.translation - other.translation], axis=-1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Rigid(ByValue):
+class Rigid(ByValue, _Frames):
     """A rigid transform a_from_b: ``xyz_a = rotation @ xyz_b + translation``.
 
     Parameters
@@ -91,16 +136,6 @@ class Rigid(ByValue):
         if deviation > 1e-12:  # projected onto SO(3), or a product of accepted rotations could fail the check above
             u, _, vt = np.linalg.svd(self.rotation)
             object.__setattr__(self, "rotation", frozen(u @ vt))
-
-    @classmethod
-    def _of(cls, rotation: np.ndarray, translation: np.ndarray) -> "Rigid":
-        """Return the transform of a product of rotations, which is one."""
-        made = object.__new__(cls)
-        object.__setattr__(made, "rotation", rotation)
-        object.__setattr__(made, "translation", translation)
-        rotation.flags.writeable = False
-        freeze(made, "translation", (3,), "translation")
-        return made
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> "Rigid":
@@ -148,12 +183,6 @@ class Rigid(ByValue):
         by_turn = np.eye(3) - skew(turn) / 2 + across * skew(turn) @ skew(turn)
         squares = np.concatenate([np.diag(by_turn @ covariance[:3, :3] @ by_turn.T), np.diag(covariance)[3:]])
         return np.sqrt(np.maximum(squares, 0))
-
-    def matrix(self) -> np.ndarray:
-        """Return the homogeneous 4×4 matrix."""
-        m = np.eye(4)
-        m[:3, :3], m[:3, 3] = self.rotation, self.translation
-        return m
 
     def inverse(self) -> "Rigid":
         """Return b_from_a."""
@@ -221,8 +250,8 @@ class Similarity(ByValue):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Poses(Brief):
-    """A stack of m transforms a_from_b.
+class Poses(Brief, _Frames):
+    """A stack of m transforms a_from_b; indexed by a number it gives one :class:`Rigid`.
 
     Parameters
     ----------
@@ -248,8 +277,8 @@ class Poses(Brief):
     def of(cls, transforms: Iterable[Rigid]) -> "Poses":
         """Return the stack of single transforms."""
         transforms = list(transforms)
-        rotation = np.array([t.rotation for t in transforms]).reshape(-1, 3, 3)
-        return cls(rotation, np.array([t.translation for t in transforms]).reshape(-1, 3))
+        rotation = np.array([t.rotation for t in transforms], float).reshape(-1, 3, 3)
+        return cls._of(rotation, np.array([t.translation for t in transforms], float).reshape(-1, 3))
 
     @classmethod
     def from_matrices(cls, matrices: ArrayLike) -> "Poses":
@@ -275,15 +304,14 @@ class Poses(Brief):
             )
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
-    def matrix(self) -> np.ndarray:
-        """Return the homogeneous matrices, (m, 4, 4)."""
-        m = np.tile(np.eye(4), (len(self), 1, 1))
-        m[:, :3, :3], m[:, :3, 3] = self.rotation, self.translation
-        return m
-
     def quaternions(self) -> np.ndarray:
         """Return the quaternions (m, 4), w first and not negative."""
         return Rotation.from_matrix(np.array(self.rotation)).as_quat(canonical=True)[:, [3, 0, 1, 2]]
+
+    @property
+    def dim(self) -> int:
+        """Number of unknowns of a pose."""
+        return 6
 
     def __len__(self) -> int:
         return len(self.translation)
@@ -296,20 +324,20 @@ class Poses(Brief):
         """Return one :class:`Rigid` for an integer, :class:`Poses` for a slice, mask or list."""
         if np.ndim(index) == 0 and not isinstance(index, slice):
             return Rigid(self.rotation[index], self.translation[index])
-        return Poses(self.rotation[index], self.translation[index])
+        return Poses._of(self.rotation[index], self.translation[index])
+
+    def __add__(self, other: "Poses") -> "Poses":
+        """Return these transforms, then those of ``other``."""
+        both = np.concatenate([self.rotation, other.rotation])
+        return Poses._of(both, np.concatenate([self.translation, other.translation]))
 
     def __iter__(self) -> Iterator[Rigid]:
         return (self[i] for i in range(len(self)))
 
-    def moved(self, step: np.ndarray) -> "Poses":
-        """Return the transforms after left perturbations (m, 6), rad and mm: exp(w) R, t + dt."""
-        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-        return Poses(turn @ self.rotation, self.translation + step[:, 3:])
-
     def inverse(self) -> "Poses":
         """Return b_from_a."""
         back = np.swapaxes(self.rotation, 1, 2)
-        return Poses(back, -np.einsum("mij,mj->mi", back, self.translation))
+        return Poses._of(back.copy(), -np.einsum("mij,mj->mi", back, self.translation))
 
     @overload
     def __matmul__(self, other: "Rigid | Poses") -> "Poses": ...
@@ -321,19 +349,15 @@ class Poses(Brief):
             translation = np.einsum(
                 "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi", self.rotation, other.translation
             )
-            return Poses(self.rotation @ other.rotation, translation + self.translation)
+            return Poses._of(self.rotation @ other.rotation, translation + self.translation)
         points = np.broadcast_to(np.asarray(other, float), self.translation.shape)
         return np.einsum("mij,mj->mi", self.rotation, points) + self.translation
 
     def __rmatmul__(self, other: Rigid) -> "Poses":
         if isinstance(other, Rigid):
-            return Poses(other.rotation @ self.rotation, self.translation @ other.rotation.T + other.translation)
+            translation = self.translation @ other.rotation.T + other.translation
+            return Poses._of(other.rotation @ self.rotation, translation)
         return NotImplemented
-
-    def difference(self, other: "Poses") -> np.ndarray:
-        """Return the motions (m, 6) from ``other`` to these: rotation vector (rad) and translation (mm) in frame a."""
-        turn = self.rotation @ np.swapaxes(other.rotation, 1, 2)
-        return np.hstack([Rotation.from_matrix(turn).as_rotvec(), self.translation - other.translation])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,6 @@ from stcal.geometry.least_squares import (
     Minima,
     Normal,
     NormalEquations,
-    PoseStack,
     block_diagonal,
     minimise,
     select_rows,
@@ -31,12 +30,11 @@ from stcal.geometry.plane import (
     Weighed,
     covariance_of_both,
     poses_of_plane,
-    step_between,
     two_minima,
     weigh,
     weights_of,
 )
-from stcal.geometry.rigid import ImageFit, Poses, Rigid, skew
+from stcal.geometry.rigid import ImageFit, Poses, Rigid, by_pose
 from stcal.io.cameras.model import CameraPrior
 from stcal.locate.layout import TargetLayout
 
@@ -89,7 +87,7 @@ class ProjectedCorners:
     before: np.ndarray
 
 
-def project(problem: PlanarProblem, poses: Poses | PoseStack) -> ProjectedCorners:
+def project(problem: PlanarProblem, poses: Poses) -> ProjectedCorners:
     """Returns the residuals of h poses, and their derivatives."""
     turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
     xyz = turned + poses.translation[:, None]
@@ -105,10 +103,10 @@ def normalised(turned: np.ndarray, xyz: np.ndarray) -> tuple[np.ndarray, np.ndar
     depth = np.where(np.abs(xyz[..., 2]) > NEAR_DEPTH, xyz[..., 2], NEAR_DEPTH)[..., None]
     uv = xyz[..., :2] / depth
     by_point = np.concatenate([np.broadcast_to(np.eye(2), (*uv.shape, 2)), -uv[..., None]], axis=-1) / depth[..., None]
-    return uv, by_point, np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+    return uv, by_point, by_pose(by_point, turned)
 
 
-def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
+def descent_near(problem: PlanarProblem, pose: Poses) -> Descend:
     """Returns the descent with residuals of single corners whitened near a pose by noise, shared and layout errors."""
     by_corner = project(problem, pose).by_corner[0]
     n = len(problem.xy)
@@ -119,8 +117,8 @@ def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
     full = noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
-    def descend(poses: PoseStack, huber: float) -> Minima:
-        def evaluate(poses: PoseStack) -> Normal:
+    def descend(poses: Poses, huber: float) -> Minima:
+        def evaluate(poses: Poses) -> Normal:
             view = project(problem, poses)
             return Normal.of((whiten @ view.residual[..., None])[..., 0], whiten @ view.by_pose, view.before, huber)
 
@@ -129,7 +127,7 @@ def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
     return descend
 
 
-def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Weighed:
+def weighed(problem: PlanarProblem, pose: Poses, weights: np.ndarray) -> Weighed:
     """Estimates a pose by image noise over Huber's ``weights`` (n,), shared errors, and the layout's covariance."""
     root = np.repeat(np.sqrt(weights), 2)
     noise = problem.noise / (root[:, None] * root)
@@ -138,7 +136,7 @@ def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Wei
     by_corner = block_diagonal(project(problem, pose).by_corner[0])
     full = (noise + by_corner @ problem.shape @ by_corner.T)[None]
 
-    def linearise(poses: PoseStack) -> NormalEquations:
+    def linearise(poses: Poses) -> NormalEquations:
         view = project(problem, poses)
         r, a = view.residual.reshape(1, -1, 1), view.by_pose.reshape(1, -1, 6)
         solved = np.linalg.solve(full, np.concatenate([a, r], axis=2))
@@ -148,7 +146,7 @@ def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Wei
 
     # A second solution that is far worse need not converge: it only shows that the first one is better.
     minimum = minimise(
-        pose, linearise, PoseStack.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
+        pose, linearise, Poses.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
     ).state
     view = project(problem, minimum)
     return weigh(view.residual, view.by_pose, full, minimum)
@@ -286,7 +284,7 @@ def locate(
     if not len(seen):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     problem = problem_of(seen, layout, camera, prior)
-    start = PoseStack.of(_start(problem, where))
+    start = Poses.of([_start(problem, where)])
     keep, outliers, all_corners = np.arange(len(seen)), [], problem
     failure = f"{where}: no pose found; check layout and camera file"
     while True:
@@ -373,9 +371,9 @@ def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: t
         pair = [weighed(problem, found.poses[[i]], weights.min(0)) for i in range(2)]
         delta = float(pair[1].chi2[0] - pair[0].chi2[0])
         better = int(delta < 0)
-        delta, second = abs(delta), pair[1 - better].poses.rigid(0)
+        delta, second = abs(delta), pair[1 - better].poses[0]
     best = weighed(problem, found.poses[[better]], weights[better])
-    pose = best.poses.rigid(0)
+    pose = best.poses[0]
     middle = pose @ np.append(problem.xy.mean(0), 0.0)
     offset = problem.in_px(problem.seen - problem.seen.mean(0))
     covariance = np.linalg.inv(best.normal[0])
@@ -407,7 +405,7 @@ def covering_both(pose: ObjPose) -> ObjPose:
     """Returns the pose with a covariance that also covers its second solution, weighted by the odds of both."""
     if pose.second is None:
         return pose
-    step = step_between(PoseStack.of(pose.camera_from_obj), PoseStack.of(pose.second))
+    step = pose.second.difference(pose.camera_from_obj)
     return replace(pose, covariance=covariance_of_both(pose.covariance, step, pose.delta_chi2))
 
 

@@ -9,6 +9,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import root_scalar
 
 from stcal.adjust.blocks import Huber, Vector
+from stcal.adjust.components import sigma_factor
 from stcal.adjust.engine import Adjustment, Solution
 from stcal.boards.design import UNIT_SQUARE, BoardView
 from stcal.boards.edges import corners_by_edges
@@ -16,12 +17,11 @@ from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import PoseStack, block_diagonal
+from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes, Told, found_amplitude
 from stcal.geometry.rigid import Poses, Rigid, align_rigid
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.geometry.variances import sigma_factor
 from stcal.locate.estimate import normalised
 from stcal.locate.layout import LayoutPlan, TargetLayout, in_obj, obj_from_plane
 from stcal.parallel import one_thread
@@ -108,7 +108,7 @@ class _Rows:
         focal = np.array([each.focal_px for each in images])[image]
         return cls(image, np.concatenate(seen).reshape(len(image), -1, 2), np.concatenate(noise), focal)
 
-    def off(self, poses: PoseStack, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def off(self, poses: Poses, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns projected minus seen corners, (r, 2c), of places ``xyz`` (r, c, 3) on the board, and the derivatives
         by the poses, (r, 2c, 6), and by the places, (r, c, 2, 3)."""
         rotation = poses.rotation[self.image]
@@ -122,7 +122,7 @@ class _Rows:
         values of the second block; ``derivatives`` : by them, from those by the places."""
         limit = length_limit(covariance.shape[-1], HUBER_TAIL)
 
-        def by_both(poses: PoseStack, second: Vector) -> tuple[np.ndarray, np.ndarray]:
+        def by_both(poses: Poses, second: Vector) -> tuple[np.ndarray, np.ndarray]:
             _, by_pose, by_place = self.off(poses, places(second))
             return by_pose, derivatives(by_place)
 
@@ -227,7 +227,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     """Minimises Huber's loss over 6m + 8n unknowns, poses eliminated. The board is the datum, exact but for how
     printers stretch and bend. Variance components (Förstner 1979) give a factor on its points' σ, and additional σ of
     tags. Raises ConvergenceError."""
-    layout, poses = _Layout.of(images), PoseStack.of(*(image.pose for image in images))
+    layout, poses = _Layout.of(images), Poses.of(image.pose for image in images)
     prints = Vector(np.zeros((1, len(layout.print.spread_mm))))
     values = {"pose": poses, "corners": Vector(start.reshape(-1, 8)), "print": prints}
     noise = layout.first_noise(values)

@@ -18,20 +18,17 @@ from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.read import save_camera
-from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile, new_dataset, write_images
+from stcal.synthetic.dataset import TruthFile, image_name, new_dataset, write_images
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
-DRAWING_PX = 2000
-"""Longer side of the drawing of a face, px."""
-CIRCLE_CORNERS = 360
-"""Corners of the polygon that a circle is drawn as."""
+DRAWING_PX = 2000  # longer side of the drawing of a face, px
+CIRCLE_CORNERS = 360  # corners of the polygon that a circle is drawn as
 SAMPLES, LATTICE = 13, 8
 """Samples of a pixel: a Fibonacci lattice, shifted at random from pixel to pixel. An edge along the pixel rows is then
 exactly in place; a grid of points would place it in steps."""
 EDGE_SIGMA_PX = 0.1
 """σ of the shift that ink, light and the camera's response give the edges of all tags alike."""
-BEND_MM = 0.02
-"""σ of a point of a printed face about its plane."""
+BEND_MM = 0.02  # σ of a point of a printed face about its plane
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 SHOWN_DEG, SQUARE_DEG = 60.0, 45.0
@@ -41,8 +38,7 @@ ENOUGH_VIEWS, ENOUGH_SQUARE = 5, 2
 """Number of photographs that show each face, and of those that show it squarely, as far as there are enough of them."""
 TRIALS, CHOICES = 2000, 24
 """Number of poses that are tried for a photograph, and number of suitable ones of which the best is taken."""
-BORDER = 0.01
-"""Free border of the image, in image widths: faces are not quite where the design has them."""
+BORDER = 0.01  # free border of the image, in image widths: faces are not quite where the design has them
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,16 +138,12 @@ class BodyScene:
 
 @require_arguments
 def body_camera(width: int) -> Camera:
-    """Returns a camera of medium focal length with a lens that distorts a little.
+    """Returns a camera of medium focal length with a lens that distorts a little, and images of 3:2.
 
     Parameters
     ----------
     width : int
-        Width of its images of 3:2, px.
-
-    Returns
-    -------
-    Camera
+        Width of its images, px.
     """
     height = round(width * 2 / 3)
     focal = 1.1 * width
@@ -176,11 +168,6 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
         The camera before which it is held, such as :func:`stcal.synthetic.body_camera` returns.
     options : BodyOptions, optional
         The defaults if None.
-
-    Returns
-    -------
-    BodyScene
-        True poses ``target_from_face`` and ``camera_from_target``, mm.
 
     Raises
     ------
@@ -215,7 +202,6 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions |
 
 
 def _in_first_face(poses: Mapping[str, Rigid]) -> dict[str, Rigid]:
-    """Returns poses of faces, by face id, in the frame of the first one."""
     first = next(iter(poses.values())).inverse()
     return {face_id: first @ pose for face_id, pose in poses.items()}
 
@@ -437,14 +423,9 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
     return np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
 
 
-def _image_name(image: int, image_format: str) -> str:
-    """Returns the name of a photograph: ``IMG_1000.jpg``."""
-    return f"IMG_{FIRST_IMAGE + image}.{image_format}"
-
-
 def body_truth(scene: BodyScene, image_format: str = "jpg") -> TruthFile:
     """Returns the truth of a body, with the pose of each photograph."""
-    poses = {_image_name(i, image_format): pose.matrix() for i, pose in enumerate(scene.camera_from_target)}
+    poses = {image_name("", i, image_format): pose.matrix() for i, pose in enumerate(scene.camera_from_target)}
     return TruthFile(
         unit="mm",
         reference_face=scene.target.faces[0].id,
@@ -463,7 +444,7 @@ def write_body(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Writes ``images/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml`` and ``truth.json`` of a body.
+    """Writes ``images/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml`` and ``truth.json``; returns the images' paths.
 
     Parameters
     ----------
@@ -471,19 +452,12 @@ def write_body(
         New or empty folder.
     scene : BodyScene
         Of :func:`stcal.synthetic.make_body_scene`.
-    image_format : str
-        ``jpg`` or ``png``.
-    jpeg_quality : int
-        Quality of JPEG, up to 100.
+    image_format, jpeg_quality : str, int
+        ``jpg`` or ``png``, and the quality of JPEG, up to 100.
     workers : int, optional
         Number of processes; one per core if None.
     progress : callable, optional
         Called with (done, total).
-
-    Returns
-    -------
-    list of Path
-        The images.
 
     Raises
     ------
@@ -497,7 +471,7 @@ def write_body(
         save_body(folder / "target.toml", scene.target)
         truth = json.dumps(body_truth(scene, image_format).content())
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-        drawings, paths = scene.drawings(), [folder / "images" / _image_name(i, image_format) for i in range(count)]
+        drawings, paths = scene.drawings(), [folder / "images" / image_name("", i, image_format) for i in range(count)]
         arguments = [(scene, i, drawings) for i in range(count)]
         write_images(render_body, paths, arguments, jpeg_quality, workers, progress)
     return paths

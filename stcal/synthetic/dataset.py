@@ -110,8 +110,8 @@ class TruthFile(ResultFile):
 
 
 def image_name(group: str, image: int, image_format: str = "jpg") -> str:
-    """Returns the name of an image inside ``images``: ``12/IMG_1000.jpg``."""
-    return f"{group}/IMG_{FIRST_IMAGE + image}.{image_format}"
+    """Returns the name of an image inside ``images``: ``12/IMG_1000.jpg``, ``IMG_1000.jpg`` without a group."""
+    return f"{group}/IMG_{FIRST_IMAGE + image}.{image_format}".removeprefix("/")
 
 
 def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
@@ -133,7 +133,7 @@ def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
 def render_all(
     scene: Scene, options: RenderOptions | None = None, workers: int | None = None
 ) -> dict[str, list[np.ndarray]]:
-    """Renders all photographs of a scene, as :func:`stcal.sfm.run` takes them.
+    """Returns all photographs of a scene, uint8 or uint16 by group, as :func:`stcal.sfm.run` takes them.
 
     Parameters
     ----------
@@ -143,11 +143,6 @@ def render_all(
         Appearance of the photographs; the defaults if None.
     workers : int, optional
         Number of processes that render; one per core by default.
-
-    Returns
-    -------
-    dict of list of (height, width) array
-        Grey images, uint8 or uint16, by group.
 
     Raises
     ------
@@ -198,25 +193,19 @@ def write_dataset(
 ) -> list[Path]:
     """Writes ``images/<group>/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml``, ``board.toml``, ``truth.json``.
 
+    Returns the paths of the images, in order.
+
     Parameters
     ----------
     folder : path
-        Folder of the data set. It is created if missing, and must be empty.
+        Folder of the data set, new or empty.
     scene : Scene
         Target, board, camera and views.
     render_options : RenderOptions, optional
         Appearance of the photographs; the defaults if None.
-    image_format : {"jpg", "png"}
-    jpeg_quality : int
-    workers : int, optional
-        Number of processes that render; one per core by default.
-    progress : callable, optional
-        Called with the number of images done, and the number of all images.
-
-    Returns
-    -------
-    list of Path
-        The images, in order.
+    image_format, jpeg_quality : {"jpg", "png"}, int
+    workers, progress : int, callable, optional
+        Number of processes, one per core by default; called with (done, total).
 
     Raises
     ------

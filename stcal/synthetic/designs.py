@@ -13,70 +13,32 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
-REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
-"""Groups of Zhang & Wei (2017), sec. 2."""
+REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))  # groups of Zhang & Wei (2017), sec. 2.
 
-# Drawings of the second design: id, x, y, radius in mm, in a drawing frame with the origin in a corner of the face.
-_TOP = [
-    ("A", 15, 16, 6.0),
-    ("B", 50, 18, 6.0),
-    ("C", 85, 14, 6.0),
-    ("D", 17, 60, 6.0),
-    ("E", 62, 55, 6.0),
-    ("F", 34, 38, 3.5),
-    ("G", 84, 50, 3.5),
-    ("H", 40, 84, 3.5),
-    ("I", 76, 82, 3.5),
-]
-_LEFT = [
-    ("p", 15, 26, 6.0),
-    ("q", 46, 15, 6.0),
-    ("r", 82, 40, 6.0),
-    ("s", 24, 82, 6.0),
-    ("t", 60, 78, 6.0),
-    ("u", 32, 52, 3.5),
-    ("v", 56, 44, 3.5),
-    ("w", 85, 80, 3.5),
-]
-_RIGHT = [
-    ("21", 20, 15, 6.0),
-    ("22", 82, 18, 6.0),
-    ("23", 18, 85, 6.0),
-    ("24", 50, 52, 6.0),
-    ("25", 52, 26, 3.5),
-    ("26", 68, 70, 3.5),
-    ("27", 34, 66, 3.5),
-    ("28", 86, 58, 3.5),
-    ("29", 74, 86, 3.5),
-]
-_EDGE_MM = 140.0
+DRAWINGS = {
+    "top": "A 15 16 6, B 50 18 6, C 85 14 6, D 17 60 6, E 62 55 6, F 34 38 3.5, G 84 50 3.5, H 40 84 3.5, I 76 82 3.5",
+    "left": "p 15 26 6, q 46 15 6, r 82 40 6, s 24 82 6, t 60 78 6, u 32 52 3.5, v 56 44 3.5, w 85 80 3.5",
+    "right": "21 20 15 6, 22 82 18 6, 23 18 85 6, 24 50 52 6, 25 52 26 3.5, 26 68 70 3.5, 27 34 66 3.5, 28 86 58 3.5, "
+    "29 74 86 3.5",
+}
+"""Circles of the second design, id, x, y and radius in mm, in a frame with the origin in a corner of the face."""
+EDGE_MM = 140.0
 
 
 def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
     """Returns a cube with dark circles on three white faces, a board with one larger corner dot, and nominal poses.
 
     It shares nothing with the reference design: face and circle ids, pattern, number of circles, radii, polarity, frame
-    circles and board all differ.
-
-    Returns
-    -------
-    target : TargetDesign
-    board : BoardDesign
-    poses : dict of Rigid
-        target_from_face by face id, mm. The target frame is the cube's own, with the origin at its centre.
+    circles and board all differ. The poses target_from_face, mm, by face id are in the cube's own frame, with the
+    origin at its centre.
     """
-    x, y, z = np.eye(3)
-    drawings = {
-        "top": (_TOP, ("A", "C", "D"), (x, y, z)),
-        "left": (_LEFT, ("q", "r", "s"), (y, z, x)),
-        "right": (_RIGHT, ("24", "22", "29"), (z, x, y)),
-    }
-    faces, poses = [], {}
-    for face_id, (circles, frame, axes) in drawings.items():
+    frames, faces, poses = (("A", "C", "D"), ("q", "r", "s"), ("24", "22", "29")), [], {}
+    for k, ((face_id, drawing), frame) in enumerate(zip(DRAWINGS.items(), frames, strict=True)):
+        rows = [row.split() for row in drawing.split(", ")]
+        circles = [(name, float(x), float(y), float(radius)) for name, x, y, radius in rows]
         face, drawing_from_face = face_of_drawing(face_id, circles, *frame)
-        middle = np.array([50.0, 50.0, 0.0])
-        rotation = np.column_stack(axes)
-        cube_from_drawing = Rigid(rotation, rotation @ ([0, 0, _EDGE_MM / 2] - middle))
+        rotation = np.roll(np.eye(3), k, axis=0)
+        cube_from_drawing = Rigid(rotation, rotation @ [-50.0, -50.0, EDGE_MM / 2])
         poses[face_id] = cube_from_drawing @ drawing_from_face
         faces.append(replace(face, rough_target_from_face=poses[face_id]))
     target = TargetDesign("second target", "dark", tuple(faces))
@@ -133,8 +95,7 @@ def tag_dodecahedron(
 
 
 MOST_WIDTH_MM = 10_000.0
-MIN_CELL_PX = 2.0
-"""Width of a tag's cell below which its corners are several times less exact."""
+MIN_CELL_PX = 2.0  # width of a tag's cell below which its corners are several times less exact
 
 
 Body = Literal["cube", "dodecahedron"]

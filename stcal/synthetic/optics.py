@@ -1,7 +1,4 @@
-"""Optics of simulated photographs: a thin lens with an aperture, and new exposures of a real photograph.
-
-An exposure has a time, uneven light, glare and a camera's response.
-"""
+"""Optics of simulated photographs: a thin lens with an aperture, and new exposures of a real photograph."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +12,10 @@ from stcal.geometry.camera import Camera
 
 SHARP_PX = 0.01
 """Radius of a circle of confusion below which nothing is blurred: it moves no centre by 1e-4 px."""
-WIDEST_PX = 20.0
-"""Largest circle of confusion that is rendered, radius: the time grows with its square."""
+WIDEST_PX = 20.0  # largest circle of confusion that is rendered, radius: the time grows with its square
 HIGHEST_WAVE = 3.0
 """Highest wave number that matters, in 1/σ of the Gaussian blur, which lets through 1 % of it."""
-LEAST_SIGMA_PX = 0.35
-"""σ of the blur by a pixel's own area, about 1/√12."""
+LEAST_SIGMA_PX = 0.35  # σ of the blur by a pixel's own area, about 1/√12
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +143,7 @@ def _moved(share: np.ndarray, source_from_square: np.ndarray) -> np.ndarray:
     return cv2.warpAffine(share, source_from_square, share.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
 
 
-DARKEST = 1e-3
-"""Least grey value, as a share of white. The photograph holds no information below."""
+DARKEST = 1e-3  # least grey value, as a share of white. The photograph holds no information below.
 
 
 FULL_WELL, READ_NOISE = 10_000.0, 8.0
@@ -158,19 +152,14 @@ FULL_WELL, READ_NOISE = 10_000.0, 8.0
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Light on a scene in addition to the light in its photograph.
+    """Light on a scene in addition to the light in its photograph; places and radii in image widths."""
 
-    ``stops`` : gradient in powers of two per width of the image, in direction ``angle_rad``; the light is unchanged at
-    ``pivot`` (x, y), in image widths; ``glare`` : light added in the middle of a spot, in units of the photograph's
-    white; ``glare_at``, ``glare_radius`` : place (x, y) and Gaussian radius of the spot, in image widths.
-    """
-
-    stops: float = 0.0
-    angle_rad: float = 0.0
-    pivot: tuple[float, float] = (0.5, 0.5)
-    glare: float = 0.0
+    stops: float = 0.0  # gradient in powers of two per width of the image
+    angle_rad: float = 0.0  # direction of the gradient
+    pivot: tuple[float, float] = (0.5, 0.5)  # (x, y) at which the light is unchanged
+    glare: float = 0.0  # light added in the middle of a spot, in units of the photograph's white
     glare_at: tuple[float, float] = (0.5, 0.5)
-    glare_radius: float = 0.1
+    glare_radius: float = 0.1  # of a Gaussian
 
 
 def expose(
@@ -189,16 +178,7 @@ def expose(
     rng, exposures = np.random.default_rng(seed), []
     # The light within one grey level is unknown. It is spread evenly, or a darker exposure would show the levels.
     grey = (photograph + rng.random(photograph.shape, np.float32)) / np.float32(256)
-    scene = lit(np.maximum(grey, np.float32(DARKEST)), light or Light())
-    for time in times:
-        electrons = scene * np.float32(time * FULL_WELL)
-        noise = np.sqrt(electrons + np.float32(READ_NOISE**2)) * rng.standard_normal(scene.shape, np.float32)
-        exposures.append(np.rint(255 * np.clip((electrons + noise) / np.float32(FULL_WELL), 0, 1)).astype(np.uint8))
-    return exposures
-
-
-def lit(scene: np.ndarray, light: Light) -> np.ndarray:
-    """Returns the light of a scene (height, width) with gradient and glare."""
+    scene, light = np.maximum(grey, np.float32(DARKEST)), light or Light()
     height, width = scene.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) / width, np.arange(height, dtype=np.float32) / width)
     if light.stops:
@@ -208,12 +188,8 @@ def lit(scene: np.ndarray, light: Light) -> np.ndarray:
     if light.glare:
         squared_distance = (x - np.float32(light.glare_at[0])) ** 2 + (y - np.float32(light.glare_at[1])) ** 2
         scene = scene + np.float32(light.glare) * np.exp(-squared_distance / np.float32(2 * light.glare_radius**2))
-    return scene
-
-
-def moved(photograph: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:
-    """Returns the photograph shifted in the image, as if the camera had turned a little."""
-    matrix = np.array([[1, 0, shift_px[0]], [0, 1, shift_px[1]]], float)
-    return cv2.warpAffine(
-        photograph, matrix, photograph.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
-    )
+    for time in times:
+        electrons = scene * np.float32(time * FULL_WELL)
+        noise = np.sqrt(electrons + np.float32(READ_NOISE**2)) * rng.standard_normal(scene.shape, np.float32)
+        exposures.append(np.rint(255 * np.clip((electrons + noise) / np.float32(FULL_WELL), 0, 1)).astype(np.uint8))
+    return exposures

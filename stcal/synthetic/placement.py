@@ -14,15 +14,12 @@ MAX_FACE_TILT_RAD = np.radians(67)
 MAX_BOARD_TILT_RAD = np.radians(50)
 CANDIDATES = 600
 CANDIDATES_PER_VIEW = 8
-AT_ONCE = 600
-"""Number of views tested at a time, which bounds the memory."""
+AT_ONCE = 600  # number of views tested at a time, which bounds the memory
 PLACES = 60
 GOOD_SHARE = 0.5
 """A place of the board is accepted at once if this share of the views of both faces also shows the board."""
-IMAGE_MARGIN = 0.03
-"""Free border of the image, in image widths."""
-BODY_GAP = 0.01
-"""Free space between target and board in the image, in focal lengths."""
+IMAGE_MARGIN = 0.03  # free border of the image, in image widths
+BODY_GAP = 0.01  # free space between target and board in the image, in focal lengths
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,10 +22,8 @@ WALL_REACH = 3.0
 """Half the side of the wall, in widths of the view. An oblique view reaches far; cells out of view cost little."""
 LAMP_REACH_MM = 1000.0
 TABLE_BELOW_MM = 50.0
-FAINT = 0.12
-"""Reflectance of the table that clutter has, which shows circles alone."""
-SHIFT = 4
-"""Fractional bits of cv2's fixed-point pixels."""
+FAINT = 0.12  # reflectance of the table that clutter has, which shows circles alone
+SHIFT = 4  # fractional bits of cv2's fixed-point pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +62,8 @@ def draw_background(
     A thin lens blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs.
     """
     g, look = scene.groups[group], look_of(scene.target.polarity)
-    painter = _Painter(scene.camera, g.camera_from_target[image], look.wall)
+    canvas = np.full((scene.camera.height, scene.camera.width), round(look.wall), np.uint8)
+    painter = _Painter(scene.camera, g.camera_from_target[image], canvas)
     if clutter:
         rng = np.random.default_rng([scene.seed, scenery_seed, list(scene.groups).index(group)])
         wall = _wall(scene, g, rng)
@@ -86,23 +85,20 @@ def draw_background(
     return blur_evenly(painter.canvas, near_px)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Painter:
     """Canvas in the image of a camera, for polygons in the target frame, perhaps as a mirror shows them."""
 
-    def __init__(
-        self,
-        camera: Camera,
-        camera_from_target: Rigid,
-        level: float,
-        canvas: np.ndarray | None = None,
-        mirror: tuple[np.ndarray, float] | None = None,  # unit normal, and distance from the origin
-        tone: Callable[[float], float] = lambda level: level,  # the canvas's grey level of a thing's
-    ):
-        self.camera, self.camera_from_target = camera, camera_from_target
-        self.canvas = np.full((camera.height, camera.width), round(level), np.uint8) if canvas is None else canvas
-        self.mirror, self.tone = mirror, tone
-        # where the eye stands, target frame
-        self.centre = self._mirrored(camera_from_target.inverse().translation)
+    camera: Camera
+    camera_from_target: Rigid
+    canvas: np.ndarray
+    mirror: tuple[np.ndarray, float] | None = None  # unit normal, and distance from the origin
+    tone: Callable[[float], float] = lambda level: level  # the canvas's grey level of a thing's
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Where the eye stands, target frame."""
+        return self._mirrored(self.camera_from_target.inverse().translation)
 
     def _mirrored(self, xyz: np.ndarray) -> np.ndarray:
         if self.mirror is None:
@@ -196,8 +192,7 @@ def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: fl
         return
     look, board, plate = look_of(scene.target.polarity), scene.board, look_of(scene.board.polarity)
     own = look.checker[1]
-    view = painter.camera, painter.camera_from_target
-    mirror = _Painter(*view, own, painter.canvas, (up, at), lambda level: own + share * (level - own))
+    mirror = replace(painter, mirror=(up, at), tone=lambda level: own + share * (level - own))
     if whole:
         _draw_body(mirror, scene, look)
     for face in scene.target.faces:
@@ -224,13 +219,10 @@ def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
 
 SUBSAMPLES = 8
 """Number of cells per pixel side at a rim. A cell that the rim crosses counts by its linear share."""
-FINE = 4
-"""Number of squares per pixel side on which a circle is blurred."""
+FINE = 4  # number of squares per pixel side on which a circle is blurred
 RIM_REACH_PX = 1.5
-SPREAD_BY_DISTORTION = 1.3
-"""Largest factor by which the lens distortion may enlarge a circle of confusion."""
-HOLE_SHARE = 0.4
-"""Radius of the hole in a dot that tells a board from its turns, in radii of the dot."""
+SPREAD_BY_DISTORTION = 1.3  # largest factor by which the lens distortion may enlarge a circle of confusion
+HOLE_SHARE = 0.4  # radius of the hole in a dot that tells a board from its turns, in radii of the dot
 STEEP_RAD = np.radians(75)
 FULL_SCALE = 255.0
 

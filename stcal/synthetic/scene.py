@@ -23,8 +23,7 @@ FACE_MARGIN_MM = 15.0
 """How far a plate is assumed to reach beyond the rims of its circles, mm, if the design states no outline."""
 BOARD_MARGIN_MM = 15.0
 SENSOR_WIDTH_MM = 22.3
-FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM
-"""Focal length in image widths of a 24 mm lens on this sensor."""
+FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM  # focal length in image widths of a 24 mm lens on this sensor
 CONVEX_TOLERANCE_MM = 5.0
 
 
@@ -122,20 +121,15 @@ class Scene(Brief):
 
     Parameters
     ----------
-    target, board : TargetDesign, BoardDesign
-        Designs of what is photographed.
-    camera : Camera
-        The camera, as it really is.
+    target, board, camera : TargetDesign, BoardDesign, Camera
+        Designs of what is photographed, and the camera as it really is.
     target_from_face : dict of Rigid
-        Three-point frames through the circles as really placed, by face id. The first face of the design is the
-        reference: its frame is the target frame.
+        Three-point frames through the circles as really placed, by face id; that of the first face is the target frame.
     circles_target : dict of (3,) array
         Centres of the circles as really placed, by label, target frame, mm.
     groups : dict of Group
         Board and views of each group, by name.
-    seed : int
-        Of all that is random, noise of the photographs included.
-    margin_mm : float
+    seed, margin_mm : int, float
         As in the options.
     """
 
@@ -177,24 +171,16 @@ def make_scene(
     nominal: dict[str, Rigid] | None = None,
     camera: Camera | CameraModel | None = None,
 ) -> Scene:
-    """Makes a scene; the same arguments give the same scene.
+    """Returns target, board and camera as really made, and views of groups; the same arguments give the same scene.
 
     Parameters
     ----------
-    options : SceneOptions, optional
-    target : TargetDesign, optional
-        Design of the target; the reference design by default.
-    board : BoardDesign, optional
-        Design of the board; the reference board by default.
+    options, target, board : optional
+        Options, and designs of target and board; the defaults and the reference designs if None.
     nominal : dict of Rigid, optional
         Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
     camera : Camera, optional
         The camera, in place of the one that the options describe.
-
-    Returns
-    -------
-    Scene
-        Target, board and camera as really made, and the views of each group.
 
     Raises
     ------
@@ -227,7 +213,12 @@ def make_scene(
     made = rng if options.body_seed is None else np.random.default_rng(options.body_seed)
     target_from_face, circles = _made_target(target, nominal, options, made)
     _check_convex(target, target_from_face, options.margin_mm)
-    camera = _made_camera(options, made)
+    focal = options.focal_px or FOCAL_PER_WIDTH * options.width
+    centre = (np.array([options.width, options.height]) - 1) / 2
+    centre = centre + options.centre_sigma * options.width * made.standard_normal(2)
+    lens = np.pad(options.distortion, (0, 8 - len(options.distortion)))
+    kind = "FULL_OPENCV" if lens[4:].any() else "OPENCV" if lens.any() else "PINHOLE"
+    camera = Camera(options.width, options.height, [focal, focal], centre, lens, colmap_model=kind)
     common = board.sigma_mm * made.standard_normal((len(board.labels()), 3)) if options.one_board else None
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
@@ -273,17 +264,6 @@ def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[
     return {face: target_from_any @ frame for face, frame in frames.items()}, circles
 
 
-def _made_camera(options: SceneOptions, rng) -> Camera:
-    focal = options.focal_px or FOCAL_PER_WIDTH * options.width
-    centre = (np.array([options.width, options.height]) - 1) / 2
-    centre = centre + options.centre_sigma * options.width * rng.standard_normal(2)
-    distortion = np.zeros(8)
-    distortion[: len(options.distortion)] = options.distortion
-    model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    camera = Camera(options.width, options.height, np.array([focal, focal]), centre, distortion)
-    return Camera.of(camera, model)
-
-
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
     pairs = combinations([face.id for face in target.faces], 2)
     normal = {face: pose.rotation[:, 2] for face, pose in target_from_face.items()}
@@ -304,8 +284,7 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
 
 def _made_group(pair, target, board, camera, target_from_face, circles, options, errors, rng) -> Group:
     """Returns a group; ``errors`` : of the places of the board's dots, mm, drawn here if None."""
-    name = group_name(pair)
-    labels = [target.face(face).labels() for face in pair]
+    name, labels = group_name(pair), [target.face(face).labels() for face in pair]
     normals = [target_from_face[face].rotation[:, 2] for face in pair]
     axes = viewing_axes(normals[0], normals[1], f"group {name}")
     dots = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
@@ -396,8 +375,7 @@ def _seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
     return replace(scene, camera=Camera.of(camera, "OPENCV_FISHEYE"), groups=groups)
 
 
-MAX_FOUND_TILT_RAD = np.radians(70)
-"""Largest tilt at which a circle must be found, in rad."""
+MAX_FOUND_TILT_RAD = np.radians(70)  # largest tilt at which a circle must be found, in rad
 MAX_SHOWN_TILT_RAD = np.radians(89)
 RIM_POINTS = 72
 NEAR_BORDER = 3.0
@@ -447,20 +425,13 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     size = np.array([scene.camera.width, scene.camera.height])
     centre = scene.camera.project(xyz)
     shown = (tilt <= MAX_SHOWN_TILT_RAD) & ((centre > -0.5) & (centre < size - 0.5)).all(1)
-    whole = _whole(scene.camera, xyz, normal, radius, centre)
+    reach = NEAR_BORDER * scene.camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
+    whole = ((centre > reach[:, None]) & (centre < size - 1 - reach[:, None])).all(1)
+    near = np.flatnonzero(~whole)  # the rims near the border alone are computed
+    rim = scene.camera.project(rim_points(xyz[near], normal[near], radius[near]))
+    whole[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
     findable = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
     return ImageCircles(tuple(labels), xyz, normal, radius, tilt, centre, findable).rows(shown)
-
-
-def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.ndarray:
-    """Returns the mask of the circles whose rims lie in the image. Only rims near its border are computed."""
-    size = np.array([camera.width, camera.height])
-    reach = NEAR_BORDER * camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
-    inside = ((centre_px > reach[:, None]) & (centre_px < size - 1 - reach[:, None])).all(1)
-    near = np.flatnonzero(~inside)
-    rim = camera.project(rim_points(xyz[near], normal[near], radius[near]))
-    inside[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
-    return inside
 
 
 def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.adjust import Adjustment, Huber, Vector
 from stcal.errors import InputError
-from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.rigid import Poses
 
 SIGMA, IMAGES, POINTS = 0.002, 6, 12
 
@@ -17,7 +17,7 @@ def problem(eliminate: str, rng, loss: Huber | None = None, numerical: bool = Fa
     """Poses of a camera of unknown focal length that see points, of which three are fixed; one of both eliminated."""
     xyz = np.column_stack([rng.uniform(-1, 1, (POINTS, 3))])
     turn = Rotation.from_rotvec(0.3 * rng.standard_normal((IMAGES, 3))).as_matrix()
-    poses = PoseStack(turn, np.tile([0, 0, 4.0], (IMAGES, 1)))
+    poses = Poses(turn, np.tile([0, 0, 4.0], (IMAGES, 1)))
     image, point = (index.ravel() for index in np.indices((IMAGES, POINTS)))
 
     def at(poses, points):

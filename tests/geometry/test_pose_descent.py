@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from stcal.geometry.least_squares import Normal, PoseStack, block_diagonal, descend
+from stcal.geometry.least_squares import Normal, block_diagonal, descend
 from stcal.geometry.rigid import Poses, Rigid, skew
 
 RNG = np.random.default_rng(0)
@@ -34,7 +34,7 @@ def evaluate(poses, huber=3.0):
 def test_every_start_reaches_its_minimum():
     """To σ: 12 points, 24 − 6 degrees of freedom, χ² below 45 but for one in 2000; starts off by up to 17°, 30 mm."""
     far = [Rigid.exp([*RNG.normal(0, 0.1, 3), *RNG.normal(0, 10, 3)]) @ TRUTH for _ in range(5)]
-    found = descend(evaluate, PoseStack.of(*far), 1e-8)
+    found = descend(evaluate, Poses.of(far), 1e-8)
     assert found.settled.all()
     assert 5 < found.cost.min() <= found.cost.max() < 45
     assert np.ptp(found.poses.translation, axis=0) == pytest.approx(0, abs=1e-4)
@@ -53,7 +53,7 @@ def test_hopeless_rivals_are_left():
         gradient[:, 3] = 0.05 * away
         return Normal(cost, normal, gradient, np.zeros((2, 1)))
 
-    start = PoseStack(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
+    start = Poses(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)))
     followed = descend(evaluate, start, 1e-9).poses.translation[:, 0]
     left = descend(evaluate, start, 1e-9, hopeless=500.0).poses.translation[:, 0]
     assert followed[1] > 8

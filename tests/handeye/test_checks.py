@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import StcalError
-from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.data.pairs import Loop
@@ -462,7 +461,7 @@ def test_covariances_of_turned_views_are_carried_along():
     truth = simulated(np.random.default_rng(14), 6)
     seen = truth.pairs.camera_from_board[3] @ HALF
     steps = np.eye(6) * np.repeat([1e-5, 1e-2], 3)
-    moved = Poses.of(perturbed(seen, step) @ HALF for step in steps)
+    moved = Poses.of(seen.moved(step) @ HALF for step in steps)
     by = moved.difference(Poses.of([seen @ HALF] * 6)).T / np.repeat([1e-5, 1e-2], 3)
     board = [*truth.pairs.camera_from_board]
     board[3] = seen

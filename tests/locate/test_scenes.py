@@ -12,7 +12,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.locate.exposures import find_scenes
 from stcal.locate.layout import TargetLayout
 from stcal.locate.scenes import LocateOptions, locate_scene, run
-from stcal.synthetic.optics import Light, expose, moved
+from stcal.synthetic.optics import Light, expose
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", CAMERA.width, CAMERA.height, "test")
@@ -121,7 +121,9 @@ def test_scenes_of_a_folder(tmp_path, plain):
 
 @pytest.mark.parametrize("shift", [1.0, 8.0])
 def test_a_scene_that_moved(located, plain, shift):
-    result = located([*expose(plain, [0.5, 1.0]), *expose(moved(plain, (shift, 0)), [0.7])])
+    matrix = np.array([[1.0, 0, shift], [0, 1, 0]])
+    turned = cv2.warpAffine(plain, matrix, plain.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    result = located([*expose(plain, [0.5, 1.0]), *expose(turned, [0.7])])
     assert result.verdict.decision == "reject"
     assert result.verdict.reasons[0].startswith("the scene moved between")
     assert result.pose is None

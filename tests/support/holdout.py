@@ -8,9 +8,8 @@ import numpy as np
 
 from stcal.boards.tags import Tags, corner_blocks
 from stcal.errors import DegenerateError, StcalError
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, refine_planar_pose
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.locate.estimate import SeenTags, locate, merge
 from stcal.locate.layout import LayoutPlan, TargetLayout
 from stcal.locate.layout_calibration import CalibratedLayout, CalibrationImages, calibrate
@@ -94,7 +93,7 @@ def _trial(images: CalibrationImages, i: int, part: SeenTags, layout: TargetLayo
         return PoseTrial(name, rows, "reject")
     error = (pose @ truth.inverse()).angle_rad()
     middle = Rigid(np.eye(3), np.append(layout.corners_mm[part.rows].reshape(-1, 2).mean(0), 0.0))
-    second = mirrored(PoseStack.of(truth), middle).rigid(0)
+    second = mirrored(Poses.of([truth]), middle)[0]
     shift = float(np.linalg.norm(pose.translation - truth.translation))
     return PoseTrial(
         name, rows, verdict.decision, error, shift, error / sigma, (pose @ second.inverse()).angle_rad() < error

@@ -7,12 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.joint import covariance_of
+from stcal.sfm.adjust.joint import unmoved
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.measurement.pose import TargetPose
@@ -44,7 +43,7 @@ def known_target(scene: Scene, noise_px: float) -> KnownTarget:
         scene.reference_face, scene.target_from_face, scene.circles_target, dict.fromkeys(scene.groups, Rigid())
     )
     models = true_models(scene, observe(scene, noise_px, np.random.default_rng(scene.seed)))
-    joint = covariance_of(models, scene.board, scene.camera, FLATNESS_MM)
+    joint = unmoved(models, scene.board, scene.camera, FLATNESS_MM).result(1.0)
     covariance = derivatives(joint, start, scene.target, "plane").all_circles_covariance(joint.covariance_mm2)
     value, vector = np.linalg.eigh((covariance + covariance.T) / 2)
     keep = value > 1e-12 * value[-1]
@@ -103,6 +102,6 @@ def is_flipped(pose: TargetPose, truth: Rigid, towards: Rigid) -> bool:
     error = pose_error(pose.camera_from_target, truth)
     if error @ np.linalg.solve(pose.covariance, error) < chi2.isf(1e-6, 6):
         return False
-    second = mirrored(PoseStack.of(truth), towards).rotation[0]
+    second = mirrored(Poses.of([truth]), towards).rotation[0]
     off = Rigid(pose.camera_from_target.rotation @ second.T).angle_rad()
     return off < float(np.linalg.norm(error[:3]))

@@ -7,9 +7,9 @@ import numpy as np
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import Minimum, NormalEquations, minimise
 from stcal.geometry.plane import camera_from_plane, fit_homography
-from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.handeye.data.pairs import HandEyePoses
 
 LEAST_CORNERS = 4
@@ -167,8 +167,8 @@ def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.n
     rotated = view.xyz_board @ camera_from_board.rotation.T
     xyz = rotated + camera_from_board.translation
     by_point = camera.projection_jacobian(xyz)
-    by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
-    return np.einsum("kab,kb->ka", weight, camera.project(xyz) - view.xy_px).ravel(), (weight @ by_pose).reshape(-1, 6)
+    residual = np.einsum("kab,kb->ka", weight, camera.project(xyz) - view.xy_px).ravel()
+    return residual, (weight @ by_pose(by_point, rotated)).reshape(-1, 6)
 
 
 def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEquations]:
@@ -190,7 +190,7 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
             return NormalEquations.impossible(6)
         return NormalEquations.of(*whitened(view, camera, pose))
 
-    minima = [minimise(start, linearise, perturbed) for start in starts]
+    minima = [minimise(start, linearise, Rigid.moved) for start in starts]
     best = min(minima, key=lambda minimum: (not minimum.converged, minimum.linear.cost))
     return best.required(name, "take the image out")
 

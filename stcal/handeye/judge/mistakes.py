@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.explain import Candidate, explain
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid, other_axes, skew
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
@@ -405,7 +404,7 @@ PUT_RIGHT = 0.2
 
 def tilted(poses: Poses) -> Poses:
     """Returns camera_from_board with the depths about the board's origin mirrored along the line of sight."""
-    other = mirrored(PoseStack(np.asarray(poses.rotation), np.asarray(poses.translation)), Rigid())
+    other = mirrored(poses, Rigid())
     return Poses(other.rotation, np.asarray(poses.translation))
 
 

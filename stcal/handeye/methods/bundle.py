@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from stcal.adjust.blocks import Block, Huber, Vector
 from stcal.adjust.engine import Adjustment
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import length_limit
 
@@ -134,7 +133,7 @@ class Corners:
 
     def problem(self) -> Adjustment:
         """Returns the adjustment: X, Z, the scale, and what else has a σ."""
-        a, one = Adjustment(sigma=dict(self.sigma)), PoseStack.of(Rigid())
+        a, one = Adjustment(sigma=dict(self.sigma)), Poses.of([Rigid()])
         on: list[tuple[Block, np.ndarray | None]] = [(a.block("x", one), None), (a.block("z", one), None)]
         on.append((a.block("scale", Vector(np.ones((1, 1))), fixed=[] if self.with_scale else [0]), None))
         if self.basis.shape[1]:
@@ -149,7 +148,7 @@ class Corners:
                 a.factor(_linear(np.eye(len(rows)), rows, arm[rows]), on[-1:], kind=name)
         m = len(self.base_from_flange)
         if self.robot is not None or self.sigma["robot_mm"]:
-            on.append((a.block("robot", PoseStack.of(*[Rigid()] * m)), self.view))
+            on.append((a.block("robot", Poses.of([Rigid()] * m)), self.view))
             by_itself, kinds = np.tile(np.eye(6), (m, 1, 1)), np.repeat(ROBOT, 3).tolist() if self.robot is None else ""
             root, off = by_itself if self.robot is None else self.robot, [(on[-1][0], np.arange(m))]
             a.factor(errors, off, derivatives=lambda robot: [by_itself], root=root, kind=kinds, loss=Huber(POSE))
@@ -174,7 +173,7 @@ class Corners:
 
     def start(self, x: Rigid, z: Rigid, scale: float) -> dict[str, Any]:
         """Returns the values of the unknowns at the start."""
-        given = {"x": PoseStack.of(x), "z": PoseStack.of(z), "scale": Vector(np.full((1, 1), scale))}
+        given = {"x": Poses.of([x]), "z": Poses.of([z]), "scale": Vector(np.full((1, 1), scale))}
         return {block.name: block.start for block in self.problem().blocks} | given
 
     def bundle(self, values: Mapping[str, Any]) -> Bundle:
@@ -190,7 +189,7 @@ class Corners:
         if "camera" in values:
             camera = camera.with_parameters(camera.parameters() + self.basis @ values["camera"].array[0])
         corners = values["board"].array if "board" in values else self.xyz_board
-        x, z = values["x"].rigid(0), values["z"].rigid(0)
+        x, z = values["x"][0], values["z"][0]
         return Bundle(x, z, flange, corners, camera, float(values["scale"].array[0, 0]), arm)
 
     def camera_parts(self) -> list[tuple[str, np.ndarray]]:
@@ -259,7 +258,7 @@ class Corners:
         return dict.fromkeys((name for name, _ in self.camera_parts()), 1.0)
 
 
-def errors(robot: PoseStack) -> np.ndarray:
+def errors(robot: Poses) -> np.ndarray:
     """Returns what poses of a robot err (m, 6): rotation vectors, rad, and translations, mm."""
     return np.hstack([Rotation.from_matrix(robot.rotation).as_rotvec(), robot.translation])
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
-from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid, skew
 from stcal.handeye.data.pairs import Motions
 
@@ -179,5 +179,5 @@ def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
 
 def polish(objective: Objective, x: Rigid) -> Rigid:
     """Returns the minimum of the objective next to X; raises ConvergenceError."""
-    minimum = minimise(x, objective.linear, perturbed, least_gain=EXACT)
+    minimum = minimise(x, objective.linear, Rigid.moved, least_gain=EXACT)
     return minimum.required("differential evolution", "check the poses that fit worst").state

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stcal.adjust.components import component_variances
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
-from stcal.geometry.variances import component_variances
 from stcal.handeye.data.pairs import Loop
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}

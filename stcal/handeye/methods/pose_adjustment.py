@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
 from stcal.geometry.clusters import ByClusters, by_clusters
-from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import Loop
@@ -38,7 +38,7 @@ class LoopState:
 
     def moved(self, step: np.ndarray) -> "LoopState":
         """Returns the state after left perturbations of X and Z and a change of the scale, (12,) or (13,)."""
-        x, z = (perturbed(a, s) for a, s in ((self.mount_from_camera, step[:6]), (self.stand_from_board, step[6:12])))
+        x, z = (a.moved(s) for a, s in ((self.mount_from_camera, step[:6]), (self.stand_from_board, step[6:12])))
         return LoopState(x, z, self.scale + (step[12] if len(step) > 12 else 0.0))
 
 

@@ -11,7 +11,7 @@ from scipy.optimize import fminbound, least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.explain import Candidate, explain
-from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Poses, Rigid, align_rigid, best_rotations, skew
 from stcal.io.poses.rotations import EXPLAINS
 from stcal.io.table import LENGTHS, UNIT_WORDS
@@ -238,7 +238,7 @@ def _base_and_points(
         minimum = minimise(
             (base, points, np.zeros(len(information))),
             linearise,
-            lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
+            lambda at, step: (at[0].moved(step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
             least_damping=REGULAR,
             settled=SETTLED,
             max_steps=ROUNDS,

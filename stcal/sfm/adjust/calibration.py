@@ -18,6 +18,7 @@ from stcal.io.toml import LEAST
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
+from stcal.sfm.adjust.equations import UNKNOWN_SHAPES
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.network import free_network
@@ -26,8 +27,7 @@ from stcal.sfm.adjust.scale import Scale, find_scale
 from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px, result_of, with_differences
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
-FLATNESS_MM = 0.02
-"""σ of the circles off the plane of their face where none is stated."""
+FLATNESS_MM = 0.02  # σ of the circles off the plane of their face where none is stated
 MOST_FLATNESS_MM = 1e6
 Solve = Literal["joint", "chain", "paper"]
 
@@ -126,19 +126,12 @@ def calibrate(
     prior: CameraPrior | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Calibrate the target from the groups' models (lengths not yet in mm, eccentricity corrections settled).
+    """Calibrates the target from the groups' models (lengths not yet in mm, eccentricity corrections settled).
 
     ``prior`` : intrinsics of the camera as observations, for options that refine them; ``progress`` : called with
-    (``faces``, done, total) after the chain, each joint adjustment, and the covariances.
-
-    Raises
-    ------
-    ScaleError
-        A group's board is not mapped.
-    MappingError
-        No face is mapped, the reference face is not mapped, or a face is not linked to it.
-    ConvergenceError
-        The adjustment finds no minimum.
+    (``faces``, done, total) after the chain, each joint adjustment, and the covariances. ScaleError: a group's board is
+    not mapped. MappingError: no face is mapped, or the reference face is not, or nothing is linked to it.
+    ConvergenceError: there is no minimum.
     """
     published = options.solve == "paper"
     prior = prior if options.refine_camera else None
@@ -295,16 +288,14 @@ def _adjust_all(
     camera the factors, are computed again before each."""
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]
-    current, shape_factors = camera, (1.0, 1.0, 1.0)
+    current, shape_factors = camera, UNKNOWN_SHAPES
     for last in [False] * (rounds - 1) + [True]:
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
         models = [with_sigma(replace(m, covariance_px2=c), factors) for m, c in zip(models, covariances, strict=True)]
         settled = EXACTLY if last else NEAR
         state = adjusted(models, board, camera, options.flatness_mm, prior, current, None, shape_factors, settled)
-        own = state.setting
-        shape_factors = own.print_factor, own.bend_factor, own.print_amplitude
-        models, current = state.models, state.camera
+        shape_factors, models, current = state.setting.factors, state.models, state.camera
         step(None)
         if prior is not None:
             unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]

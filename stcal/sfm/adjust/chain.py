@@ -159,7 +159,6 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
 
 
 def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
-    """Returns reference_from_face along one chain."""
     pose = {(face.group, face.face): face.group_from_face for face in faces}
     way, groups = chain
     result = Rigid()

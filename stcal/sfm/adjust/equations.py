@@ -3,7 +3,7 @@ has poses of its cameras, dots, and a pose of its board of its own."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,11 +12,10 @@ from stcal.adjust.engine import Adjustment, Joined
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.normal_equations import free_motions
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.print_modes import AMPLITUDES
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.faces import Shape
@@ -26,10 +25,8 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 
 CIRCLES, DOTS, BOARD, SHAPE, CAMERA, POSES = "circles", "dots", "board", "shape", "camera", "poses"
 """Names of blocks; those of a group end with its name. The first three are kinds of rows, too."""
-SHARED = CIRCLES, CAMERA, SHAPE
-"""Blocks that all groups share, the last if the board keeps its shape."""
-FREE_DIRECTIONS = 6
-"""Number of free directions: a rigid motion of the world changes nothing."""
+SHARED = CIRCLES, CAMERA, SHAPE  # blocks that all groups share, the last if the board keeps its shape
+FREE_DIRECTIONS = 6  # number of free directions: a rigid motion of the world changes nothing
 
 
 def normalised(model: GroupModel, camera: Camera) -> np.ndarray:
@@ -84,9 +81,9 @@ class Group:
     def values(self) -> dict[str, Any]:
         """Returns its own unknowns at the start."""
         return {
-            self.name(POSES): PoseStack.of(*self.model.camera_from_model),
+            self.name(POSES): Poses.of(self.model.camera_from_model),
             self.name(DOTS): Vector(self.model.xyz_model[self.dots]),
-            self.name(BOARD): PoseStack.of(self.model_from_board),
+            self.name(BOARD): Poses.of([self.model_from_board]),
         }
 
     def at(self, values: Mapping[str, Any]) -> MetricModel:
@@ -98,7 +95,7 @@ class Group:
 
     def board_at(self, values: Mapping[str, Any]) -> Rigid:
         """Returns model_from_board at a state."""
-        return values[self.name(BOARD)].rigid(0)
+        return values[self.name(BOARD)][0]
 
     def board_residual(self, values: Mapping[str, Any]) -> np.ndarray:
         """Returns the adjusted dots minus the design, (e, 3), board frame, mm."""
@@ -115,6 +112,18 @@ class Group:
         return np.flatnonzero(np.isin(self.model.point_index, self.circles if kind == CIRCLES else self.dots))
 
 
+class ShapeFactors(NamedTuple):
+    """Factors on the stated σ of faces of known shape, in their plane and off it, and ``amplitude`` of the smooth
+    deviations of their prints."""
+
+    in_plane: float = 1.0
+    off_plane: float = 1.0
+    amplitude: float = AMPLITUDES[0]
+
+
+AS_STATED, UNKNOWN_SHAPES = ShapeFactors(), ShapeFactors(amplitude=1.0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
     """Constants of one minimisation."""
@@ -128,9 +137,7 @@ class Setting:
     basis: np.ndarray  # (16, q) derivative of the camera's parameters by those that are adjusted
     prior: np.ndarray
     huber: float
-    print_factor: float = 1.0  # on the stated σ of faces of known shape, in their plane
-    bend_factor: float = 1.0  # off their plane
-    print_amplitude: float = AMPLITUDES[0]  # of the smooth deviations of their prints
+    factors: ShapeFactors = AS_STATED
 
     def own_sigma_mm(self) -> float:
         return self.board.sigma_mm * float(np.sqrt(1 - self.common))
@@ -181,56 +188,42 @@ class Setting:
         return Joined(parts, SHARED if self.common else SHARED[:2], free_directions)
 
     def _add(self, a: Adjustment, group: Group, values: Mapping[str, Any], circles: Block, camera: Block) -> None:
-        """Adds the rows of a group."""
         model, few = group.model, is_dots_first_cheaper(group)
         poses = a.block(group.name(POSES), values[group.name(POSES)], eliminate=not few)
-        of_circles = replace(model, labels=self.labels, xyz_model=values[CIRCLES].array, point_index=group.place())
-        self._reproject(a, of_circles.observed(group.observations(CIRCLES)), (circles, poses, camera), CIRCLES)
+        points = [(CIRCLES, self.labels, circles)]
+        if len(group.dots):
+            dots = a.block(group.name(DOTS), values[group.name(DOTS)], eliminate=few)
+            points.append((DOTS, tuple(model.labels[i] for i in group.dots), dots))
+        for kind, labels, block in points:
+            own = replace(model, labels=labels, xyz_model=values[block.name].array, point_index=group.place())
+            on = (block, poses, camera)[: 2 + bool(self.basis.shape[1])]
+            seen = own.observed(group.observations(kind))
+            reproject(a, seen, on, self.camera_at, self.basis, kind=kind, loss=Huber(self.huber))
         if not len(group.dots):
             return
-        dots = a.block(group.name(DOTS), values[group.name(DOTS)], eliminate=few)
-        board = a.block(group.name(BOARD), values[group.name(BOARD)])
-        of_dots = replace(
-            model,
-            labels=tuple(model.labels[i] for i in group.dots),
-            xyz_model=values[group.name(DOTS)].array,
-            point_index=group.place(),
-        )
-        self._reproject(a, of_dots.observed(group.observations(DOTS)), (dots, poses, camera), DOTS)
-        on = [(dots, np.arange(len(group.dots))), (board, None)]
+        # Dots minus their places on the board, mm: dot = pose · (design + shape).
+        cells = np.searchsorted(self.cells(), group.cells)
+        ends = [(dots, np.arange(len(group.dots))), (a.block(group.name(BOARD), values[group.name(BOARD)]), None)]
         if self.common:
-            on.append((a.blocks[SHARED.index(SHAPE)], np.searchsorted(self.cells(), group.cells)))
-        gap = _Gap(group.design, on[-1][1])
-        a.factor(gap.residuals, on, self.own_sigma_mm(), gap.derivatives, kind=BOARD)
+            ends.append((a.blocks[SHARED.index(SHAPE)], cells))
 
-    def _reproject(self, a: Adjustment, model: MetricModel, on: tuple[Block, Block, Block], kind: str) -> None:
-        used = on if self.basis.shape[1] else on[:2]
-        reproject(a, model, used, self.camera_at, self.basis, kind=kind, loss=Huber(self.huber))
+        def turned(board: Poses, shape: tuple[Vector, ...]) -> np.ndarray:
+            return (group.design + shape[0].array[cells] if shape else group.design) @ board.rotation[0].T
+
+        def residuals(dots: Vector, board: Poses, *shape: Vector) -> np.ndarray:
+            return dots.array - turned(board, shape) - board.translation
+
+        def derivatives(dots: Vector, board: Poses, *shape: Vector) -> list[np.ndarray]:
+            unit = np.broadcast_to(np.eye(3), (len(dots), 3, 3))
+            by_board = np.concatenate([skew(turned(board, shape)), -unit], axis=2)
+            return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]
+
+        a.factor(residuals, ends, self.own_sigma_mm(), derivatives, kind=BOARD)
 
 
 def is_dots_first_cheaper(group: Group) -> bool:
     """True if the cameras of a group are fewer unknowns than its dots."""
     return 6 * len(group.model.images) < 3 * len(group.dots)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Gap:
-    """Dots minus their places on a board, mm: dot = pose · (design + shape)."""
-
-    design: np.ndarray  # (e, 3)
-    cells: np.ndarray | None  # (e,) in the common shape
-
-    def _turned(self, board: PoseStack, shape: tuple[Vector, ...]) -> np.ndarray:
-        places = self.design + shape[0].array[self.cells] if shape else self.design
-        return places @ board.rotation[0].T
-
-    def residuals(self, dots: Vector, board: PoseStack, *shape: Vector) -> np.ndarray:
-        return dots.array - self._turned(board, shape) - board.translation
-
-    def derivatives(self, dots: Vector, board: PoseStack, *shape: Vector) -> list[np.ndarray]:
-        unit = np.broadcast_to(np.eye(3), (len(self.design), 3, 3))
-        by_board = np.concatenate([skew(self._turned(board, shape)), -unit], axis=2)
-        return [unit, by_board, *(np.broadcast_to(-board.rotation[0], unit.shape) for _ in shape)]
 
 
 @dataclass(slots=True, eq=False)
@@ -302,22 +295,16 @@ def shapes(xyz: np.ndarray, setting: Setting) -> Iterator[Shape]:
     """Yields the faces of known shape, with their stated σ; none for a state that a step has sent to infinity."""
     if not np.isfinite(xyz).all():
         return
-    off, known = setting.bend_factor * setting.flatness_mm, known_points(setting.labels, setting.board)
+    off, known = setting.factors.off_plane * setting.flatness_mm, known_points(setting.labels, setting.board)
     # What the sizes of all prints have in common counts once: each alone may be off by more.
     alone = float(np.sqrt(len(known)))
     for face, members in known:
         design = face.places_mm(setting.labels[i].circle for i in members)
-        within = setting.print_factor * (face.sigma_mm or 1.0)
+        within = setting.factors.in_plane * (face.sigma_mm or 1.0)
         weight = np.tile([within**-2, within**-2, 0.0 if np.isinf(off) else off**-2], (len(members), 1))
         try:
-            yield Shape.of(
-                members,
-                design,
-                xyz[members],
-                weight,
-                alone * face.size_sigma,
-                setting.print_amplitude,
-            )
+            size_sigma = alone * face.size_sigma
+            yield Shape.of(members, design, xyz[members], weight, size_sigma, setting.factors.amplitude)
         except DegenerateError:  # corners on a line
             continue
 

@@ -125,8 +125,7 @@ class Shape:
 
 
 FrameKind = Literal["plane", "three-point"]
-MIN_KNOWN = 3
-"""Smallest number of points of a face of known shape that place it."""
+MIN_KNOWN = 3  # smallest number of points of a face of known shape that place it
 MIN_PLACING = 4
 """Smallest number of mapped circles that can place the others of their face. Three determine the placement, a fourth
 shows how good it is."""
@@ -164,7 +163,7 @@ def with_unmapped(
     missing = missing_frame_circles(face, xyz)
     if not missing:
         return dict(xyz)
-    known = {circle: _designed(face, circle) for circle in face.ids} if known is None else known
+    known = dict(zip(face.ids, face.places_mm(face.ids), strict=True)) if known is None else known
     common = [circle for circle in xyz if circle in known]
     names = " and ".join(f"{face.id}:{circle}" for circle in missing)
     if len(common) < MIN_PLACING:
@@ -182,10 +181,6 @@ def with_unmapped(
     return dict(xyz) | {circle: model_from_known @ known[circle] for circle in missing}
 
 
-def _designed(face: FaceDesign, circle: str) -> np.ndarray:
-    return np.append(face.xy_mm[face.ids.index(circle)], 0.0)
-
-
 def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
     """Returns the in-plane σ per axis of circles (3,) about the design, pooled over rigid fits of the faces."""
     square, redundancy = 0.0, 0
@@ -193,14 +188,12 @@ def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray])
         centres = {label.circle: place for label, place in xyz.items() if label.face == face.id}
         if len(centres) < MIN_PLACING:
             continue
+        mapped, design = np.array(list(centres.values())), face.places_mm(centres)
         try:
-            fit = align_rigid(
-                np.array(list(centres.values())), np.array([_designed(face, circle) for circle in centres])
-            )
+            away = align_rigid(mapped, design).inverse() @ mapped - design
         except DegenerateError:
             continue
-        deviations = [(fit.inverse() @ place - _designed(face, circle))[:2] for circle, place in centres.items()]
-        square += float((np.array(deviations) ** 2).sum())
+        square += float((away[:, :2] ** 2).sum())
         redundancy += 2 * len(centres) - 3
     return float(np.sqrt(square / redundancy)) if redundancy else 0.0
 
@@ -214,8 +207,7 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
         raise DegenerateError(
             "E-FACE-FRAME-CIRCLES", f"face {face.id}: frame circle {names} not mapped; add views that show it"
         )
-    frames = face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)
-    return Rigid(frames.rotation[0], frames.translation[0])
+    return face_frames(face, tuple(xyz), np.array(list(xyz.values()))[None], kind, towards)[0]
 
 
 def face_frames(

@@ -27,8 +27,10 @@ from stcal.sfm.adjust.equations import (
     DOTS,
     FREE_DIRECTIONS,
     SHAPE,
+    UNKNOWN_SHAPES,
     Group,
     Setting,
+    ShapeFactors,
     bars,
     coordinates,
     normalised,
@@ -40,14 +42,10 @@ from stcal.sfm.adjust.equations import (
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import MetricModel
 
-Values = dict[str, Any]
-"""Unknowns by block."""
-ShapeFactors = tuple[float, float, float]
-"""``print_factor``, ``bend_factor`` and ``print_amplitude`` of faces of known shape."""
+Values = dict[str, Any]  # unknowns by block
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
-NEAR = 1e-8
-"""The same where a result is the start of another one: a hundredth of σ."""
+NEAR = 1e-8  # the same where a result is the start of another one: a hundredth of σ
 NEARLY = 1e-6
 """The same where parts of the images are compared, or the σ of faces of known shape are estimated: a tenth of σ."""
 MAX_STEPS = 100
@@ -97,7 +95,7 @@ class JointResult:
     def sigma_scale(self) -> float:
         """Factor in the covariances: ``enlarged`` times σ₀, which counts as 1 at least, as the single groups have
         confirmed the σ of the centres."""
-        return self.enlarged * scale_of(self.sigma0)
+        return self.enlarged * max(1.0, self.sigma0)
 
     def with_larger_sigma(self, factor: float) -> "JointResult":
         """Returns the result with all σ multiplied by a factor."""
@@ -130,14 +128,26 @@ class Adjusted:
         """The camera."""
         return self.setting.camera(self.solution.values)
 
-    def result(self) -> JointResult:
-        """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``."""
-        return _result(self.setting, self.solution, self.move_px).with_larger_sigma(self.enlarged)
+    def result(self, sigma0: float | None = None) -> JointResult:
+        """Returns the result with the covariances of independent errors; see ``uncertainty.result_of``. ``sigma0``: of
+        the residuals if None."""
+        return _result(self.setting, self.solution, self.move_px, sigma0).with_larger_sigma(self.enlarged)
 
-
-def adjust_jointly(models: Sequence[MetricModel], board: BoardDesign, camera: Camera) -> JointResult:
-    """Returns the result of :func:`adjusted` with the covariances at its minimum."""
-    return adjusted(models, board, camera).result()
+    def extensible(self) -> "Extensible":
+        """Returns the covariances of the points; σ₀ is 1."""
+        setting, solution = self.setting, self.solution
+        points, to_circles, c = {}, {}, solution.values[CIRCLES].array.size
+        for group, part in zip(setting.groups, solution.whole, strict=True):
+            blocks = {block.name: block for block in part.problem.blocks}
+            dots = blocks.get(group.name(DOTS))
+            together = part.together(dots) if dots else part.inverse
+            place = np.empty((len(group.model.labels), 3), int)
+            place[group.circles] = 3 * group.circle_place[:, None] + np.arange(3)
+            place[group.dots] = part.kept + np.arange(3 * len(group.dots)).reshape(-1, 3)
+            row = np.concatenate([place.ravel(), np.arange(part.kept)[part.places[CAMERA]]])
+            points[group.model.group] = together[np.ix_(row, row)]
+            to_circles[group.model.group] = together[row, :c]
+        return Extensible(self.camera, setting.basis, solution.inverse[:c, :c], points, to_circles)
 
 
 def adjusted(
@@ -149,7 +159,7 @@ def adjusted(
     start: Camera | None = None,  # of the intrinsics
     # share of the board's variance common to all groups; no residual is then down-weighted
     common: float | None = None,
-    factors: ShapeFactors = (1.0, 1.0, 1.0),  # of an earlier result
+    factors: ShapeFactors = UNKNOWN_SHAPES,  # of an earlier result
     settled: float = EXACTLY,  # largest predicted decrease of the last step, as a share of χ²
 ) -> Adjusted:
     """Adjusts metric models that share one frame. The dots show whether the board kept its shape between the groups
@@ -171,13 +181,8 @@ def adjust_part(
     # Of a single group, the variance of its board is the same whatever share of it other groups have.
     common = whole.board_common if len(models) > 1 else 0.0
     setting, values = _start(models, board, whole.camera, flatness_mm, None, common)
-    setting = replace(
-        setting,
-        huber=HUBER * _robust_sigma(setting, values),
-        print_factor=whole.print_factor,
-        bend_factor=whole.bend_factor,
-        print_amplitude=whole.print_amplitude,
-    )
+    factors = ShapeFactors(whole.print_factor, whole.bend_factor, whole.print_amplitude)
+    setting = replace(setting, huber=HUBER * _robust_sigma(setting, values), factors=factors)
     return replace(_minimise(setting, values, NEARLY), differ=whole.differ)
 
 
@@ -185,19 +190,16 @@ SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
 """Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
 """Degrees of freedom that the stated σ of such faces are worth, in addition to their deviations."""
-LEAST_FACTOR = 0.1
-"""Smallest such factor: print may be better than stated, but is never exact."""
+LEAST_FACTOR = 0.1  # smallest such factor: print may be better than stated, but is never exact
 
 
 def _with_shape_factors(setting: Setting, values: Values, factors: ShapeFactors) -> tuple[Setting, Values]:
     """Returns the state near its minimum with the σ of faces of known shape that belong to it."""
-    names = ("print_factor", "bend_factor", "print_amplitude")
-    setting = replace(setting, **dict(zip(names, factors, strict=True)))
+    setting = replace(setting, factors=factors)
     for _ in range(SHAPE_ROUNDS):
-        minimum = _descent(setting, values, NEARLY)
-        before, values, factors = factors, minimum.state, _shape_factors(setting, minimum.linear)
-        setting = replace(setting, **dict(zip(names, factors, strict=True)))
-        if np.abs(np.log(np.divide(factors, before))).max() < SETTLED_FACTOR:
+        minimum, before = _descent(setting, values, NEARLY), setting.factors
+        values, setting = minimum.state, replace(setting, factors=_shape_factors(setting, minimum.linear))
+        if np.abs(np.log(np.divide(setting.factors, before))).max() < SETTLED_FACTOR:
             break
     return setting, values
 
@@ -213,24 +215,24 @@ def _shape_factors(setting: Setting, solution: JoinedSolution) -> ShapeFactors:
         normalised_square = shape.weight * shape.off_mm**2
         square += [normalised_square[:, :2].sum(), normalised_square[:, 2].sum()]
         freedom += [left[:, :2].sum(), left[:, 2].sum()]
-        prints.append(shape.told(own, setting.print_amplitude))
-    before = np.array([setting.print_factor, setting.bend_factor])
+        prints.append(shape.told(own, setting.factors.amplitude))
+    before = np.array(setting.factors[:2])
     variance = (before**2 * square + PRIOR_FREEDOM) / (np.maximum(freedom, 0) + PRIOR_FREEDOM)
     within, off = np.maximum(np.sqrt(variance), LEAST_FACTOR).tolist()
-    return within, off, found_amplitude(prints, setting.print_amplitude)
+    return ShapeFactors(within, off, found_amplitude(prints, setting.factors.amplitude))
 
 
-def covariance_of(
+def unmoved(
     models: Sequence[MetricModel],
     board: BoardDesign,
     camera: Camera,
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     common: float = 0.0,
-) -> JointResult:
-    """Returns the result of :func:`adjust_jointly` for models at their true positions, which do not move; σ₀ is 1."""
+) -> Adjusted:
+    """Returns the adjustment of models at their true positions, which do not move; arguments as of :func:`adjusted`."""
     setting, values = _start(models, board, camera, flatness_mm, prior, common)
-    return _result(setting, setting.joined(values).at(values), 0.0, 1.0)
+    return Adjusted(setting, setting.joined(values).at(values), 0.0)
 
 
 def basis_of(prior: CameraPrior | None) -> np.ndarray:
@@ -240,7 +242,7 @@ def basis_of(prior: CameraPrior | None) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extensible:
-    """The circle covariance of :func:`covariance_of`, prepared for one more view, for any number of images."""
+    """The circle covariance of an adjustment, prepared for one more view, for any number of images."""
 
     camera: Camera
     basis: np.ndarray  # (16, q) derivative of its parameters by those that are adjusted
@@ -257,35 +259,6 @@ class Extensible:
         return (half**2).sum(0)
 
 
-def extensible(
-    models: Sequence[MetricModel],
-    board: BoardDesign,
-    camera: Camera,
-    flatness_mm: float | None = None,
-    prior: CameraPrior | None = None,
-    common: float = 0.0,
-) -> Extensible:
-    """Returns the :class:`Extensible` covariance of models; arguments as of :func:`covariance_of`."""
-    setting, values = _start(models, board, camera, flatness_mm, prior, common)
-    return points_of(setting, setting.joined(values).at(values))
-
-
-def points_of(setting: Setting, solution: JoinedSolution) -> Extensible:
-    """Returns the covariances of the points of an adjustment; σ₀ is 1."""
-    points, to_circles, c = {}, {}, solution.values[CIRCLES].array.size
-    for group, part in zip(setting.groups, solution.whole, strict=True):
-        blocks = {block.name: block for block in part.problem.blocks}
-        dots = blocks.get(group.name(DOTS))
-        together = part.together(dots) if dots else part.inverse
-        place = np.empty((len(group.model.labels), 3), int)
-        place[group.circles] = 3 * group.circle_place[:, None] + np.arange(3)
-        place[group.dots] = part.kept + np.arange(3 * len(group.dots)).reshape(-1, 3)
-        row = np.concatenate([place.ravel(), np.arange(part.kept)[part.places[CAMERA]]])
-        points[group.model.group] = together[np.ix_(row, row)]
-        to_circles[group.model.group] = together[row, :c]
-    return Extensible(setting.camera(solution.values), setting.basis, solution.inverse[:c, :c], points, to_circles)
-
-
 def _start(
     models,
     board: BoardDesign,
@@ -295,7 +268,7 @@ def _start(
     common: float = 0.0,
     start: Camera | None = None,
 ) -> tuple[Setting, Values]:
-    """Returns a setting without down-weighting, and the start; ``common`` : see :func:`covariance_of`."""
+    """Returns a setting without down-weighting, and the start."""
     labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
     weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
     groups = tuple(_group(model, board, labels) for model in models)
@@ -373,7 +346,6 @@ def _group(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ..
 
 
 def _robust_sigma(setting: Setting, values: Values) -> float:
-    """Returns the robust σ of the normalised residuals per axis."""
     camera = setting.camera(values)
     length = np.concatenate([np.linalg.norm(normalised(g.at(values), camera), axis=1) for g in setting.groups])
     return max(robust_sigma(length, 2), 1e-6)
@@ -396,13 +368,7 @@ def _common_share(setting: Setting, values: Values) -> float:
     return 0.0 if share < max(MIN_COMMON, 3 / np.sqrt(count)) else min(share, MAX_COMMON)
 
 
-def scale_of(sigma0: float) -> float:
-    """Returns the factor on σ by which residuals of ``sigma0`` times their σ enlarge the covariances."""
-    return max(1.0, sigma0)
-
-
 def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: float | None = None) -> JointResult:
-    """Returns the result with its covariances."""
     values, groups, camera = solution.values, setting.groups, setting.camera(solution.values)
     models = tuple(group.at(values) for group in groups)
     xyz = values[CIRCLES].array
@@ -415,7 +381,7 @@ def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: 
     redundancy = observations - unknowns + FREE_DIRECTIONS
     if sigma0 is None:
         sigma0 = float(np.sqrt(solution.cost / max(redundancy, 1)))
-    covariance = scale_of(sigma0) ** 2 * solution.inverse
+    covariance = max(1.0, sigma0) ** 2 * solution.inverse
     intrinsics = solution.parts[0].places[CAMERA]
     return JointResult(
         models,
@@ -431,7 +397,5 @@ def _result(setting: Setting, solution: JoinedSolution, move_px: float, sigma0: 
         {model.group: robust_weights(model, camera, setting.huber) for model in models},
         redundancy,
         move_px,
-        setting.print_factor,
-        setting.bend_factor,
-        setting.print_amplitude,
+        *setting.factors,
     )

@@ -136,24 +136,17 @@ def free_network(model: GroupModel, camera: Camera) -> Network:
     place = 3 * np.arange(p)[:, None] + np.arange(3)
     normal[place[:, :, None], place[:, None]] += points
     covariance = constrained_inverse(normal, free_motions(model.xyz_model, scale=True))
-    cofactor = np.eye(2) - _leverage(model, a, b, reduction.inverse, reduction.from_kept, covariance)
-    right_of_points = point_right.ravel() - reduction.right
-    return Network(
-        model, residual, a, b, reduction.inverse, coupling, pose_right, right_of_points, covariance, cofactor
-    )
-
-
-def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.ndarray:
-    """Returns the cofactors of each adjusted observation, (n, 2, 2)."""
-    p = len(model.labels)
-    weighted = eliminated @ covariance
-    pose = inverse + weighted @ np.swapaxes(eliminated, 1, 2)
-    mixed = weighted.reshape(len(model.images), 6, p, 3)[model.image_index, :, model.point_index]
+    # cofactors of each adjusted observation, (n, 2, 2)
+    inverse, weighted = reduction.inverse, reduction.from_kept @ covariance
+    pose = inverse + weighted @ np.swapaxes(reduction.from_kept, 1, 2)
+    mixed = weighted.reshape(m, 6, p, 3)[model.image_index, :, model.point_index]
     blocks = covariance.reshape(p, 3, p, 3)[np.arange(p), :, np.arange(p)]
-    b_transposed = np.swapaxes(b, 1, 2)
-    cross = a @ mixed @ b_transposed
+    cross = a @ mixed @ np.swapaxes(b, 1, 2)
     of_poses = a @ pose[model.image_index] @ np.swapaxes(a, 1, 2)
-    return of_poses - cross - np.swapaxes(cross, 1, 2) + b @ blocks[model.point_index] @ b_transposed
+    of_points = b @ blocks[model.point_index] @ np.swapaxes(b, 1, 2)
+    cofactor = np.eye(2) - (of_poses - cross - np.swapaxes(cross, 1, 2) + of_points)
+    right = point_right.ravel() - reduction.right
+    return Network(model, residual, a, b, inverse, coupling, pose_right, right, covariance, cofactor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

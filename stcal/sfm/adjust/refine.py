@@ -12,9 +12,8 @@ from stcal.adjust.engine import Adjustment
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import PARAMETER_NAMES, Camera
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset, fit_plane
-from stcal.geometry.rigid import skew
+from stcal.geometry.rigid import Poses, by_pose
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import Label
 from stcal.sfm.adjust.scale import find_scale
@@ -23,8 +22,7 @@ from stcal.sfm.data.model import MIN_POINTS, GroupModel, M, Outlier, WorldModel
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 MAX_STEPS = 50
-DAMPING = 1e-10
-"""Relative damping, which holds the seven free directions of the world."""
+DAMPING = 1e-10  # relative damping, which holds the seven free directions of the world
 NO_PARAMETERS = np.zeros((len(PARAMETER_NAMES), 0))
 
 
@@ -36,7 +34,7 @@ def adjust(model: M, camera: Camera) -> M:
             f"group {model.group}: no two images have {MIN_POINTS} circles or corners in common; add images, until two "
             "show each face beside a neighbour",
         )
-    a, poses = Adjustment(), PoseStack.of(*model.camera_from_model)
+    a, poses = Adjustment(), Poses.of(model.camera_from_model)
     few = 2 * len(model.images) <= len(model.labels)  # the larger part of the unknowns is eliminated
     cameras = a.block("poses", poses, eliminate=not few)
     points = a.block("points", Vector(model.xyz_model), eliminate=few)
@@ -60,32 +58,31 @@ def reproject(
     point, image, measured_px = model.point_index, model.image_index, model.corrected_px()
 
     @lru_cache(maxsize=2)
-    def seen(points: Vector, poses: PoseStack) -> np.ndarray:
+    def seen(points: Vector, poses: Poses) -> np.ndarray:
         return np.einsum("nij,nj->ni", poses.rotation[image], points.array[point]) + poses.translation[image]
 
-    def residuals(points: Vector, poses: PoseStack, *lens: Vector) -> np.ndarray:
+    def residuals(points: Vector, poses: Poses, *lens: Vector) -> np.ndarray:
         xyz = seen(points, poses)
         behind = (xyz[:, 2] <= 0).any()
         return np.full_like(measured_px, np.inf) if behind else camera_at(*lens).project(xyz) - measured_px
 
-    def derivatives(points: Vector, poses: PoseStack, *lens: Vector) -> list[np.ndarray]:
+    def derivatives(points: Vector, poses: Poses, *lens: Vector) -> list[np.ndarray]:
         xyz, camera, own = seen(points, poses), camera_at(*lens), poses[image]
-        by_pose, by_point = jacobians(xyz, own.rotation, own.translation, camera)
-        return [by_point, by_pose, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
+        of_poses, by_point = jacobians(xyz, own.rotation, own.translation, camera)
+        return [by_point, of_poses, *(camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens)]
 
     root = model.whiten(np.tile(np.eye(2), (len(image), 1, 1)))
     a.factor(residuals, list(zip(on, (point, image, None), strict=False)), derivatives=derivatives, root=root, **known)
 
 
-def placed(model: M, poses: PoseStack, points: Vector) -> M:
+def placed(model: M, poses: Poses, points: Vector) -> M:
     """Returns the model with these poses and points."""
-    rigid = tuple(poses.rigid(i) for i in range(len(poses)))
-    return replace(model, camera_from_model=rigid, xyz_model=points.array)
+    return replace(model, camera_from_model=tuple(poses), xyz_model=points.array)
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Returns the derivatives of the projections (px) by poses, left perturbed, (n, 2, 6), and by points, (n, 2, 3)."""
-    own = PoseStack.of(*model.camera_from_model)[model.image_index]
+    own = Poses.of(model.camera_from_model)[model.image_index]
     return jacobians(model.xyz_camera(), own.rotation, own.translation, camera)
 
 
@@ -94,12 +91,11 @@ def jacobians(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns :func:`projection_jacobians` of points (n, 3) in cameras with poses (n, 3, 3), (n, 3)."""
     by_camera = camera.projection_jacobian(xyz)
-    return np.concatenate([-by_camera @ skew(xyz - translation), by_camera], axis=2), by_camera @ rotation
+    return by_pose(by_camera, xyz - translation), by_camera @ rotation
 
 
 MAX_ROUNDS = 20
-SETTLED_PX = 1e-5
-"""Largest change of corrections that have settled, in px: far below any centring noise."""
+SETTLED_PX = 1e-5  # largest change of corrections that have settled, in px: far below any centring noise
 OUTLIER_RMS = 6.0
 """Limit of a residual, as a multiple of the residuals' robust RMS length, √2 σ. Observations that exceed it, and twice
 this multiple of their own σ, are named and left out."""

@@ -23,8 +23,7 @@ prior of the share that all views of a kind have in common, which the views dete
 BLUR_SHARE_BY_TILT = 0.05
 """σ by which this share grows with the tangent of the tilt, which looks like a rim: it is 0.00 to 0.02 for circles that
 face the camera, 0.05 at 50° and 0.04 to 0.13 at 62° in rendered scenes (circles of 8 px and more)."""
-LEAST_SIGMA_MM = 0.003
-"""Smallest σ of a rim: what else the light of a circle adds."""
+LEAST_SIGMA_MM = 0.003  # smallest σ of a rim: what else the light of a circle adds
 DOME_BY_TILT = 0.04
 """The same of a dome's effect on radii, which is that of one step. In 30 rendered scenes that lack 10 to 40 % of the
 light at the rim, the mean square of the error over σ is 0.8."""

@@ -14,10 +14,8 @@ from stcal.labels import CircleLabel, Label, dot_cells
 from stcal.sfm.data.model import ImageObservations, WorldModel
 
 MIN_DOTS = 4
-EDGE_SIGMA_PX = 0.1
-"""σ of the shift that all edges of all tags share."""
-MIN_CORNERS = 3
-"""Smallest number of corners that determine the scale of a face of known shape."""
+EDGE_SIGMA_PX = 0.1  # σ of the shift that all edges of all tags share
+MIN_CORNERS = 3  # smallest number of corners that determine the scale of a face of known shape
 ScaleSource = Literal["board", "faces", "distances", "drawing"]
 
 
@@ -81,7 +79,12 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
             "E-SCALE-COLLINEAR", f"{where}: the mapped board dots lie in one line; show more rows of the board"
         ) from error
     spread = np.sqrt(((xyz_board - xyz_board.mean(0)) ** 2).sum())
-    mean_ratio, rows = _by_rows(xyz_board, xyz_world, cells[:, 0])
+    # λ by Zhang & Wei (2017), eq. 7, with the correct mean over pairs: 2/(n(n−1)), not 1/(n−1)!
+    rows = int(cells[:, 0].min()), int(cells[:, 0].max())
+    chosen = np.isin(cells[:, 0], rows)
+    i, j = np.triu_indices(int(chosen.sum()), 1)
+    apart = [np.linalg.norm(xyz[chosen][i] - xyz[chosen][j], axis=1) for xyz in (xyz_board, xyz_world)]
+    mean_ratio = float((apart[0] / apart[1]).mean())
     if by_rows:
         board_from_world = Similarity(mean_ratio, align_rigid(xyz_board, mean_ratio * xyz_world))
     return Scale(
@@ -167,13 +170,3 @@ def known_points(labels: Sequence[Label], board: BoardDesign) -> list[tuple[Face
         if isinstance(label, CircleLabel) and label.face in faces:
             members.setdefault(label.face, []).append(i)
     return [(faces[face], np.array(rows)) for face, rows in members.items() if len(rows) >= MIN_CORNERS]
-
-
-def _by_rows(xyz_board, xyz_world, row) -> tuple[float, tuple[int, int]]:
-    """Computes λ by Zhang & Wei (2017), eq. 7, with the correct mean over pairs: 2/(n(n−1)), not 1/(n−1)!."""
-    first, last = int(row.min()), int(row.max())
-    chosen = (row == first) | (row == last)
-    i, j = np.triu_indices(int(chosen.sum()), 1)
-    designed = np.linalg.norm(xyz_board[chosen][i] - xyz_board[chosen][j], axis=1)
-    reconstructed = np.linalg.norm(xyz_world[chosen][i] - xyz_world[chosen][j], axis=1)
-    return float((designed / reconstructed).mean()), (first, last)

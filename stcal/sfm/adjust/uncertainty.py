@@ -24,10 +24,9 @@ from stcal.sfm.adjust.equations import (
     shapes,
 )
 from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
-from stcal.sfm.adjust.joint import Adjusted, JointResult, points_of, scale_of
+from stcal.sfm.adjust.joint import Adjusted, JointResult
 
-STEP_MM = 1e-3
-"""Step of the central differences, in mm."""
+STEP_MM = 1e-3  # step of the central differences, in mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,7 +305,7 @@ def with_differences(state: Adjusted, start: CalibratedTarget, target: TargetDes
     if not by_circles:
         return state
     faces = np.concatenate(by_circles)
-    extensible, camera, basis = points_of(state.setting, state.solution), state.camera, state.setting.basis
+    extensible, camera, basis = state.extensible(), state.camera, state.setting.basis
     scatter, told = np.zeros((2, len(faces), len(faces)))
     for model in state.models:
         points, to_faces = extensible.points[model.group], extensible.to_circles[model.group] @ faces.T
@@ -323,4 +322,4 @@ def with_differences(state: Adjusted, start: CalibratedTarget, target: TargetDes
     for i in range(0, len(faces), 6):
         own_part = np.ix_(range(i, i + 6), range(i, i + 6))
         ratios.append(np.trace(np.linalg.lstsq(told[own_part], scatter[own_part], rcond=None)[0]) / 6)
-    return replace(state, differ=max(1.0, float(np.sqrt(np.mean(ratios))) / scale_of(result.sigma0)))
+    return replace(state, differ=max(1.0, float(np.sqrt(np.mean(ratios))) / max(1.0, result.sigma0)))

@@ -10,7 +10,7 @@ from stcal.adjust.blocks import Vector
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
-from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.rigid import Poses
 from stcal.labels import Label
 from stcal.parallel import run_in_order
 from stcal.sfm.adjust.refine import eccentricity_px, placed
@@ -281,7 +281,7 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
     points = Vector(xyz)
     for _ in range(POSE_PASSES):
         model = replace(model, shift_px=eccentricity_px(model, camera, radius, 1.0))
-        begin, poses = model, PoseStack.of(*model.camera_from_model)
+        begin, poses = model, Poses.of(model.camera_from_model)
 
         def left(step: np.ndarray, begin=begin, poses=poses) -> np.ndarray:
             moved = placed(begin, poses.moved(step[None]), points)

@@ -12,8 +12,9 @@ from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
 from stcal.geometry.clusters import ByClusters
-from stcal.geometry.least_squares import PoseStack, minimise
+from stcal.geometry.least_squares import minimise
 from stcal.geometry.print_modes import PrintModes
+from stcal.geometry.rigid import Poses
 from stcal.sfm.adjust.equations import image_cost, normalised
 from stcal.sfm.adjust.refine import placed, reproject
 from stcal.sfm.data.model import MetricModel
@@ -195,7 +196,7 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
     values: dict[str, Any] = {"lens": Vector(setting.away(state.camera)[None])}
     for model in state.models:
         a, board = Adjustment(), setting.boards[model.group]
-        values[POSES + model.group] = PoseStack.of(*model.camera_from_model)
+        values[POSES + model.group] = Poses.of(model.camera_from_model)
         values[DOTS_OF + model.group] = Vector(model.xyz_model)
         lens = a.block("lens", values["lens"])
         dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])

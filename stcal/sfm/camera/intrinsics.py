@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stcal.adjust.components import sigma_factor
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
@@ -12,7 +13,6 @@ from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homogr
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
-from stcal.geometry.variances import sigma_factor
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import normalised, robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px

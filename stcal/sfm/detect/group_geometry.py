@@ -9,9 +9,8 @@ import numpy as np
 
 from stcal.adjust.blocks import Huber
 from stcal.adjust.engine import Adjustment
-from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import circle_image_offset
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.as_drawn import FAR_DEG
 from stcal.sfm.data.model import ImageObservations
@@ -50,16 +49,16 @@ class Arrangement:
             foreign={i: self.foreign.get(i, ()) + views for i, views in gone.items()},
         )
 
-    def stacks(self) -> tuple[PoseStack, PoseStack]:
+    def stacks(self) -> tuple[Poses, Poses]:
         """Returns the poses of the images, and those of the planes."""
-        return PoseStack.of(*self.camera_from_group.values()), PoseStack.of(*self.group_from_plane.values())
+        return Poses.of(self.camera_from_group.values()), Poses.of(self.group_from_plane.values())
 
-    def moved(self, cameras: PoseStack, planes: PoseStack) -> "Arrangement":
+    def moved(self, cameras: Poses, planes: Poses) -> "Arrangement":
         """Returns the arrangement with other poses, in the order of :meth:`stacks`."""
         return replace(
             self,
-            camera_from_group={i: cameras.rigid(a) for a, i in enumerate(self.camera_from_group)},
-            group_from_plane={p: planes.rigid(b) for b, p in enumerate(self.group_from_plane)},
+            camera_from_group={i: cameras[a] for a, i in enumerate(self.camera_from_group)},
+            group_from_plane={p: planes[b] for b, p in enumerate(self.group_from_plane)},
         )
 
     def explained(self) -> int:
@@ -331,7 +330,7 @@ class PlaneBundle:
         """Returns the points of the mask ``keep``."""
         return PlaneBundle(self.image[keep], self.plane[keep], self.xyz[keep], self.seen[keep], self.focal_px)
 
-    def adjusted(self, poses: PoseStack, planes: PoseStack) -> tuple[PoseStack, PoseStack]:
+    def adjusted(self, poses: Poses, planes: Poses) -> tuple[Poses, Poses]:
         """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
         fixed.
 
@@ -347,18 +346,17 @@ class PlaneBundle:
         found = a.minimum(settled=BUNDLE_SETTLED, max_steps=BUNDLE_STEPS, damping=1e-3).state
         return found["cameras"], found["planes"]
 
-    def _off(self, planes: PoseStack, poses: PoseStack) -> np.ndarray:
+    def _off(self, planes: Poses, poses: Poses) -> np.ndarray:
         xyz = self.placed(planes, poses)[2]
         if (xyz[:, 2] <= 0).any():
             return np.full(self.seen.shape, np.inf)
         return self.focal_px * xyz[:, :2] / xyz[:, 2:] - self.seen
 
-    def _slopes(self, planes: PoseStack, poses: PoseStack) -> tuple[np.ndarray, np.ndarray]:
+    def _slopes(self, planes: Poses, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
         turned, placed, xyz = self.placed(planes, poses)
         by_point = self.by_point(xyz)
         by_world = by_point @ poses.rotation[self.image]
-        by_plane = np.concatenate([-by_world @ skew(turned), by_world], axis=2)
-        return by_plane, np.concatenate([-by_point @ skew(placed), by_point], axis=2)
+        return by_pose(by_world, turned), by_pose(by_point, placed)
 
     def by_point(self, xyz_camera: np.ndarray) -> np.ndarray:
         """Returns the derivatives of images by points in the camera frame, (n, 2, 3), px/mm."""
@@ -368,7 +366,7 @@ class PlaneBundle:
         by_point *= (self.focal_px / xyz_camera[:, 2])[:, None, None]
         return by_point
 
-    def placed(self, planes: PoseStack, poses: PoseStack) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def placed(self, planes: Poses, poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the points turned into the world, turned into the cameras, and in the cameras' frames, (n, 3)."""
         turned = np.einsum("nij,nj->ni", planes.rotation[self.plane], self.xyz)
         placed = np.einsum("nij,nj->ni", poses.rotation[self.image], turned + planes.translation[self.plane])
@@ -423,8 +421,8 @@ class _Circles:
     rows: list[tuple[int, Label]]  # image and label of each
     bundle: PlaneBundle  # by places in the arrangement; the images of the circles' centres, without eccentricity
     sigma_px: np.ndarray
-    camera_from_group: PoseStack
-    group_from_plane: PoseStack
+    camera_from_group: Poses
+    group_from_plane: Poses
 
     @classmethod
     def of(cls, arrangement: Arrangement, images, patterns: dict[str, Pattern], focal_px: float) -> "_Circles":

@@ -1,13 +1,12 @@
 """Cross-check against the native COLMAP: same database, same initial pairs, same thresholds; result file and text."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.arrays import require_arguments, rms
-from stcal.geometry.rigid import Poses, Rigid, align_similarity
+from stcal.geometry.rigid import Rigid, align_similarity
 from stcal.io.json import read_json
 from stcal.parallel import Progress, scratch_folder
 from stcal.report.text import number, text_table
@@ -114,7 +113,6 @@ def crosscheck(
 def _compared(
     run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None
 ) -> Crosscheck:
-    """Returns the comparison, ``crosscheck`` of ``report.json``."""
     progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
@@ -220,7 +218,6 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
 
 
 def _own_model(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids) -> ReadModel:
-    """Returns the model of the same mapping by pycolmap."""
     reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
     if reconstruction is None:
         raise MappingError(
@@ -239,7 +236,7 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
     covariances = run.faces.circle_covariance_mm2
     off = {label: np.subtract(xyz, circles[label]) for label, xyz in target.circles.items() if label in circles}
     return ResultCompared(
-        faces=_faces(target.target_from_face, faces, run.faces.target_from_face_covariance),
+        faces=face_differences(target, run, faces),
         circles_um={label: MICRO * float(np.linalg.norm(v)) for label, v in off.items()},
         circles_sigmas={
             label: _sigmas(v, np.asarray(covariances[label]), FACE_FLOOR[3:])
@@ -249,31 +246,21 @@ def _targets(target: CalibratedTarget, faces: dict[str, Rigid], circles: dict, r
     )
 
 
-def face_differences(target: CalibratedTarget, run: SavedRun) -> dict[str, FaceDifference | None]:
-    """Returns the differences of a target's faces from ``RUN/faces.json``, by face; None if only one has the face."""
-    return _faces(target.target_from_face, run.faces.poses(), run.faces.target_from_face_covariance)
-
-
-def _faces(
-    a: dict[str, Rigid], b: dict[str, Rigid], covariance: Mapping[str, np.ndarray]
+def face_differences(
+    target: CalibratedTarget, run: SavedRun, faces: dict[str, Rigid] | None = None
 ) -> dict[str, FaceDifference | None]:
-    """Returns the differences by face; None for a face that only one of the two has."""
-    rows: dict[str, FaceDifference | None] = {}
-    for face in sorted(a.keys() | b.keys()):
-        rows[face] = None
-        if face in a and face in b:
-            difference = _off(a[face], b[face])
-            rows[face] = FaceDifference(
-                translation_um=MICRO * float(np.linalg.norm(difference[3:])),
-                rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(difference[:3]))),
-                sigmas=_sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
-            )
+    """Returns the differences of a target's faces from ``faces``, or the run's; None of a face that only one has."""
+    a, b, covariance = target.target_from_face, faces, run.faces.target_from_face_covariance
+    b = run.faces.poses() if b is None else b
+    rows: dict[str, FaceDifference | None] = dict.fromkeys(sorted(a.keys() | b.keys()))
+    for face in a.keys() & b.keys():
+        difference = a[face].difference(b[face])
+        rows[face] = FaceDifference(
+            translation_um=MICRO * float(np.linalg.norm(difference[3:])),
+            rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(difference[:3]))),
+            sigmas=_sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
+        )
     return rows
-
-
-def _off(pose: Rigid, other: Rigid) -> np.ndarray:
-    """Returns the rotation vector (rad) and translation (mm) from ``other`` to ``pose`` in their common frame, (6,)."""
-    return Poses.of([pose]).difference(Poses.of([other]))[0]
 
 
 def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float:
@@ -291,10 +278,9 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
         model = model_of_group.get(theirs.group)
         if model is None:
             continue
-        index_of_label = {label: i for i, label in enumerate(theirs.labels)}
-        pairs = [(index_of_label[label], i) for i, label in enumerate(model.labels) if label in index_of_label]
-        common = np.array(pairs, int).reshape(-1, 2).T
-        alignment = align_similarity(model.xyz_model[common[1]], theirs.xyz_model[common[0]])
+        common = sorted(set(theirs.labels) & set(model.labels), key=model.labels.index)
+        own, other = (m.xyz_model[[m.labels.index(label) for label in common]] for m in (model, theirs))
+        alignment = align_similarity(own, other)
         network = free_network(with_sigma(model, factors), run.camera)
         covariance = dict(zip(model.images, network.pose_covariance(), strict=True))
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
@@ -302,14 +288,13 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
         for name, pose, moved in zip(theirs.images, theirs.camera_from_model, aligned, strict=True):
             if name not in poses:
                 continue
-            target_from_a, target_from_b = pose.inverse(), poses[name].inverse()
-            turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
+            off = pose.inverse().difference(poses[name].inverse())
             rows.append(
                 CameraDifference(
                     image=name,
-                    position_um=MICRO * float(np.linalg.norm(target_from_a.translation - target_from_b.translation)),
-                    rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
-                    sigmas=_sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6)),
+                    position_um=MICRO * float(np.linalg.norm(off[3:])),
+                    rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(off[:3]))),
+                    sigmas=_sigmas(moved.difference(poses[name]), covariance[name], np.zeros(6)),
                 )
             )
     return sorted(rows, key=lambda row: row.image)
@@ -348,12 +333,12 @@ def comparison_text(check: Crosscheck) -> str:
 def _differences(
     images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, tolerances: Tolerances
 ) -> list[str]:
-    """Returns the differences beyond their tolerances, one clause each."""
     clauses = []
     for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:
             others = f" and {len(names) - 1} more" if len(names) > 1 else ""
             clauses.append(f"image {names[0]}{others}: registered by {program} only")
+    largest = []  # what, its largest value, unit, and limit
     for compared, source, sigma in (
         (mapping, "mapped by both", tolerances.mapped_sigma),
         (result, "from the native model against faces.json", tolerances.sigma),
@@ -370,20 +355,17 @@ def _differences(
                     f"face {face} ({source}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{sigma_text}; "
                     f"{', '.join(limits)} allowed"
                 )
-        for unit, values, limit in (
-            ("µm", compared.circles_um, tolerances.circle_um),
-            ("σ", compared.circles_sigmas, sigma),
-        ):
-            label, worst = max(values.items(), key=lambda item: item[1], default=("", 0.0))
-            if limit is not None and worst > limit:
-                clauses.append(f"circle {label} ({source}) {worst:.1f} {unit}; {limit:g} {unit} allowed")
-    for source, key, limit, unit in (
-        ("position", "position_um", tolerances.camera_um, "µm"),
-        ("attitude", "rotation_mdeg", tolerances.camera_mdeg, "mdeg"),
-    ):
-        image, worst = max(((c.image, getattr(c, key)) for c in mapping.cameras), key=lambda c: c[1], default=("", 0.0))
+        circles = (compared.circles_um, "µm", tolerances.circle_um), (compared.circles_sigmas, "σ", sigma)
+        largest += [("circle {} " + f"({source})", *each) for each in circles]
+    position, attitude = (
+        {c.image: getattr(c, key) for c in mapping.cameras} for key in ("position_um", "rotation_mdeg")
+    )
+    largest.append(("camera {}: position", position, "µm", tolerances.camera_um))
+    largest.append(("camera {}: attitude", attitude, "mdeg", tolerances.camera_mdeg))
+    for what, values, unit, limit in largest:
+        name, worst = max(values.items(), key=lambda item: item[1], default=("", 0.0))
         if limit is not None and worst > limit:
-            clauses.append(f"camera {image}: {source} {worst:.1f} {unit}; {limit:g} {unit} allowed")
+            clauses.append(f"{what.format(name)} {worst:.1f} {unit}; {limit:g} {unit} allowed")
     return clauses
 
 

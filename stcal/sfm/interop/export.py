@@ -1,6 +1,5 @@
 """Export of a finished run to files of other programs: robots' software, viewers, tables."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from stcal.io.poses.programs import Static, fixed_joint, messages, ros1_launch, 
 from stcal.io.table import csv_text
 from stcal.io.toml import opencv_matrix
 from stcal.sfm.interop import gltf
-from stcal.sfm.interop.export_content import Content, content_of
+from stcal.sfm.interop.export_content import Content, content_of, require_new
 from stcal.sfm.runs.saved import AnyRun, saved_run
 
 COLUMNS = (
@@ -76,8 +75,7 @@ def _list(texts) -> str:
     return "[ " + ", ".join(map(_quoted, texts)) + " ]"
 
 
-PLATE_M = 1e-4
-"""Height of the cylinders that show circles. Their outer ends lie in the faces' planes."""
+PLATE_M = 1e-4  # height of the cylinders that show circles. Their outer ends lie in the faces' planes.
 MM_M = 1e-3
 
 
@@ -144,8 +142,7 @@ def _escaped(text: str) -> str:
     return text.replace("$(", "$$(").replace("${", "$${")
 
 
-ROOT = "target"
-"""Default name of the target frame."""
+ROOT = "target"  # default name of the target frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +180,7 @@ class ExportedRun:
 
 @require_arguments
 def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
-    """Writes faces and circles to a new file, with σ and cameras if the form holds them.
+    """Writes faces and circles to a new file, with σ and cameras if the form holds them, and returns the content.
 
     Parameters
     ----------
@@ -196,11 +193,6 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
         Form in place of that of the suffix.
     name : str
         Name of the target frame, and prefix of the other frames' names.
-
-    Returns
-    -------
-    ExportedRun
-        ``path``, ``form``, and the ``content``.
 
     Raises
     ------
@@ -217,10 +209,7 @@ def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -
     form = form or suffixes[path.suffix.lower()]
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
-    if os.path.lexists(path):
-        raise InputError("E-OUTPUT-EXISTS", f"{path}: exists, and nothing is overwritten; give a new file")
-    if not path.parent.is_dir():
-        raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
+    require_new(path)
     content = content_of(saved_run(run), name)
     written = FORMS[form].write(content)
     save(path, written)

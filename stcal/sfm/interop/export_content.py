@@ -1,6 +1,8 @@
 """Content of the exports of a finished run: faces, circles, cameras and their σ; target frame, mm."""
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -29,8 +31,6 @@ BOARD_RGB = (150, 150, 150)
 
 
 class _Report(Part):
-    """The parts of ``report.json`` that are exported."""
-
     camera: ReportCamera
     scene: Space
 
@@ -46,12 +46,12 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circle:
-    """A circle of the target. ``xyz_mm`` : (3,) centre; ``covariance_mm2`` : (3, 3) or None; target frame."""
+    """A circle of the target, target frame."""
 
     label: CircleLabel
-    xyz_mm: np.ndarray
+    xyz_mm: np.ndarray  # (3,)
     radius_mm: float
-    covariance_mm2: np.ndarray | None
+    covariance_mm2: np.ndarray | None  # (3, 3)
 
     @property
     def sigma_mm(self) -> np.ndarray | None:
@@ -121,6 +121,14 @@ class Content:
         return lines
 
 
+def require_new(out: Path) -> None:
+    """Refuses a file that exists, or whose folder does not."""
+    if os.path.lexists(out):
+        raise InputError("E-OUTPUT-EXISTS", f"{out}: exists, and nothing is overwritten; give a new file")
+    if not out.parent.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place")
+
+
 def content_of(run: SavedRun, root: str) -> Content:
     """Returns the content of a run; ``root``: name of the target frame."""
     if not root.isprintable() or root.split() != [root]:
@@ -136,9 +144,6 @@ def content_of(run: SavedRun, root: str) -> Content:
         )
         for label, xyz in faces.circles.items()
     )
-    photographs = [
-        Photograph(each.image, each.group, Rigid(np.array(each.axes).T, each.position_mm)) for each in scene.cameras
-    ]
     content = Content(
         root=root,
         run=run,
@@ -146,7 +151,9 @@ def content_of(run: SavedRun, root: str) -> Content:
         faces=faces.poses(),
         covariances={face: np.array(c) for face, c in faces.target_from_face_covariance.items()},
         circles=circles,
-        photographs=tuple(photographs),
+        photographs=tuple(
+            Photograph(each.image, each.group, Rigid(np.array(each.axes).T, each.position_mm)) for each in scene.cameras
+        ),
         rgb=colours(run),
     )
     names = [root, *(each.child for each in content.statics())]

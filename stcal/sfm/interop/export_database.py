@@ -9,6 +9,7 @@ from pathlib import Path
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
+from stcal.sfm.interop.export_content import require_new
 from stcal.sfm.interop.schema import Schema, find_schema
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
@@ -39,37 +40,22 @@ def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
     schema : str
         Version of COLMAP that is to open it: ``3.8`` to ``4.2``.
 
-    Returns
-    -------
-    Exported
-        ``path``, name of the ``schema``, and counts of ``images`` and ``pairs``.
-
     Raises
     ------
     InputError
         The schema is unknown, or ``out`` exists or cannot be written.
     """
     run, out, wanted = saved_run(run), Path(out), find_schema(schema)
-    if os.path.lexists(out):
-        raise _exists(out)
-    if not out.parent.is_dir():
-        raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place")
+    require_new(out)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as scratch:
         partial = Path(scratch) / out.name
         pairs = write_copy(run, partial, wanted)
         try:
             os.link(partial, out)  # which never overwrites a file that appeared meanwhile
-        except FileExistsError as error:
-            raise _exists(out) from error
-        except OSError:  # the file system has no hard links
-            if os.path.lexists(out):
-                raise _exists(out) from None
+        except OSError:  # that, or the file system has no hard links
+            require_new(out)
             partial.rename(out)
     return Exported(out, wanted.name, len(run.observations), pairs, (run.camera.colmap_model,))
-
-
-def _exists(out: Path) -> InputError:
-    return InputError("E-OUTPUT-EXISTS", f"{out}: exists, and is not overwritten; move it away, or give another name")
 
 
 def write_copy(run: SavedRun, path: Path, wanted: Schema) -> int:

@@ -43,8 +43,6 @@ class ExportedModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """A point of the model."""
-
     id: int
     group: str  # empty if several groups share it
     label: Label
@@ -71,11 +69,6 @@ def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
         New file for ``nvm``, new or empty folder for the others; missing parent folders are made.
     form : {"colmap-bin", "colmap-txt", "nvm", "bundler"}
         The format.
-
-    Returns
-    -------
-    ExportedModel
-        Paths of model and ``labels``, counts of ``images`` and ``points``, and the ideal camera of NVM and Bundler, px.
 
     Raises
     ------
@@ -155,7 +148,8 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
     image_of = {}
     for image_id, image in reconstruction.images.items():
         if image.name not in observations:
-            raise _not_of_run(path, f"image {image.name} is not as in the run's labels.csv")
+            fault = f"image {image.name} is not as in the run's labels.csv"
+            raise InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
         image_of[image_id], corrected_px = observations[image.name]
         require_keypoints(path, image, image_of[image_id].labels, corrected_px)
     rgb = colours(run)
@@ -164,7 +158,8 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         views = tuple((element.image_id, element.point2D_idx) for element in point.track.elements)
         names = {image_of[image_id].labels[k] for image_id, k in views}
         if len(names) != 1:
-            raise _not_of_run(path, f"point {point_id} is of {len(names)} labels, 1 needed")
+            fault = f"point {point_id} is of {len(names)} labels, 1 needed"
+            raise InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
         label = names.pop()
         groups = {image_of[image_id].group for image_id, _ in views}
         colour = BOARD_RGB if isinstance(label, DotLabel) else rgb[label.face]
@@ -172,10 +167,6 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
         group = groups.pop() if len(groups) == 1 else ""
         points.append(_Point(point_id, group, label, point.xyz.tolist(), colour, views))
     return reconstruction, points
-
-
-def _not_of_run(path: Path, fault: str) -> InputError:
-    return InputError("E-MODEL-NOT-OF-RUN", f"model {path}: {fault}; run it again")
 
 
 def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:

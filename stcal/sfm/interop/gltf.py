@@ -11,10 +11,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.poses.programs import metres, xyzw
 from stcal.sfm.interop.export_content import BOARD_RGB, Circle, Content
 
-EDGES = 48
-"""Number of edges of a disc. Its triangles leave out 0.3 % of its area."""
-CAMERA_SHARE = 0.06
-"""Depth of a camera's pyramid as a share of the scene's extent."""
+EDGES = 48  # number of edges of a disc. Its triangles leave out 0.3 % of its area.
+CAMERA_SHARE = 0.06  # depth of a camera's pyramid as a share of the scene's extent
 
 
 MM_M = 1e-3
@@ -22,8 +20,7 @@ FLOAT, UNSIGNED = 5126, 5125
 VERTICES, INDICES = 34962, 34963
 LINES, TRIANGLES = 1, 4
 NEAR_M = 0.01
-RINGS, SEGMENTS = 8, 12
-"""Numbers of rings and segments of the ball that shows σ."""
+RINGS, SEGMENTS = 8, 12  # numbers of rings and segments of the ball that shows σ
 Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
 """Quaternion x y z w that turns the target's Z to glTF's Y, which points up."""
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
@@ -115,7 +112,11 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         below += _cameras(content, buffer, mesh, node)
     below_up = node(name=content.root, children=below, extras={"said": content.said(), "sigma_drawn_times": factor})
     up = node(name="y_up", rotation=Y_UP, children=[below_up])
-    colours = [*(content.rgb[face] for face in content.faces), (40, 40, 40), BOARD_RGB]
+    materials = []
+    for rgb in (*(content.rgb[face] for face in content.faces), (40, 40, 40), BOARD_RGB):
+        linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in rgb]
+        surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        materials.append({"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}})
     tree = {
         "asset": {"version": "2.0", "generator": content.said()[0]},
         "extensionsUsed": [UNLIT],
@@ -123,7 +124,7 @@ def _tree(content: Content) -> tuple[dict, bytes]:
         "scenes": [{"nodes": [up]}],
         "nodes": nodes,
         "meshes": meshes,
-        "materials": [_material(rgb) for rgb in colours],
+        "materials": materials,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
     }
@@ -153,13 +154,6 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
 def _lens(content: Content) -> dict:
     """Returns a glTF camera with the field of view, and as extras all intrinsics, which glTF does not support."""
     camera = content.camera
-    parameters = {
-        "model": camera.colmap_model,
-        "size_px": [camera.width, camera.height],
-        "focal_px": list(map(float, camera.focal)),
-        "centre_px": list(map(float, camera.centre)),
-        "distortion": list(map(float, camera.distortion)),
-    }
     return {
         "name": "camera",
         "type": "perspective",
@@ -168,7 +162,13 @@ def _lens(content: Content) -> dict:
             "aspectRatio": float(camera.width / camera.focal[0] / (camera.height / camera.focal[1])),
             "znear": NEAR_M,
         },
-        "extras": parameters,
+        "extras": {
+            "model": camera.colmap_model,
+            "size_px": [camera.width, camera.height],
+            "focal_px": camera.focal.tolist(),
+            "centre_px": camera.centre.tolist(),
+            "distortion": camera.distortion.tolist(),
+        },
     }
 
 
@@ -200,12 +200,6 @@ def _exaggeration(content: Content) -> float:
 
 def _placed(pose: Rigid) -> dict:
     return {"translation": metres(pose), "rotation": xyzw(pose)}
-
-
-def _material(rgb: tuple[int, int, int]) -> dict:
-    linear = [((v / 255 + 0.055) / 1.055) ** 2.4 if v > 10 else v / 255 / 12.92 for v in rgb]
-    surface = {"baseColorFactor": [*linear, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
-    return {"pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {UNLIT: {}}}
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:

@@ -226,11 +226,6 @@ def calibrate_models(
     out : str or Path, optional
         File for the faces, as ``faces.json``; nothing is written if None.
 
-    Returns
-    -------
-    Calibration
-        ``target`` and models in mm, target frame; ``scales`` by group; ``notes``.
-
     Raises
     ------
     InputError

@@ -101,8 +101,7 @@ _4_2 = replace(_4_0, user_version=4_02_00_00).following(
 SCHEMAS = {schema.name: schema for schema in (_3_8, _3_9, _3_10, _3_11, _3_12, replace(_3_12, name="3.13"), _4_0, _4_2)}
 """All published schemas by name, the oldest first."""
 
-_SAME_TABLES = {"4.1": "4.0"}
-"""Versions that have the tables of another version."""
+_SAME_TABLES = {"4.1": "4.0"}  # versions that have the tables of another version
 
 
 def find_schema(name: str) -> Schema:

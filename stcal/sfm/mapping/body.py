@@ -14,36 +14,29 @@ from stcal.adjust.engine import Adjustment
 from stcal.design import FaceDesign
 from stcal.errors import DegenerateError, MappingError
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import Normal, PoseStack, descend
+from stcal.geometry.least_squares import Normal, descend
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
-from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.rigid import Poses, Rigid, by_pose, perspective
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier
 
-MIN_CORNERS = 4
-"""Smallest number of corners of a view of a face: they determine its homography."""
+MIN_CORNERS = 4  # smallest number of corners of a view of a face: they determine its homography
 SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
 """Largest differences of two poses of one face relative to another that agree: rotation, and translation as a share of
 the distance of the faces."""
-MOST_VOTES = 250
-"""Most images that vote on how two faces lie; time and memory grow with their square."""
-LEAST_SIGMA_PX = 0.05
-"""σ that print, lens and detector leave to any corner."""
+MOST_VOTES = 250  # most images that vote on how two faces lie; time and memory grow with their square
+LEAST_SIGMA_PX = 0.05  # σ that print, lens and detector leave to any corner
 LEAST_PAIRS, ROBUST_SIZES = 2, 10
 """Smallest number of images of two faces that tell the ratio of their sizes, and number of robust rounds."""
 MOST_OFF, SURE_SIGMAS = np.log(1.15), 5.0
 """Logarithm of the factor, and number of σ, beyond both of which a face is drawn at another size than the others."""
 LEAST_SIGMA_OFF = 0.02
 """σ of such a logarithm that the reflections of views and a rough camera leave to any."""
-LEAST_FOCAL = 0.1
-"""Smallest focal length of the camera, as a share of that at the start."""
-BETTER = 0.2
-"""Share by which another pose of a face must fit its corners better."""
-BY_CHANCE = 0.01
-"""Number of sound corners in a run that may be taken for gross errors."""
-SHARING = 2
-"""Number of corners that share the error of an edge."""
+LEAST_FOCAL = 0.1  # smallest focal length of the camera, as a share of that at the start
+BETTER = 0.2  # share by which another pose of a face must fit its corners better
+BY_CHANCE = 0.01  # number of sound corners in a run that may be taken for gross errors
+SHARING = 2  # number of corners that share the error of an edge
 PASSES, ROBUST_ROUNDS = 3, 3
 MAX_STEPS = 100
 FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
@@ -99,8 +92,8 @@ class Corners:
 class Body:
     """Poses of faces and images by index in the corners, and the camera; only those of the masks have a meaning."""
 
-    body_from_face: PoseStack
-    camera_from_body: PoseStack
+    body_from_face: Poses
+    camera_from_body: Poses
     camera: Camera
     placed_faces: np.ndarray
     placed_images: np.ndarray
@@ -133,7 +126,7 @@ def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.nda
 def place_body(corners: Corners, camera: Camera) -> Body:
     """Returns start values of all poses for a given camera."""
     views = _Views.of(corners, camera)
-    edges = [_edge(a, b, pairs, views) for (a, b), pairs in _pairs(views).items()]
+    edges = {faces: _edge(pairs, views) for faces, pairs in _pairs(views).items()}
     if not edges:
         raise MappingError(
             "E-BODY-UNLINKED",
@@ -151,7 +144,7 @@ class _Views:
 
     image: np.ndarray
     face: np.ndarray
-    poses: PoseStack  # (2v,) camera_from_face, both minima of each view one after the other
+    poses: Poses  # (2v,) camera_from_face, both minima of each view one after the other
     cost: np.ndarray  # (v, 2)
 
     @classmethod
@@ -159,7 +152,8 @@ class _Views:
         normalised = camera.normalised_from_pixel(corners.xy_px)
         key, view_of = np.unique(np.column_stack([corners.image, corners.face]), axis=0, return_inverse=True)
         members = [np.flatnonzero(view_of == v) for v in range(len(key))]
-        starts, kept = [], []
+        starts: list[Rigid] = []
+        kept: list[int] = []
         for v, own in enumerate(members):
             try:
                 pose = camera_from_plane(fit_homography(corners.xy_face[own], normalised[own]))
@@ -168,12 +162,10 @@ class _Views:
             if ((pose @ corners.xyz_face()[own])[:, 2] <= 0).any():
                 continue
             middle = Rigid(np.eye(3), np.append(corners.xy_face[own].mean(0), 0.0))
-            starts += [PoseStack.of(pose), mirrored(PoseStack.of(pose), middle)]
+            starts += [pose, *mirrored(Poses.of([pose]), middle)]
             kept.append(v)
         if not kept:
-            return cls(
-                np.zeros(0, int), np.zeros(0, int), PoseStack(np.zeros((0, 3, 3)), np.zeros((0, 3))), np.zeros((0, 2))
-            )
+            return cls(np.zeros(0, int), np.zeros(0, int), Poses.of([]), np.zeros((0, 2)))
         most = max(len(members[v]) for v in kept)
         index = np.array([np.pad(members[v], (0, most - len(members[v]))) for v in kept])
         real = np.array([np.arange(most) < len(members[v]) for v in kept])
@@ -181,33 +173,17 @@ class _Views:
         xyz, xy = corners.xyz_face()[index], normalised[index]
         root = corners.root[index] * camera.focal * real[..., None, None]
 
-        def evaluate(poses: PoseStack) -> Normal:
+        def evaluate(poses: Poses) -> Normal:
             rotated = xyz @ np.swapaxes(poses.rotation, 1, 2)
             p = rotated + poses.translation[:, None]
-            possible = np.asarray(((p[..., 2] > 0) | ~real).all(1))
-            depth = np.where(p[..., 2] > 0, p[..., 2], 1.0)
-            by_point = np.zeros((*p.shape[:2], 2, 3))
-            by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
-            by_point[..., :2, 2] = -p[..., :2] / depth[..., None] ** 2
-            by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=3)
-            residual = xy - p[..., :2] / depth[..., None]
-            return Normal.of((root @ residual[..., None])[..., 0], root @ by_pose, possible, np.inf)
+            ahead = p[..., 2] > 0
+            p[..., 2] = np.where(ahead, p[..., 2], 1.0)
+            ideal, by_point = perspective(p)
+            residual = (root @ (xy - ideal)[..., None])[..., 0]
+            return Normal.of(residual, root @ by_pose(by_point, rotated), np.asarray((ahead | ~real).all(1)), np.inf)
 
-        first = starts[0]
-        for start in starts[1:]:
-            first = first.plus(start)
-        minima = descend(evaluate, first, 1e-6)
+        minima = descend(evaluate, Poses.of(starts), 1e-6)
         return cls(key[kept, 0], key[kept, 1], minima.poses, minima.cost.reshape(-1, 2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Edge:
-    """``a_from_b`` of two faces as the images see it, and the number of images that agree on it."""
-
-    a: int
-    b: int
-    a_from_b: Rigid
-    images: int
 
 
 def _pairs(views: _Views) -> dict[tuple[int, int], list[tuple[int, int]]]:
@@ -263,7 +239,8 @@ class _Relative:
         return best, int(votes[best])
 
 
-def _edge(a: int, b: int, pairs: list[tuple[int, int]], views: _Views) -> _Edge:
+def _edge(pairs: list[tuple[int, int]], views: _Views) -> tuple[Rigid, int]:
+    """Returns a_from_b of two faces as the images see it, and the number of images that agree on it."""
     poses = _Relative.of(pairs, views)
     translation = poses.b_place - poses.a_place
     apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
@@ -271,20 +248,13 @@ def _edge(a: int, b: int, pairs: list[tuple[int, int]], views: _Views) -> _Edge:
     best, votes = poses.best(agrees)
     near = np.flatnonzero(agrees[best])
     mean = Rotation.from_matrix(poses.rotation[near]).mean().as_matrix()
-    return _Edge(a, b, Rigid(mean, np.median(translation[near], axis=0)), votes)
+    return Rigid(mean, np.median(translation[near], axis=0)), votes
 
 
-@dataclass(frozen=True, slots=True)
-class WrongSizes:
-    """Faces that are drawn at another size than the rest."""
-
-    factors: dict[int, float]  # true over stated size, by index of the face
-    alike: int  # number of the others whose sizes were compared
-
-
-def wrong_sizes(corners: Corners, camera: Camera) -> WrongSizes:
-    """Returns the faces whose stated size contradicts those of most others: too large by q, a face seems farther by q.
-    Face b is at the same place d in the frame of a in all images: q R_aᵀ t_b − R_aᵀ t_a = d."""
+def wrong_sizes(corners: Corners, camera: Camera) -> tuple[dict[int, float], int]:
+    """Returns true over stated size of faces whose size contradicts those of most others, by index of the face, and the
+    number of the others that were compared. Too large by q, a face seems farther by q: face b is at the same place d in
+    the frame of a in all images, q R_aᵀ t_b − R_aᵀ t_a = d."""
     views = _Views.of(corners, camera)
     ratios: list[tuple[int, int, float, float]] = []
     for (a, b), pairs in _pairs(views).items():
@@ -309,7 +279,7 @@ def wrong_sizes(corners: Corners, camera: Camera) -> WrongSizes:
         if ratio > 0:
             ratios.append((a, b, np.log(ratio), np.sqrt(variance / square) / ratio))
     off = _off(ratios, len(corners.faces)) if ratios else {}
-    return WrongSizes(off, len({face for a, b, *_ in ratios for face in (a, b)}) - len(off))
+    return off, len({face for a, b, *_ in ratios for face in (a, b)}) - len(off)
 
 
 def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, float]:
@@ -336,28 +306,24 @@ def _off(ratios: list[tuple[int, int, float, float]], faces: int) -> dict[int, f
     return off
 
 
-def _tree(views: _Views, edges: list[_Edge], faces: int) -> tuple[PoseStack, np.ndarray]:
+def _tree(views: _Views, edges: dict[tuple[int, int], tuple[Rigid, int]], faces: int) -> tuple[Poses, np.ndarray]:
     """Returns body_from_face along the edges that most images agree on, and a mask of the linked faces."""
     seen = np.bincount(views.face, minlength=faces)
-    linked = {face for edge in edges for face in (edge.a, edge.b)}
-    root = max(linked, key=lambda face: seen[face])
-    poses = {root: Rigid()}
-    while True:
-        open_edges = [edge for edge in edges if (edge.a in poses) != (edge.b in poses)]
-        if not open_edges:
-            break
-        edge = max(open_edges, key=lambda edge: edge.images)
-        if edge.a in poses:
-            poses[edge.b] = poses[edge.a] @ edge.a_from_b
+    poses = {max({face for edge in edges for face in edge}, key=lambda face: seen[face]): Rigid()}
+    while open_edges := [(a, b) for a, b in edges if (a in poses) != (b in poses)]:
+        a, b = max(open_edges, key=lambda edge: edges[edge][1])
+        a_from_b = edges[a, b][0]
+        if a in poses:
+            poses[b] = poses[a] @ a_from_b
         else:
-            poses[edge.a] = poses[edge.b] @ edge.a_from_b.inverse()
+            poses[a] = poses[b] @ a_from_b.inverse()
     placed = np.array([face in poses for face in range(faces)])
-    return PoseStack.of(*(poses.get(face, Rigid()) for face in range(faces))), placed
+    return Poses.of(poses.get(face, Rigid()) for face in range(faces)), placed
 
 
 def _images(
-    views: _Views, corners: Corners, body_from_face: PoseStack, placed_faces: np.ndarray, camera: Camera
-) -> tuple[PoseStack, np.ndarray]:
+    views: _Views, corners: Corners, body_from_face: Poses, placed_faces: np.ndarray, camera: Camera
+) -> tuple[Poses, np.ndarray]:
     """Returns camera_from_body of each image: of what its views say, that which fits most of its corners best."""
     count = len(corners.images)
     rotation, translation = np.tile(np.eye(3), (count, 1, 1)), np.tile([0.0, 0.0, 1.0], (count, 1))
@@ -368,17 +334,15 @@ def _images(
         own = np.flatnonzero((corners.image == image) & placed_faces[corners.face])
         if len(own) < MIN_POINTS:
             continue
-        part, least = corners.select(own), np.inf
+        part, candidates = corners.select(own), []
         for v in np.flatnonzero((views.image == image) & placed_faces[views.face]):
-            back = f.rotation[views.face[v]].T
             for k in (2 * v, 2 * v + 1):
-                turn = views.poses.rotation[k] @ back
-                shift = views.poses.translation[k] - turn @ f.translation[views.face[v]]
-                length = _lengths(body[own] @ turn.T + shift, part, camera)
-                cost = _robust(length)
-                if cost < least:
-                    least, rotation[image], translation[image], placed[image] = cost, turn, shift, True
-    return PoseStack(rotation, translation), placed
+                turn = views.poses.rotation[k] @ f.rotation[views.face[v]].T
+                candidates.append((turn, views.poses.translation[k] - turn @ f.translation[views.face[v]]))
+        costs = [_robust(_lengths(body[own] @ turn.T + shift, part, camera)) for turn, shift in candidates]
+        if min(costs, default=np.inf) < np.inf:
+            (rotation[image], translation[image]), placed[image] = candidates[int(np.argmin(costs))], True
+    return Poses(rotation, translation), placed
 
 
 def adjust_body(
@@ -408,7 +372,7 @@ def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, gi
         a.prior(lens, (np.linalg.pinv(basis) @ (given.parameters() - body.camera.parameters()))[None], prior)
         on.append((lens, None))
 
-    def at(faces: PoseStack, images: PoseStack, *lens: Vector) -> Body:
+    def at(faces: Poses, images: Poses, *lens: Vector) -> Body:
         parameters = body.camera.parameters() + sum(basis @ own.array[0] for own in lens)
         parameters[:2] = np.maximum(parameters[:2], LEAST_FOCAL * body.camera.focal)
         camera = body.camera.with_parameters(parameters)
@@ -423,11 +387,9 @@ def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, gi
         xyz, turn = state.xyz_camera(used), images.rotation[used.image]
         in_face = np.einsum("nij,nj->ni", faces.rotation[used.face], used.xyz_face())
         by_point = state.camera.projection_jacobian(xyz)
-        by_body = by_point @ turn
-        by_face = np.concatenate([-by_body @ skew(in_face), by_body], axis=2)
-        by_image = np.concatenate([-by_point @ skew(xyz - images.translation[used.image]), by_point], axis=2)
+        by_image = by_pose(by_point, xyz - images.translation[used.image])
         by_lens = [state.camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis for _ in lens]
-        return [by_face, by_image, *by_lens]
+        return [by_pose(by_point @ turn, in_face), by_image, *by_lens]
 
     a.factor(residuals, on, derivatives=slopes, root=used.root, loss=Huber(huber))
     start = {block.name: block.start for block in a.blocks}
@@ -436,7 +398,7 @@ def _minimum(body: Body, used: Corners, basis: np.ndarray, prior: np.ndarray, gi
     return at(*a.minimum(start, settled=1e-7, max_steps=MAX_STEPS).state.values())
 
 
-def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:
+def _faces_again(views: _Views, corners: Corners, body: Body) -> Poses:
     """Returns body_from_face by the view that fits all corners of a face best, or as before if none does."""
     rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
     i = body.camera_from_body
@@ -444,20 +406,18 @@ def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:
         own = np.flatnonzero((corners.face == face) & body.placed_images[corners.image])
         part, xyz = corners.select(own), corners.xyz_face()[own]
 
-        def cost(turn: np.ndarray, shift: np.ndarray, part: Corners = part, xyz: np.ndarray = xyz) -> float:
-            in_body = xyz @ turn.T + shift
-            seen = np.einsum("nij,nj->ni", i.rotation[part.image], in_body) + i.translation[part.image]
-            return _robust(_lengths(seen, part, body.camera))
-
-        least = (1 - BETTER) * cost(rotation[face], translation[face])
+        candidates, costs = [(rotation[face].copy(), translation[face].copy())], []
         for v in np.flatnonzero((views.face == face) & body.placed_images[views.image]):
             back = i.rotation[views.image[v]].T
             for k in (2 * v, 2 * v + 1):
-                turn = back @ views.poses.rotation[k]
                 shift = back @ (views.poses.translation[k] - i.translation[views.image[v]])
-                if (of_view := cost(turn, shift)) < least:
-                    least, rotation[face], translation[face] = of_view, turn, shift
-    return PoseStack(rotation, translation)
+                candidates.append((back @ views.poses.rotation[k], shift))
+        for turn, shift in candidates:
+            in_body = xyz @ turn.T + shift
+            seen = np.einsum("nij,nj->ni", i.rotation[part.image], in_body) + i.translation[part.image]
+            costs.append(_robust(_lengths(seen, part, body.camera)) * (1.0 if costs else 1 - BETTER))
+        rotation[face], translation[face] = candidates[int(np.argmin(costs))]
+    return Poses(rotation, translation)
 
 
 def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:

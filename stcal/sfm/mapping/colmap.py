@@ -5,8 +5,7 @@ import ctypes
 import os
 import signal
 
-_ROOM = 1024
-"""More bytes than the system's ``struct sigaction`` has anywhere."""
+_ROOM = 1024  # more bytes than the system's struct sigaction has anywhere
 _handlers: dict[int, ctypes.Array] = {}
 if os.name == "posix":
     _system = ctypes.CDLL(None)

@@ -67,13 +67,32 @@ def write_database(
     keypoints_px: Sequence[np.ndarray] | None = None,
 ) -> None:
     """Writes a new database atomically: the file appears complete or not at all."""
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
+    partial = Path(path).with_name(Path(path).name + ".partial")
     remove_database(partial)
     pycolmap.logging.minloglevel = LOG_FATAL_ALONE  # what fails is raised
     try:
         with pycolmap.Database.open(str(partial)) as database:
-            _write(database, camera, observations, pairs, keypoints_px)
+            # row by row, since a transaction of COLMAP ends the process if the disk is full
+            native, rig, ids = colmap_camera(camera), pycolmap.Rig(rig_id=RIG_ID), image_ids(observations)
+            database.write_camera(native, use_camera_id=True)
+            rig.add_ref_sensor(native.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+            for i, image in enumerate(observations):
+                record = pycolmap.Image(name=image.name, camera_id=CAMERA_ID, image_id=ids[image.name])
+                frame = pycolmap.Frame(frame_id=ids[image.name], rig_id=RIG_ID)
+                frame.add_data_id(record.data_id)
+                database.write_image(record, use_image_id=True)
+                database.write_frame(frame, use_frame_id=True)
+                xy = image.centre_px if keypoints_px is None else keypoints_px[i]
+                database.write_keypoints(ids[image.name], to_colmap_px(xy).astype(np.float32))
+            for i, j in pairs:
+                a, b = observations[i], observations[j]
+                matches = match_labels(a, b)
+                database.write_matches(ids[a.name], ids[b.name], matches)
+                geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
+                # COLMAP 4.x silently skips pairs of configuration UNDEFINED.
+                geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
         if Path(f"{partial}-wal").exists():  # SQLite could not move its content into the database, and does not say so
             raise RuntimeError("a part of it is left in the log")
     except RuntimeError as error:
@@ -84,7 +103,7 @@ def write_database(
     os.replace(partial, path)
 
 
-def unwritable(path: Path, error: RuntimeError) -> InputError:
+def unwritable(path: str | Path, error: RuntimeError) -> InputError:
     """Returns the error of a database that COLMAP cannot write, or cannot open for lack of space beside it."""
     reason = re.sub(r"^\[[^]]*] *", "", str(error))
     return InputError(
@@ -96,32 +115,6 @@ def remove_database(path: Path) -> None:
     """Removes a database and SQLite's files beside it."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
-
-
-def _write(database, camera, observations, pairs, keypoints_px) -> None:
-    """Writes row by row, since a transaction of COLMAP ends the process if the disk is full."""
-    native = colmap_camera(camera)
-    database.write_camera(native, use_camera_id=True)
-    rig = pycolmap.Rig(rig_id=RIG_ID)
-    rig.add_ref_sensor(native.sensor_id)
-    database.write_rig(rig, use_rig_id=True)
-    ids = image_ids(observations)
-    for i, image in enumerate(observations):
-        record = pycolmap.Image(name=image.name, camera_id=CAMERA_ID, image_id=ids[image.name])
-        frame = pycolmap.Frame(frame_id=ids[image.name], rig_id=RIG_ID)
-        frame.add_data_id(record.data_id)
-        database.write_image(record, use_image_id=True)
-        database.write_frame(frame, use_frame_id=True)
-        xy = image.centre_px if keypoints_px is None else keypoints_px[i]
-        database.write_keypoints(ids[image.name], to_colmap_px(xy).astype(np.float32))
-    for i, j in pairs:
-        a, b = observations[i], observations[j]
-        matches = match_labels(a, b)
-        database.write_matches(ids[a.name], ids[b.name], matches)
-        geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
-        # COLMAP 4.x silently skips pairs of configuration UNDEFINED.
-        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-        database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
 
 
 def labels_csv(

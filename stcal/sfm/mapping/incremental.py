@@ -85,10 +85,8 @@ def widest_angle_rad(direction: np.ndarray) -> float:
 
 
 SEED = 1
-MAX_REPROJECTION_PX = 4.0
-"""Largest reprojection error of an observation in the model (COLMAP's filter)."""
-MIN_AGREEMENT = 0.5
-"""Share of the circles seen at least twice that a model must contain."""
+MAX_REPROJECTION_PX = 4.0  # largest reprojection error of an observation in the model (COLMAP's filter)
+MIN_AGREEMENT = 0.5  # share of the circles seen at least twice that a model must contain
 LOG_ERRORS_ONLY = 3
 
 

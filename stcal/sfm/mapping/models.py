@@ -22,8 +22,7 @@ from stcal.sfm.data.model import GroupModel, ImageObservations, M, MetricModel, 
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
-LOG_NOTHING = 4
-"""Level of COLMAP's log that prints nothing. Errors are raised as exceptions."""
+LOG_NOTHING = 4  # level of COLMAP's log that prints nothing. Errors are raised as exceptions.
 KEYPOINT_TOLERANCE_PX = 0.002
 """Largest deviation of a keypoint from the database. Steps of float32: 0.0005 px at x = 5000, 0.002 px at x = 30
 000."""
@@ -222,20 +221,16 @@ _CHECK = re.compile(r"\[\w.]+:\d+\] Check failed: .*")
 """COLMAP's words for a fault of a file: a place in its own source."""
 
 
-def parameter_count(model: int) -> int:
-    """Returns the number of parameters of the camera model with COLMAP's id; raises ValueError for an unknown id."""
-    return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
-
-
 def _end_of(kind: str, data: bytes, at: int) -> int:
-    """Returns where the record at ``at`` of a binary file ends; struct.error if a number of it is missing."""
+    """Returns where a record ends; struct.error if a number is missing, ValueError for an unknown camera model."""
 
     def number(form: str, place: int) -> int:
         return struct.unpack_from(f"<{form}", data, place)[0]
 
     match kind:
         case "cameras":
-            return at + 24 + 8 * parameter_count(number("i", at + 4))
+            camera = pycolmap.CameraModelId(number("i", at + 4))
+            return at + 24 + 8 * len(pycolmap.Camera.create_from_model_id(1, camera, 1.0, 1, 1).params)
         case "frames":
             return at + 68 + 16 * number("I", at + 64)
         case "images":

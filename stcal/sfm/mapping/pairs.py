@@ -125,7 +125,12 @@ def _score(
         return PairScore(a.name, b.name, n, 0.0, 0.0, 0.0, None, f"{n} labels in common, {MIN_LABELS} needed")
     xy_a, xy_b = a.centre[matches[:, 0]], b.centre[matches[:, 1]]
     if board is not None and share_board_alone(a, b):
-        pose = _pose_by_board(xy_a, xy_b, board.places_mm(a.labels[i] for i in matches[:, 0])[:, :2])
+        xy_mm, pose = board.places_mm(a.labels[i] for i in matches[:, 0])[:, :2], None
+        on_a, on_b = planar_pose(xy_mm, xy_a), planar_pose(xy_mm, xy_b)
+        if on_a is not None and on_b is not None:
+            b_from_a = on_b @ on_a.inverse()
+            length = float(np.linalg.norm(b_from_a.translation))
+            pose = Rigid(b_from_a.rotation, b_from_a.translation / length) if length > 0 else None
     else:
         pose = _relative_pose(xy_a, xy_b, RANSAC_PX / float(np.sqrt(camera.focal.prod())))
     if pose is None:
@@ -136,7 +141,11 @@ def _score(
     angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
     in_front, forward = float(front.mean()), float(abs(pose.translation[2]))
     # If a rotation explains the pair, only noise determines the translation: angles and depths are meaningless.
-    if _is_rotation(xy_a, xy_b, camera):
+    rays_a, rays_b = (np.column_stack([xy, np.ones(n)]) for xy in (xy_a, xy_b))
+    rays_a /= np.linalg.norm(rays_a, axis=1)[:, None]
+    rays_b /= np.linalg.norm(rays_b, axis=1)[:, None]
+    error = np.linalg.norm(rays_b - rays_a @ best_rotations(rays_b.T @ rays_a)[0].T, axis=1)
+    if np.sqrt((error**2).mean()) * camera.focal.max() < RANSAC_PX:
         angle = min(angle, MIN_ANGLE_RAD / 2)
         verdict = "a mere rotation explains the pair: the camera hardly moved"
     elif angle < MIN_ANGLE_RAD:
@@ -148,17 +157,6 @@ def _score(
     else:
         verdict = "usable"
     return PairScore(a.name, b.name, n, angle, in_front, forward, pose, verdict)
-
-
-def _is_rotation(xy_a: np.ndarray, xy_b: np.ndarray, camera: Camera) -> bool:
-    """Returns whether a pure rotation of the camera explains the pair to one pixel RMS."""
-    rays_a = np.column_stack([xy_a, np.ones(len(xy_a))])
-    rays_b = np.column_stack([xy_b, np.ones(len(xy_b))])
-    rays_a /= np.linalg.norm(rays_a, axis=1)[:, None]
-    rays_b /= np.linalg.norm(rays_b, axis=1)[:, None]
-    rotation, _ = best_rotations(rays_b.T @ rays_a)
-    error = np.linalg.norm(rays_b - rays_a @ rotation.T, axis=1)
-    return bool(np.sqrt((error**2).mean()) * camera.focal.max() < RANSAC_PX)
 
 
 def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigid | None:
@@ -179,16 +177,6 @@ def share_board_alone(a: ImageObservations, b: ImageObservations) -> bool:
     return all(isinstance(label, DotLabel) for label in set(a.labels) & set(b.labels))
 
 
-def _pose_by_board(xy_a: np.ndarray, xy_b: np.ndarray, xy_mm: np.ndarray) -> Rigid | None:
-    """Returns b_from_a with unit translation, from the poses of the board in both images."""
-    a, b = planar_pose(xy_mm, xy_a), planar_pose(xy_mm, xy_b)
-    if a is None or b is None:
-        return None
-    b_from_a = b @ a.inverse()
-    length = float(np.linalg.norm(b_from_a.translation))
-    return Rigid(b_from_a.rotation, b_from_a.translation / length) if length > 0 else None
-
-
 def triangulate(xy_a: np.ndarray, xy_b: np.ndarray, b_from_a: Rigid) -> tuple[np.ndarray, np.ndarray]:
     """Returns points (n, 3) in frame a by linear triangulation, and the mask of points in front of both cameras."""
     rows = np.zeros((len(xy_a), 4, 4))
@@ -205,14 +193,10 @@ def triangulate(xy_a: np.ndarray, xy_b: np.ndarray, b_from_a: Rigid) -> tuple[np
 GraphKind = Literal["all", "sparse"]
 SPARSE_FROM = 80
 """Largest set of images that gets all pairs. Above it the sparse graph is faster (scripts/studies/scale_study.py)."""
-MIN_SHARED = 6
-"""Smallest number of common labels of a pair of images that is written."""
-SKELETON = 20
-"""Number of images of a group that are mapped first. Smaller groups are mapped as a whole."""
-MIN_VIEWS = 3
-"""Smallest number of views of every circle in the skeleton, if the group has that many."""
-NEIGHBOURS = 3
-"""Smallest number of skeleton images that each image outside the skeleton is paired with."""
+MIN_SHARED = 6  # smallest number of common labels of a pair of images that is written
+SKELETON = 20  # number of images of a group that are mapped first. Smaller groups are mapped as a whole.
+MIN_VIEWS = 3  # smallest number of views of every circle in the skeleton, if the group has that many
+NEIGHBOURS = 3  # smallest number of skeleton images that each image outside the skeleton is paired with
 MIN_DOTS = 6
 
 

@@ -34,12 +34,10 @@ from stcal.sfm.mapping.models import assemble
 from stcal.sfm.mapping.pairs import PairScore
 
 BY_FACES = "faces of known shape, placed together"
-LENS = "OPENCV"
-"""Model of an unknown camera."""
+LENS = "OPENCV"  # model of an unknown camera
 SIGMA_FOCAL, SIGMA_SQUARE = 0.5, 2e-3
 """Relative σ of the focal length of an unknown camera, and of the ratio of its two focal lengths."""
-SIGMA_CENTRE = 0.03
-"""σ of its principal point, in longer image sides."""
+SIGMA_CENTRE = 0.03  # σ of its principal point, in longer image sides
 SIGMA_RADIAL, SIGMA_TANGENTIAL = np.array([0.3, 0.1]), 0.003
 """σ of its distortion, as shares of a corner's distance from the middle of the image: lenses of cameras have no more,
 and few or small faces would take noise for it."""
@@ -92,8 +90,7 @@ def place_with_camera(
     """Returns the body by its faces, with a known camera; for faces of circles the design is a start."""
     corners = Corners.of(observations, faces)
     _require_sizes(corners, camera)
-    none = np.zeros((16, 0))
-    body = settled_body(place_body(corners, camera), corners, none, np.zeros((0, 0)), camera)
+    body = settled_body(place_body(corners, camera), corners, np.zeros((16, 0)), np.zeros((0, 0)), camera)
     return _named(body, corners, camera)
 
 
@@ -123,24 +120,23 @@ def place_and_find_camera(
 
 def _require_sizes(corners: Corners, camera: Camera) -> None:
     """Refuses faces of which some are drawn at another size than the others. A rough camera is enough."""
-    wrong = wrong_sizes(corners, camera)
-    if not wrong.factors:
+    wrong, alike = wrong_sizes(corners, camera)
+    if not wrong:
         return
-    names = [corners.faces[face].id for face in wrong.factors]
-    if wrong.alike < len(names):
-        factors = list(wrong.factors.values())
-        told = f"face {names[-1]} is {factors[-1] / factors[0]:.3g} times as large against face {names[0]}"
-        raise MappingError(
-            "E-BODY-SIZES",
-            f"target: sizes of faces {' and '.join(names)} contradict one another: by the photographs, {told} as "
-            "target.toml states; measure the side of each print, and correct it",
+    names, factors = [corners.faces[face].id for face in wrong], list(wrong.values())
+    if alike < len(names):
+        told = (
+            f"sizes of faces {' and '.join(names)} contradict one another: by the photographs, face {names[-1]} is "
+            f"{factors[-1] / factors[0]:.3g} times as large against face {names[0]} as target.toml states; measure the "
+            "side of each print"
         )
-    told = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, wrong.factors.values(), strict=True))
-    raise MappingError(
-        "E-BODY-SIZES",
-        f"target: the photographs show {told} times as large as target.toml states, and the sizes of {wrong.alike} "
-        "other faces agree with one another; measure the side of its print, and correct it",
-    )
+    else:
+        each = ", ".join(f"face {name} {v:.3g}" for name, v in zip(names, factors, strict=True))
+        told = (
+            f"the photographs show {each} times as large as target.toml states, and the sizes of {alike} other faces "
+            "agree with one another; measure the side of its print"
+        )
+    raise MappingError("E-BODY-SIZES", f"target: {told}, and correct it")
 
 
 def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
@@ -159,8 +155,8 @@ def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
 def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
     placed = np.flatnonzero(body.placed_faces).tolist()
     return PlacedBody(
-        {corners.faces[f].id: body.body_from_face.rigid(f) for f in placed},
-        {corners.images[i]: body.camera_from_body.rigid(i) for i in np.flatnonzero(body.placed_images).tolist()},
+        {corners.faces[f].id: body.body_from_face[f] for f in placed},
+        {corners.images[i]: body.camera_from_body[i] for i in np.flatnonzero(body.placed_images).tolist()},
         tuple(corners.faces[f] for f in placed),
         camera,
         tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),

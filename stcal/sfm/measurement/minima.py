@@ -7,9 +7,9 @@ import numpy as np
 
 from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
-from stcal.geometry.least_squares import Minima, Normal, PoseStack, block_diagonal
+from stcal.geometry.least_squares import Minima, Normal, block_diagonal
 from stcal.geometry.plane import MAX_OUTLIER_SHARE, Descend, camera_from_plane, fit_homography, two_minima
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles
@@ -38,7 +38,7 @@ class PoseProblem:
     shape: np.ndarray  # (3n, 3n) mm² covariance of the circles
     outliers: tuple[Outlier, ...] = ()  # circles that were left out
 
-    def seen(self, poses: PoseStack) -> tuple[np.ndarray, CircleImages]:
+    def seen(self, poses: Poses) -> tuple[np.ndarray, CircleImages]:
         """Returns, for h poses, measured minus projected centres (h, n, 2), and the projections."""
         image = project_circles(self.xyz, self.normal, self.radius, poses.rotation, poses.translation)
         return self.centre - image.centre, image
@@ -69,7 +69,7 @@ def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.n
     return full + by_camera @ problem.prior @ by_camera.T
 
 
-def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
+def descent_near(problem: PoseProblem, pose: Poses) -> Descend:
     """Returns the descent near a pose, with residuals whitened by the σ of each centre's noise and own circle, and
     Huber's loss."""
     by_circle = problem.seen(pose)[1].by_circle
@@ -78,10 +78,10 @@ def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
     covariance = problem.noise + by_circle @ own @ np.swapaxes(by_circle, -1, -2)
     whiten = block_diagonal(np.linalg.inv(np.linalg.cholesky(covariance)))
 
-    def descend(poses: PoseStack, huber: float) -> Minima:
+    def descend(poses: Poses, huber: float) -> Minima:
         h = len(poses)
 
-        def evaluate(poses: PoseStack) -> Normal:
+        def evaluate(poses: Poses) -> Normal:
             residual, image = problem.seen(poses)
             r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
             return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), np.all(image.depth > 0, axis=1), huber)
@@ -99,7 +99,7 @@ MIN_BREADTH = 0.05
 """Least ratio of breadth to length of the visible circles. Circles in a row leave the rotation about the row open."""
 
 
-def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[PoseStack, Rigid]:
+def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[Poses, Rigid]:
     """Returns the pose from the homography of the face with the most circles, and target_from_plane of that face."""
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(problem.labels):
@@ -117,7 +117,7 @@ def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple
         if len(faces[face]) >= MIN_CIRCLES:
             pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
             if isinstance(pose, Rigid):
-                return PoseStack.of(pose), target.target_from_plane[face]
+                return Poses.of([pose]), target.target_from_plane[face]
             reasons.append(pose)
     raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
 
@@ -139,9 +139,7 @@ def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int
     return pose
 
 
-def minima_without_outliers(
-    problem: PoseProblem, start: PoseStack, plane: Rigid, where: str
-) -> tuple[Minima, PoseProblem]:
+def minima_without_outliers(problem: PoseProblem, start: Poses, plane: Rigid, where: str) -> tuple[Minima, PoseProblem]:
     """Returns the minima without centres that contradict the others, and the problem without these."""
     count, alone = len(problem.labels), len({label.face for label in problem.labels}) == 1
     failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"

@@ -9,18 +9,17 @@ import numpy as np
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields, rms
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.least_squares import Minima, PoseStack, block_diagonal
+from stcal.geometry.least_squares import Minima, block_diagonal
 from stcal.geometry.plane import (
     MAX_SIGMA_RAD,
     OUTLIER,
     deciding_delta,
     distinct,
     mirrored,
-    step_between,
     weigh,
     weights_of,
 )
-from stcal.geometry.rigid import ImageFit, Rigid
+from stcal.geometry.rigid import ImageFit, Poses, Rigid
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
@@ -49,11 +48,11 @@ OTHER_SIDE = 3.0
 
 def covariance_of_likelihood(
     problem: PoseProblem,
-    pose: PoseStack,
+    pose: Poses,
     full: np.ndarray,
     least: float,
     covariance: np.ndarray,
-    second: PoseStack | None,
+    second: Poses | None,
     plane: Rigid | None,
     plausible: float,
 ) -> tuple[np.ndarray, float]:
@@ -66,7 +65,7 @@ def covariance_of_likelihood(
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
     def excess(step: np.ndarray) -> np.ndarray:
-        poses = PoseStack(np.repeat(pose.rotation, len(step), 0), np.repeat(pose.translation, len(step), 0)).moved(step)
+        poses = pose[np.zeros(len(step), int)].moved(step)
         residual, image = problem.seen(poses)
         square = ((residual.reshape(len(step), -1) @ whiten.T) ** 2).sum(1)
         return np.where((image.depth > 0).all(1), square, np.inf)
@@ -76,7 +75,7 @@ def covariance_of_likelihood(
     other_side, first = np.inf, covariance
     if plane is not None:
         image_pose = mirrored(pose, plane)
-        step_to_mirrored = step_between(pose, image_pose)
+        step_to_mirrored = image_pose.difference(pose)[0]
         square = float(step_to_mirrored @ np.linalg.solve(covariance, step_to_mirrored))
         delta = _best_of_tilt(problem, image_pose, plane, whiten) - least
         if delta < min(plausible, square / 2) and square > OTHER_SIDE**2:
@@ -85,7 +84,7 @@ def covariance_of_likelihood(
     return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
 
 
-def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: np.ndarray) -> float:
+def _best_of_tilt(problem: PoseProblem, pose: Poses, plane: Rigid, whiten: np.ndarray) -> float:
     """Returns χ² of a pose after all parameters but the tilt of the plane are adjusted, to first order."""
     residual, image = problem.seen(pose)
     free = np.zeros((6, 4))
@@ -96,7 +95,7 @@ def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: n
     return float(residual_after @ residual_after)
 
 
-def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, second: PoseStack | None) -> np.ndarray:
+def _sampled(excess, least: float, pose: Poses, covariance: np.ndarray, second: Poses | None) -> np.ndarray:
     """Returns the second moment (6, 6) of exp(−(excess − least)/2) about the pose, first guessed as ``covariance``."""
     normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
     precision = np.linalg.inv(covariance)
@@ -104,7 +103,7 @@ def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, seco
         step = SAMPLED_WIDER * normal @ _principal(covariance)
         log = (normal**2).sum(1) / 2 - (excess(step) - least) / 2
         if second is not None:
-            step_to_second = step_between(pose, second)
+            step_to_second = second.difference(pose)[0]
             log[(step - step_to_second / 2) @ precision @ step_to_second > 0] = -np.inf
         weight = np.exp(log - log.max())
         weight /= weight.sum()
@@ -291,7 +290,7 @@ def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOpti
     return replace(first, status="ambiguous", second=other)
 
 
-def _second_solution(problem: PoseProblem, found: Minima) -> tuple[float, PoseStack | None]:
+def _second_solution(problem: PoseProblem, found: Minima) -> tuple[float, Poses | None]:
     """Returns the excess in χ² of the second minimum, and its pose; infinite and None if there is none. Both minima
     give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide."""
     if len(found.cost) == 1:
@@ -308,7 +307,7 @@ def _second_solution(problem: PoseProblem, found: Minima) -> tuple[float, PoseSt
 
 
 def _solution(
-    problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
+    problem: PoseProblem, minimum: Minima, second: Poses | None, plane: Rigid | None, options: PoseOptions
 ) -> TargetPose:
     """Returns a minimum weighed by the whole covariance of its centres in two steps: the first errs by second order.
     Its ``delta_chi2`` is that of the other side of a wide valley, infinite if the minimum is no valley."""
@@ -339,7 +338,7 @@ def _solution(
     )
     parts["curvature"] = covariance - gaussian
     return TargetPose(
-        camera_from_target=last.poses.rigid(0),
+        camera_from_target=last.poses[0],
         covariance=(covariance + covariance.T) / 2,
         parts=parts,
         by_circles=by_circles,

@@ -21,7 +21,7 @@ from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.file import FacePoses
-from stcal.sfm.adjust.joint import Extensible, covariance_of, extensible
+from stcal.sfm.adjust.joint import Extensible, unmoved
 from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
@@ -291,7 +291,7 @@ def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
 def forecast(models: Sequence[MetricModel], setup: Setup, known: Derivatives | None = None) -> Forecast:
     """Returns the σ of metric models, mm, target frame, as the joint adjustment would state them. ``known``:
     derivatives of an earlier forecast of the same circles."""
-    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
+    joint = unmoved(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common).result(1.0)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.circle_covariance(joint.covariance_mm2)
     reference = setup.start.reference_face
@@ -317,7 +317,7 @@ class PositionsWith:
     @classmethod
     def of(cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives) -> "PositionsWith":
         """Prepares views in addition to these models. ``known`` is as in :func:`forecast`."""
-        now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common)
+        now = unmoved(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common).extensible()
         faces = known.face_covariance(setup.circle_covariance(now.covariance_mm2))
         variance = {f: position_sigma_mm(c) ** 2 for f, c in faces.items() if f != setup.start.reference_face}
         jacobian = np.concatenate([known.faces[face][3:] for face in variance])

@@ -8,8 +8,7 @@ import pytest
 from stcal.adjust.blocks import Vector
 from stcal.adjust.engine import Adjustment
 from stcal.design import BoardDesign
-from stcal.geometry.least_squares import PoseStack
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel, DotLabel
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.equations import Group, Setting
@@ -34,7 +33,7 @@ def test_without_cameras_it_is_the_schur_complement_of_the_full_equations(group,
     basis = np.eye(16)[:, :intrinsics]
     a = Adjustment()
     points = a.block("points", Vector(model.xyz_model))
-    poses = a.block("poses", PoseStack.of(*model.camera_from_model), eliminate=True)
+    poses = a.block("poses", Poses.of(model.camera_from_model), eliminate=True)
     lens = a.block("lens", Vector(np.zeros((1, intrinsics))))
 
     def camera_at(lens: Vector):

@@ -7,7 +7,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board, load_target, target_toml
-from stcal.sfm.adjust.joint import adjust_jointly
+from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -106,7 +106,7 @@ def test_a_board_states_the_rims_of_its_dots(scene, tmp_path):
 
 def test_rims_of_dots_move_the_board_and_no_face(scene):
     models = true_models(scene, observe(scene, 0.01, np.random.default_rng(0)))
-    seen, surface = (adjust_jointly(models, replace(scene.board, rim_mm=h), scene.camera) for h in (0.0, 0.3))
+    seen, surface = (adjusted(models, replace(scene.board, rim_mm=h), scene.camera).result() for h in (0.0, 0.3))
     np.testing.assert_allclose(surface.xyz_model, seen.xyz_model, atol=1e-6)
     moved = surface.model_from_board["12"].translation - seen.model_from_board["12"].translation
     np.testing.assert_allclose(moved, 0.15 * seen.model_from_board["12"].rotation[:, 2], atol=1e-6)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from stcal.geometry.least_squares import PoseStack
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.sfm.detect.group_geometry import PlaneBundle
 
 FOCAL_PX = 1000.0
@@ -23,9 +22,9 @@ def test_an_image_without_points_keeps_its_pose():
             seen.append(FOCAL_PX * at[:, :2] / at[:, 2:])
     bundle = PlaneBundle(np.array(image), np.array(plane), np.concatenate(xyz), np.concatenate(seen), FOCAL_PX)
     off = Rigid.exp([2e-3, -1e-3, 1e-3, 0.5, 0.3, 1.0])
-    start = PoseStack.of(*(pose @ off for pose in poses))
-    found, world_from_plane = bundle.adjusted(start, PoseStack.of(planes[0], planes[1] @ off))
+    start = Poses.of(pose @ off for pose in poses)
+    found, world_from_plane = bundle.adjusted(start, Poses.of([planes[0], planes[1] @ off]))
     for i in (0, 2):
-        np.testing.assert_allclose(found.rigid(i).matrix(), poses[i].matrix(), atol=1e-6)
-    np.testing.assert_array_equal(found.rigid(1).matrix(), (poses[1] @ off).matrix())
-    np.testing.assert_allclose(world_from_plane.rigid(1).matrix(), planes[1].matrix(), atol=1e-6)
+        np.testing.assert_allclose(found[i].matrix(), poses[i].matrix(), atol=1e-6)
+    np.testing.assert_array_equal(found[1].matrix(), (poses[1] @ off).matrix())
+    np.testing.assert_allclose(world_from_plane[1].matrix(), planes[1].matrix(), atol=1e-6)

@@ -198,7 +198,7 @@ def test_an_unknown_schema_and_a_folder_that_is_not_there(refused):
 
 def test_nothing_is_overwritten(refused, tmp_path):
     (tmp_path / "out.db").write_text("mine")
-    assert "out.db: exists, and is not overwritten" in refused()
+    assert "out.db: exists, and nothing is overwritten" in refused()
     (tmp_path / "link.db").symlink_to(tmp_path / "nowhere")
     assert "link.db: exists" in refused(out="link.db")
 

@@ -15,7 +15,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior, model_of
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
+from stcal.sfm.adjust.joint import adjusted, unmoved
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.planning import bodies, session, views
@@ -79,7 +79,7 @@ def models_of(scene: Scene, noise: CentreNoise = NOISE) -> list[MetricModel]:
 
 def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> list[MetricModel]:
     """The models with dots displaced by the board's σ, one plate or one for each group, and noisy centres."""
-    model_from_board = covariance_of(models, setup.board, setup.camera).model_from_board
+    model_from_board = unmoved(models, setup.board, setup.camera).result(1.0).model_from_board
     labels = setup.board.labels()
     plate = rng.normal(0, setup.board.sigma_mm, (len(labels), 3))
     noisy = []
@@ -97,10 +97,10 @@ def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> 
 def errors_of(models: list[MetricModel], setup: Setup, expected: Forecast, draws: int, seed: int):
     """Pose errors by face, (draws, 6), of adjusted simulations, and the last adjustment."""
     rng = np.random.default_rng(seed)
-    truth = covariance_of(models, setup.board, setup.camera).xyz_model
+    truth = unmoved(models, setup.board, setup.camera).result(1.0).xyz_model
     rows = []
     for _ in range(draws):
-        joint = adjust_jointly(drawn(models, setup, rng), setup.board, setup.camera)
+        joint = adjusted(drawn(models, setup, rng), setup.board, setup.camera).result()
         rows.append((joint.xyz_model - truth).ravel())
     return {face: np.array(rows) @ expected.derivatives.faces[face].T for face in expected.face_covariance}, joint
 
@@ -178,7 +178,7 @@ def test_centre_noise_is_found_again(exact):
 
 def known_from(scene: Scene) -> Known:
     setup, models = setup_of(scene, 0.005), tuple(models_of(scene))
-    joint = covariance_of(models, setup.board, setup.camera)
+    joint = unmoved(models, setup.board, setup.camera).result(1.0)
     return Known(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
 
 
@@ -452,7 +452,7 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     found = []
     for first in (True, False):
         monkeypatch.setattr(equations, "is_dots_first_cheaper", lambda _, first=first: first)
-        found.append(covariance_of(models, board, exact.camera, 0.02, prior, common))
+        found.append(unmoved(models, board, exact.camera, 0.02, prior, common).result(1.0))
     dots, cameras = found
     np.testing.assert_allclose(
         dots.covariance_mm2, cameras.covariance_mm2, rtol=0, atol=1e-8 * cameras.covariance_mm2.max()

@@ -12,7 +12,7 @@ from stcal.io.images import find_images
 from stcal.labels import DotLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import SigmaFactors, image_sigma_factors, with_sigma
-from stcal.sfm.adjust.joint import adjust_jointly
+from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
@@ -141,7 +141,7 @@ def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only)
             )
             for m in labels_only.models(scene, observed)
         ]
-        joint = adjust_jointly(models, board, scene.camera)
+        joint = adjusted(models, board, scene.camera).result()
         results.append((joint.sigma0, calibrated_target(joint, chained, scene.target, "plane").face_covariance["3"]))
         # Six free directions, and no more: the rank of the datum of smallest trace.
         value = np.linalg.eigvalsh(joint.covariance_mm2)
