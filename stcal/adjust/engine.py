@@ -330,17 +330,20 @@ class Solution:
             if rows.factor.cluster is not None:
                 yield rows.factor.cluster, rows.total(ways), rows.residual
 
-    def _ways(self, along: np.ndarray) -> dict[str, np.ndarray]:
-        """Return by block how its members (n, dim, q) change by ``along`` (k, q), eliminated members going with it."""
-        kept = {b.name: (len(b.start), b.start.dim, along.shape[1]) for b in self.problem.blocks if not b.eliminate}
-        ways = {name: along[self.places[name]].reshape(shape) for name, shape in kept.items()}
+    def _ways(self, along: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Return by block how its members (n, dim, q) change by ``along`` (k, q), of each kept unknown by itself if
+        None, eliminated members going with it."""
+        every = np.eye(self.kept) if along is None else along
+        kept = {b.name: (len(b.start), b.start.dim, every.shape[1]) for b in self.problem.blocks if not b.eliminate}
+        ways = {name: every[self.places[name]].reshape(shape) for name, shape in kept.items()}
         if self.dropped:
-            ways[self.dropped.name] = -(self.reduction.from_kept @ along)
+            by = self.reduction.from_kept
+            ways[self.dropped.name] = -by if along is None else -(by @ along)
         return ways
 
     @cached_property
     def _each(self) -> dict[str, np.ndarray]:
-        return self._ways(np.eye(self.kept))
+        return self._ways()
 
     def without(self, cluster: int) -> dict[str, Any]:
         """Return the values one step after leaving out a cluster (influence: Cook & Weisberg 1982)."""

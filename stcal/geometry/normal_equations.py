@@ -12,6 +12,8 @@ SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
 
 TINY = 1e-300
+SPARSE = 0.1
+"""Share of entries that are not 0 below which a product of sparse matrices is faster."""
 LARGE = 100  # number of unknowns of a block from which on its inverse is computed from Cholesky's factors
 
 
@@ -55,7 +57,12 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
             solved[:] = np.linalg.solve(own, solved) if fault else dpotrs(factor, solved, lower=True)[0]
         from_kept, step = np.ascontiguousarray(both[..., :k]), both[..., k]
     flat, weighted = cross.reshape(m * a, k), from_kept.reshape(m * a, k)
-    return Reduction(flat.T @ weighted, weighted.T @ right.ravel(), step, from_kept, block, float((right * step).sum()))
+    of_kept = weighted.T @ right.ravel()
+    if np.count_nonzero(flat) < SPARSE * flat.size:  # dots of a plate, each tied to its own place on it
+        normal = (csr_array(flat).T @ csr_array(weighted)).toarray()
+    else:
+        normal = flat.T @ weighted
+    return Reduction(normal, of_kept, step, from_kept, block, float((right * step).sum()))
 
 
 def inverse_and_size(normal: np.ndarray) -> tuple[np.ndarray, float]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from stcal.adjust.blocks import Block, Huber, Vector
 from stcal.adjust.engine import Adjustment, Joined
@@ -46,20 +47,41 @@ def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarra
     return huber_weights(np.linalg.norm(normalised(model, camera), axis=1), huber)
 
 
-def rows_of_view(
-    model: GroupModel, camera: Camera, basis: np.ndarray, root: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened equations (2n − 6, 3p + q) of one image over points and intrinsics, orthogonal to its pose, and the
-    directions (2n, 2n − 6) of its coordinates that they are; ``root``: (2n,) of robust weights."""
-    by_pose, by_point = projection_jacobians(model, camera)
-    n, p = len(model.point_index), len(model.labels)
-    rows = np.zeros((n, 2, 3 * p + basis.shape[1]))
-    columns = 3 * model.point_index[:, None] + np.arange(3)
-    rows[np.arange(n)[:, None, None], np.arange(2)[:, None], columns[:, None]] = model.whiten(by_point)
-    rows[:, :, 3 * p :] = model.whiten(model.by_parameters(camera) @ basis)
-    weight = (np.ones(2 * n) if root is None else root)[:, None]
-    across = np.linalg.qr(weight * model.whiten(by_pose).reshape(2 * n, 6), mode="complete")[0][:, 6:]
-    return across.T @ (weight * rows.reshape(2 * n, -1)), across
+@dataclass(frozen=True, slots=True, eq=False)
+class RowsOfView:
+    """Whitened derivatives of one image by points and intrinsics, of which its pose takes six directions."""
+
+    rows: csr_array  # (2n, 3p + q)
+    pose: np.ndarray  # (2n, 6) orthonormal
+
+    @classmethod
+    def of(cls, model: GroupModel, camera: Camera, basis: np.ndarray, root: np.ndarray | None = None) -> "RowsOfView":
+        """Returns the rows of a model of one image; ``root``: (2n,) of robust weights."""
+        by_pose, by_point = projection_jacobians(model, camera)
+        n, p = len(model.point_index), 3 * len(model.labels)
+        weight = (np.ones(2 * n) if root is None else root).reshape(n, 2, 1)
+        by_point, lens, by_pose = (
+            weight * model.whiten(each) for each in (by_point, model.by_parameters(camera) @ basis, by_pose)
+        )
+        columns = np.concatenate(
+            [3 * model.point_index[:, None] + np.arange(3), np.tile(p + np.arange(basis.shape[1]), (n, 1))], axis=1
+        )
+        values, size = np.concatenate([by_point, lens], axis=2), columns.shape[1]
+        starts = np.arange(0, 2 * n * size + 1, size)
+        rows = csr_array((values.ravel(), np.repeat(columns, 2, axis=0).ravel(), starts), (2 * n, p + basis.shape[1]))
+        return cls(rows, np.linalg.qr(by_pose.reshape(2 * n, 6))[0])
+
+    def free(self, values: np.ndarray) -> np.ndarray:
+        """Returns (2n, …) without what the pose takes."""
+        return values - self.pose @ (self.pose.T @ values)
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """Returns the change (2n, k) of the rows along directions (3p + q, k), the pose adjusted."""
+        return self.free(self.rows @ directions)
+
+    def square(self, covariance: np.ndarray) -> np.ndarray:
+        """Returns the covariance (2n, 2n) of the rows by that of points and intrinsics, the pose adjusted."""
+        return self.along(self.along(covariance).T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

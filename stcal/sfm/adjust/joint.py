@@ -29,6 +29,7 @@ from stcal.sfm.adjust.equations import (
     SHAPE,
     UNKNOWN_SHAPES,
     Group,
+    RowsOfView,
     Setting,
     ShapeFactors,
     bars,
@@ -36,7 +37,6 @@ from stcal.sfm.adjust.equations import (
     normalised,
     planes,
     robust_weights,
-    rows_of_view,
     shapes,
 )
 from stcal.sfm.adjust.scale import MIN_DOTS
@@ -253,9 +253,9 @@ class Extensible:
     def lowered(self, view: MetricModel, to_functions: np.ndarray) -> np.ndarray:
         """Returns by how much one more view lowers the variances of f functions of the circles, (f,) (Woodbury 1950).
         ``to_functions``: (3p + q, f) covariance between points and intrinsics, and the functions."""
-        rows, _ = rows_of_view(view, self.camera, self.basis)
-        inner = np.eye(len(rows)) + rows @ self.points[view.group] @ rows.T
-        half = solve_triangular(np.linalg.cholesky(inner), rows @ to_functions, lower=True)
+        rows = RowsOfView.of(view, self.camera, self.basis)
+        inner = np.eye(len(rows.pose)) + rows.square(self.points[view.group])
+        half = solve_triangular(np.linalg.cholesky(inner), rows.along(to_functions), lower=True)
         return (half**2).sum(0)
 
 

@@ -15,12 +15,12 @@ from stcal.sfm.adjust.equations import (
     CAMERA,
     CIRCLES,
     DOTS,
+    RowsOfView,
     bars,
     coordinates,
     normalised,
     planes,
     robust_weights,
-    rows_of_view,
     shapes,
 )
 from stcal.sfm.adjust.faces import FrameKind, face_frames, missing_frame_circles, placement_sigma_mm, with_unmapped
@@ -312,10 +312,10 @@ def with_differences(state: Adjusted, start: CalibratedTarget, target: TargetDes
         for rows in model.rows_by_image():
             view = model.observed(rows)
             root = np.repeat(np.sqrt(robust_weights(view, camera, state.setting.huber)), 2)
-            equations, across = rows_of_view(view, camera, basis, root)
-            residual = across.T @ (root * normalised(view, camera).ravel())
-            expected = to_faces.T @ equations.T
-            pull = expected @ released(residual, equations @ points @ equations.T)
+            rows_of = RowsOfView.of(view, camera, basis, root)
+            expected = rows_of.along(to_faces).T
+            residual = rows_of.free(root * normalised(view, camera).ravel())
+            pull = expected @ released(residual, rows_of.square(points))
             scatter += np.outer(pull, pull)
             told += expected @ expected.T
     ratios = []
