@@ -24,9 +24,10 @@ import numpy as np
 from bench_rows import ADVISED, GROUPS, TREE, timed_advice, timed_boards, timed_handeye, timed_tree
 
 from scripts.runner import options_of
+from stcal.boards.board_file import board_toml, load_dots
+from stcal.boards.target_file import load_target
 from stcal.design import reference_board
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_toml, load_board, load_target
 from stcal.parallel import run_parallel
 
 FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
@@ -162,7 +163,7 @@ def timed_stream(data: Path, out: Path, workers: int) -> float:
     from stcal.sfm import MeasureOptions, read_target
     from stcal.sfm import measure as measure_images
 
-    design, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    design, board = load_target(data / "target.toml"), load_dots(data / "board.toml")
     circles, camera = read_target(out / "faces.json", design), read_camera(data / "cameras.txt")
     start = time.perf_counter()
     result = measure_images(data / "images", camera, circles, design, board, MeasureOptions(workers=workers))
@@ -217,7 +218,7 @@ def timed_detection(data: Path, cache: Path):
     from stcal.sfm.detect.circles.candidates import EllipseOptions
     from stcal.sfm.detect.files import detect_files
 
-    designs = load_target(data / "target.toml"), load_board(data / "board.toml")
+    designs = load_target(data / "target.toml"), load_dots(data / "board.toml")
     camera, (files, _) = read_camera(data / "cameras.txt"), find_images(data / "images")
     start = time.perf_counter()
     result = detect_files(files, camera, *designs, EllipseOptions(), cache)
@@ -274,7 +275,7 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
         for name, image in group["images"].items()
     }
     paths = [data / "images" / name for name in true]
-    camera, board = read_camera(data / "cameras.txt"), load_board(data / "board.toml")
+    camera, board = read_camera(data / "cameras.txt"), load_dots(data / "board.toml")
     megabytes = sum(len(path.read_bytes()) for path in paths) / 1e6
     rows = {"decoding alone": {"seconds": timed_decoding(paths)}}
     words = ["run", "--no-strict", data / "images", *files_of(data), "--out", scratch / "run"]
@@ -344,7 +345,7 @@ def detection_profile(paths: list[Path], data: Path) -> dict[str, float]:
     from stcal.sfm.detect import files, image
     from stcal.sfm.detect.circles.candidates import EllipseOptions
 
-    target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    target, board = load_target(data / "target.toml"), load_dots(data / "board.toml")
     camera = read_camera(data / "cameras.txt")
     camera = camera.sized(camera.width, camera.height)
     found: dict[str, float] = {}
@@ -385,7 +386,7 @@ def processor_time(paths: list[Path], data: Path) -> dict[str, float]:
     from stcal.sfm.detect.circles.candidates import EllipseOptions
     from stcal.sfm.detect.image import detect_image
 
-    target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    target, board = load_target(data / "target.toml"), load_dots(data / "board.toml")
     camera = read_camera(data / "cameras.txt")
     camera = camera.sized(camera.width, camera.height)
     pictures = [decode(path.read_bytes(), path.name) for path in paths]

@@ -10,7 +10,7 @@ from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessb
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
 from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, seen_otherwise, view_of_tags
-from stcal.boards.target import tags_on
+from stcal.boards.target_file import tags_on
 from stcal.design import FaceDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera

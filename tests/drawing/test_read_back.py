@@ -6,12 +6,12 @@ import pytest
 from stcal.boards.chessboard import find_charuco, find_chessboard
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.tags import find_aprilgrid, find_tags
+from stcal.boards.target_file import target_toml
 from stcal.design import BoardDesign, TargetDesign, reference_target
 from stcal.drawing.draw import draw
 from stcal.drawing.parts import Area, Disc, parts_of
 from stcal.drawing.sheets import one_sheet
 from stcal.geometry.plane import apply_homography
-from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_images, label_single  # noqa: F401

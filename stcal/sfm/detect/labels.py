@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stcal.boards.board_file import board_of
 from stcal.boards.design import CornerBoard
-from stcal.boards.file import run_board_of
-from stcal.boards.target import body_of
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.arrays import ByValue, require_arguments
 from stcal.geometry.camera import Camera
@@ -177,8 +177,8 @@ def detect_circles(
         The array is no image, or not of the camera's size.
     """
     grey = grey_of(image, "image")
-    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), body_of(target)
-    board = None if board is None else run_board_of(board)
+    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), target_of(target)
+    board = None if board is None else board_of(board)
     found = detect_image(grey, camera, target, board, options or EllipseOptions())
     circles, labelled = target.with_faces(printed=False), unlabelled("image", "", found)
     if circles.faces or board is not None:

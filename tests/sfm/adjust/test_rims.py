@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import board_toml, load_board
+from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
-from stcal.io.design import board_toml, load_board, load_target, target_toml
 from stcal.sfm.adjust.joint import adjust_jointly
 from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board import rim_check
