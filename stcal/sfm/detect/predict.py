@@ -1,18 +1,19 @@
 """Search for circles at places predicted by an arrangement, or by the previous image."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from stcal.design import BoardDesign, Polarity, TargetDesign
+from stcal.design import Polarity
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres, ImageObservations
-from stcal.sfm.data.patterns import MAX_TILT_RAD, ideal_border, images_px, in_view, patterns_of
+from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
 from stcal.sfm.detect.circles.candidates import (
     MAX_POSITION_ERROR,
     MAX_POSITION_ERROR_PX,
@@ -23,7 +24,6 @@ from stcal.sfm.detect.circles.candidates import (
 )
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.circles.fits import MIN_SIGMA
-from stcal.sfm.detect.group_geometry import Arrangement
 
 MAX_STRETCH = 1.15
 """Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end. If an
@@ -79,28 +79,22 @@ class SecondLook:
 
 
 def predict_circles(
-    arrangement: Arrangement,
-    image: int,
-    seen: Sequence[Label],
-    target: TargetDesign,
-    board: BoardDesign | None,
+    camera_from_group: Rigid,
+    group_from_plane: Mapping[str, Rigid],
+    seen: Collection[Label],
+    patterns: Mapping[str, Pattern],
     camera: Camera,
     max_tilt_rad: float = MAX_TILT_RAD,
-) -> PredictedCircles | None:
-    """Predicts the circles in view of an image, None if the arrangement lacks it; those not in ``seen`` are wanted."""
-    pose = arrangement.camera_from_group.get(image)
-    if pose is None:
-        return None
+) -> PredictedCircles:
+    """Predicts the circles in view on planes of known poses; those not in ``seen`` are wanted."""
     labels: list[Label] = []
     centre, shape, polarity = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], []
     border = ideal_border(camera)
-    for plane, pattern in patterns_of(target, board).items():
-        if plane not in arrangement.group_from_plane:
+    for plane, pattern in patterns.items():
+        if plane not in group_from_plane:
             continue
-        camera_from_plane = pose @ arrangement.group_from_plane[plane]
+        camera_from_plane = camera_from_group @ group_from_plane[plane]
         shown = np.flatnonzero(in_view(pattern, camera_from_plane, camera, border, max_tilt_rad))
-        if not len(shown):
-            continue
         place, outline = images_px(pattern, camera_from_plane, camera, shown)
         labels += [pattern.labels[i] for i in shown.tolist()]
         centre.append(place)
