@@ -110,37 +110,35 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     common size ratio of a plane's circles is attributed to the design and accepted."""
     place = {label: i for i, label in enumerate(predicted.labels)}
     rows = np.array([k for k, label in enumerate(observed.labels) if label in place], int)
-    predicted_rows = np.array([place[observed.labels[k]] for k in rows], int)
-    shapes_px = predicted.shape_px[predicted_rows]
+    labels = [observed.labels[k] for k in rows]
+    shapes_px = predicted.shape_px[np.array([place[label] for label in labels], int)]
     widest, narrowest = _stretch(shapes_px, observed.shape[rows], observed.centre[rows], camera)
-    planes = np.array([observed.labels[k].plane for k in rows], str)
+    planes = np.array([label.plane for label in labels], str)
     reasons: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
             stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])
-            _, reason = _disagreement(shapes_px[k], 0.0, stretch, blur)
-            if reason:
-                reasons[observed.labels[rows[k]]] = reason
+            if reason := _disagreement(shapes_px[k], 0.0, stretch, blur)[1]:
+                reasons[labels[k]] = reason
     return reasons
 
 
 def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
     """Returns the largest and smallest ratio, in any direction, of measured ellipses (normalised) to expected ones."""
-    local = camera.pixel_jacobian(centre)
-    return singular_values(np.linalg.solve(shape_px, local @ shape))
+    return singular_values(np.linalg.solve(shape_px, camera.pixel_jacobian(centre) @ shape))
 
 
 def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], blur_px: float) -> tuple[str, str]:
     """Returns why a measured ellipse is not the expected one: the key of its remedy and the reason; empty if it is."""
     largest, smallest = singular_values(shape_px)
+    allowed_px = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
+    most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
     if blur_px > MAX_BLUR * smallest:
         return "blur", f"blurred by {blur_px:.2g} px, {MAX_BLUR * float(smallest):.2g} px allowed by its smaller radius"
-    allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
-    if off_px > allowed:
-        return "place", f"{off_px:.3g} px from its place, {allowed:.3g} allowed"
-    most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
+    if off_px > allowed_px:
+        return "place", f"{off_px:.3g} px from its place, {allowed_px:.3g} allowed"
     if most > limit:
         return "shape", f"{most:.3g} times its size along one direction, {limit:.3g} allowed"
     return "", ""
@@ -150,22 +148,35 @@ def measure_predicted(
     image: np.ndarray, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook:
     """Measures the wanted circles in a grey image of any depth, if the options admit their size."""
-    grey = grey_fine(image)
     everything = Ellipses(predicted.centre_px, predicted.shape_px, np.ones(len(predicted.labels)))
-    wanted = np.flatnonzero(predicted.wanted)
     low, high = options.min_diameter_px or MIN_DIAMETER_PX, options.max_diameter_px
-    diameter = 2 * everything.radius_px()
-    missed = {}
-    for i in wanted[(diameter[wanted] < low) | (diameter[wanted] > high)]:
+    diameter, missed = 2 * everything.radius_px(), {}
+    admitted = (diameter >= low) & (diameter <= high)
+    for i in np.flatnonzero(predicted.wanted & ~admitted):
         remedy = REMEDIES["small" if diameter[i] < low else "large"]
         missed[predicted.labels[i]] = f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for; {remedy}"
-    wanted = np.array([i for i in wanted if predicted.labels[i] not in missed], int)
+    wanted = np.flatnonzero(predicted.wanted & admitted)
     expected = everything.select(wanted)
-    centres = measure_centres(grey, camera, expected, everything)
-    reasons = _reasons(centres, expected, [predicted.polarity[i] for i in wanted], camera)
-    accepted = np.array([k for k, reason in enumerate(reasons) if not reason], int)
-    missed |= {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason}
-    return SecondLook(tuple(predicted.labels[i] for i in wanted[accepted]), centres.select(accepted), missed)
+    found = measure_centres(grey_fine(image), camera, expected, everything)
+    contrast, needed = _contrast(found, [predicted.polarity[i] for i in wanted])
+    off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
+    widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
+    accepted = []
+    for k, i in enumerate(wanted):
+        kind, reason = "rim", f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
+        if found.ok[k] and contrast[k] < needed[k]:
+            kind, reason = "contrast", f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
+        elif found.ok[k]:
+            stretch, blur = (widest[k], narrowest[k]), float(found.blur_px[k])
+            kind, reason = _disagreement(expected.shape_px[k], float(off[k]), stretch, blur)
+            if not reason and sigma[k] > MAX_SIGMA_PX:
+                kind, reason = "sigma", f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
+        if reason:
+            missed[predicted.labels[i]] = f"{reason}; {REMEDIES[kind]}"
+        else:
+            accepted.append(k)
+    labels = tuple(predicted.labels[i] for i in wanted[accepted])
+    return SecondLook(labels, found.select(np.array(accepted, int)), missed)
 
 
 def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray, np.ndarray]:
@@ -174,37 +185,16 @@ def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray,
     return contrast, MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
 
 
-def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
-    """Returns by fit why it is not the expected circle, with the remedy; empty if it is."""
-    contrast, needed = _contrast(found, polarity)
-    off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
-    widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
-    reasons = []
-    for k in range(len(found)):
-        if not found.ok[k]:
-            kind = "rim"
-            reason = f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
-        elif contrast[k] < needed[k]:
-            kind, reason = "contrast", f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
-        else:
-            stretch, blur = (widest[k], narrowest[k]), float(found.blur_px[k])
-            kind, reason = _disagreement(expected.shape_px[k], float(off[k]), stretch, blur)
-            if not reason and sigma[k] > MAX_SIGMA_PX:
-                kind, reason = "sigma", f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
-        reasons.append(f"{reason}; {REMEDIES[kind]}" if reason else "")
-    return reasons
-
-
 def missed_notes(missed: dict[Label, str]) -> list[str]:
     """Returns one note for each face, and one for the board, on circles that were expected in view and not measured."""
-    planes: dict[str, list[tuple[Label, str]]] = {}
-    for label, reason in missed.items():
-        planes.setdefault(label.plane, []).append((label, reason))
     notes = []
-    for plane, rows in planes.items():
-        place, (first, reason) = "board" if plane == BOARD else f"face {plane}", rows[0]
+    for plane in dict.fromkeys(label.plane for label in missed):
+        place, rows = (
+            "board" if plane == BOARD else f"face {plane}",
+            [label for label in missed if label.plane == plane],
+        )
         others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-        notes.append(f"{place}: {first}{others} should be in view and not measured; {first}: {reason}")
+        notes.append(f"{place}: {rows[0]}{others} should be in view and not measured; {rows[0]}: {missed[rows[0]]}")
     return notes
 
 

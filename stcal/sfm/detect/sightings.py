@@ -133,13 +133,14 @@ def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDes
     for faces in detection.open_faces:
         views = [_face_view(each, target, detection, named=False) for each in faces]
         readings.append([view for view in views if view is not None])
-    if board is not None and BOARD not in detection.repeated:
-        for each in detection.boards:
-            labels = [tuple(DotLabel(*cell) for cell in n.tolist()) for n in (*each.numberings, *each.unlikely)]
-            views = [_view(BOARD, own, each.rows, board.places_mm(own)[:, :2], detection) for own in labels]
-            count = len(each.numberings)
-            covered = [replace(view, likely=False) for view in views[count:] if view is not None]
-            readings.append(views[:count] + covered)
+    for each in detection.boards if board is not None and BOARD not in detection.repeated else ():
+        views = []
+        for k, cells in enumerate((*each.numberings, *each.unlikely)):
+            labels = tuple(DotLabel(*cell) for cell in cells.tolist())
+            view = _view(BOARD, labels, each.rows, board.places_mm(labels)[:, :2], detection)
+            views.append(view and replace(view, likely=k < len(each.numberings)))
+        likely = views[: len(each.numberings)]
+        readings.append([*likely, *(view for view in views[len(likely) :] if view is not None)])
     return [[v for v in views if v is not None] for views in readings if views and all(v is not None for v in views)]
 
 
@@ -157,13 +158,9 @@ def _view(
     plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: ImageDetection, named: bool = True
 ) -> PlaneView | None:
     xy = detection.centres.centre[rows]
-    if len(rows) < MIN_POSE_CIRCLES:
-        return None
-    pose = planar_pose(xy_mm, xy)
-    if pose is None:
-        return None
+    pose = planar_pose(xy_mm, xy) if len(rows) >= MIN_POSE_CIRCLES else None
     area = float(np.abs(np.linalg.det(detection.centres.shape[rows])).sum())
-    return PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
+    return None if pose is None else PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
 
 
 def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
@@ -175,13 +172,12 @@ def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
 @lru_cache(maxsize=8)
 def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
     faces = [(face_id, np.frombuffer(xy).reshape(-1, 2), np.frombuffer(radius)) for face_id, xy, radius in key]
-    sets_of_face = {}
-    for face_id, xy, radius in faces:
-        sets: set[frozenset[int]] = set()
-        for other_id, *other in faces:
-            sets |= common_circles(xy, radius, *other, same=face_id == other_id)
-        sets_of_face[face_id] = tuple(s for s in sets if not any(s < t for t in sets))
-    return sets_of_face
+    return {
+        face_id: tuple(
+            set().union(*(common_circles(xy, radius, *other, same=face_id == other_id) for other_id, *other in faces))
+        )
+        for face_id, xy, radius in faces
+    }
 
 
 def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
