@@ -17,10 +17,8 @@ from stcal.geometry.camera import Camera
 from stcal.io.images import ImageFile, decode, grey_of
 from stcal.labels import BOARD
 
-MOST_READ = 12
-"""Largest number of images in which tags of no face are looked for."""
-LOOKED_AT = 5
-"""Number of images in which other tags are looked for."""
+MOST_READ, LOOKED_AT = 12, 5
+"""Largest numbers of images in which tags of no face, and tags of other kinds, are looked for."""
 MOST_TILT_DEG = 70.0
 LEAST_COSINE = float(np.cos(np.radians(MOST_TILT_DEG)))
 """Largest tilt, and its cosine, beyond which the corners of a tag are left out, as its edges meet at sharp angles:
