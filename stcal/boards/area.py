@@ -156,13 +156,11 @@ def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
 CLEAR_BLURS = 2.5
 """Distance from other lines, in σ of blur and pixel, from which on pixels are used."""
 END_BLURS = 2.0
-"""Distance from the ends of a cell's side, in the same, from which on pixels are used. Past its end the contrast of the
-side changes, but not its place."""
+"""Distance from the ends of a cell's side, in the same, from which on pixels are used."""
 LEAST_BLURS, MOST_BLURS = 1.5, 4.0
 """Least and largest reach of pixels to either side of a line, in σ of blur and pixel."""
 FARTHEST_PX = 0.1
-"""Largest distance of a line from the tag's grid. Cells of a tag that is drawn or printed in dots are not all of one
-size; their lines are farther away."""
+"""Largest distance of a line from the tag's grid; cells that are printed in dots are not all of one size."""
 MOST_PX = 0.04
 """Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
 STEPS = 2

@@ -30,8 +30,7 @@ MOST_BY_AREA = 10.0
 UNSEEN_PX = 0.1
 """σ of a corner that is where the gradients of its edges meet, as the areas in its window do not fit."""
 SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
-"""σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px. Smoothing does
-not move a saddle, but removes noise of the gradients, which would hold a corner at its start."""
+"""σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px."""
 MARGIN, LEAST_MARGIN = 3.0, 10.0
 """Margin about the corners in which the image is smoothed, in windows and then in px: no window comes near its end."""
 FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -41,8 +40,7 @@ PART, PART_FLAGS = (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 FIRST_SIDE, LEAST_SIDE = 1600, 300
 """Longer side of the largest image that is searched before the original, and of the smallest one, px."""
 PX_A_SQUARE = 25.0
-"""Longer side of the first image that is searched, per square of the board's longer side, px: a board that fills a
-third of it has squares of 8 px."""
+"""Longer side of the first image that is searched, px per square of the board's longer side."""
 
 
 def find_chessboard(
@@ -181,9 +179,8 @@ ROBUST_PASSES = 10
 LEAST_SCATTER_PX = 0.05
 """Smallest scatter of corners about a smooth field, px: printing and lenses cause it even in sharp views."""
 GATE = 5.0
-"""Largest deviation of a corner from the prediction by its neighbours. It is in units of the robust σ of such
-deviations in the view, or of the scatter of the neighbours themselves, whichever is larger. A bent board or a wide lens
-makes the latter large near an edge."""
+"""Largest deviation of a corner from the prediction by its neighbours, in robust σ of the view or, if larger, of the
+neighbours themselves, as of a bent board."""
 SMOOTHING_PX = 0.8
 """σ of the smoothing before gradients are taken."""
 ALIKE_PX2 = 4 * np.pi * SMOOTHING_PX**2
@@ -193,8 +190,7 @@ LEAST_WINDOW_PX, MOST_WINDOW_PX = 2, 30
 STEPS, SETTLED_PX = 20, 1e-3
 """Most steps of a corner's measurement, and the step at which it ends, px."""
 WIDEST_EDGE, MOST_FROM_SADDLE = 0.4, 0.25
-"""Largest σ of an edge's blur at which edges that meet are measured, and largest distance of their point from the
-saddle, in half sides of the window. Wider edges leave it, and only the saddle is measured."""
+"""Largest σ of an edge's blur, and distance of the edges' point from the saddle, in half sides of the window."""
 NOISE = 1e-6
 """Keeps the equations of a blank window regular."""
 LEAST_SIGMA_PX = 0.02

@@ -64,11 +64,9 @@ TOLD, LONG_SMEAR = 4.0, 0.4
 ROUNDING = 1 / 12
 """Variance of rounding to whole grey values."""
 BLURS, LEAST_INSIDE_PX = 2.5, 1.0
-"""Distance from the tag's inner cells, in σ of blur and pixel, from which on pixels are used, and the least width of
-the border's band that is used, px."""
+"""Distance of pixels from the tag's inner cells, in σ of blur and pixel, and least width of the border's band, px."""
 CLEAR_BLURS = 1.5
-"""Distance from the pattern next to a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what
-the blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
+"""Distance of pixels from the pattern next to a crossing, in σ of blur and pixel."""
 SHADED_HALF_PX = 4
 """Half the side of a window from which on grey values may change along it."""
 CROSSING_STEPS = 4
@@ -551,14 +549,9 @@ def _growth(
     place: np.ndarray,  # (n, k) profiles of the pixels, px along the edges; different numbers on both
     noise: np.ndarray,  # (n,) variances of the pixels
     profiles: int,  # number on each edge
-    blur: float,  # variance, px²
+    blur: float,  # variance, px²; neighbours at a distance k correlate by exp(−k²/4σ²)
 ) -> float:
-    """Return the factor, 1 or more, of all variances that is due to edges that are not straight, as by print.
-
-    All pixels of a profile share the displacement of the edge there. The squares of their common pulls are compared
-    with what the noise of single pixels makes of them. The blur smooths displacements along the edge: neighbours at a
-    distance k correlate by exp(−k²/4σ²), and the variance of the sum is 2σ√π times what the single ones add up to.
-    """
+    """Return the factor, 1 or more, of all variances by edges that are not straight: all pixels of a profile move."""
     n = len(pull)
     number = np.rint(place).astype(int)
     number -= number.min()

@@ -23,18 +23,15 @@ SATURATED = 254
 EDGE_PX = 0.1
 """σ of the shift that all edges of a tag share, by a nonlinear response, stray light or ink."""
 SATURATED_EDGE_PX = 0.7
-"""σ that saturation adds to this shift. An edge blurred by 0.7 px whose bright side is clipped at ½ or ¼ of its height
-seems to lie 0.6 or 0.9 px farther towards the dark side (the mean of a normal density's tail)."""
+"""σ that saturation adds to this shift: an edge blurred by 0.7 px and clipped at half its height moves by 0.6 px."""
 SATURATION_POINTS = 8
 """Number of points along each edge at which saturation is tested."""
 WHITE_PX = 3
-"""Side of the window of the dilation, px. Without dilation, a blurred corner at which two black squares meet joins them
-to one outline."""
+"""Side of the window of the dilation, px, which separates black squares that meet at a blurred corner."""
 TOGETHER_PX, APART_PX = (5, 25), ((5,), (21,))
 """Sides of the windows of the threshold, px, of one search, and of two."""
 GROWN_LOOKS = ((2, 4e7), (3, 1e7), (1, 5e8))
-"""Scales of the dilated images, each with the largest number of pixels up to which it is used. Dilation by a pixel at
-the original scale grows the white too far into tags of 50 px and less."""
+"""Scales of the dilated images, each with the largest number of pixels up to which it is used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,13 +235,11 @@ def _refined(
 KALIBR_BITS, USUAL_BITS = 2, 1
 """Widths of the black border of Kalibr's tags and of usual ones, cells."""
 TELLING_SHARE = 0.5
-"""Smallest share of the tags read with a border of one cell that a border of two cells must read to be accepted. A
-border of two cells is sometimes read as one, but a border of one cell never as two."""
+"""Smallest share of the tags read with a border of one cell that a border of two cells must read."""
 ENOUGH_SHARE = 0.5
 """Share of all tags of the board from which on a border of two cells is accepted without trying one cell."""
 MAX_OFF_SHARE = 0.15
-"""Largest deviation of a tag from its place in the board's plane, as a share of its side; a tag with a larger one is
-elsewhere, or rotated."""
+"""Largest deviation of a tag from its place in the board's plane, as a share of its side."""
 MOST_STRAY_SHARE = 1 / 3
 """Largest share of the tags in view that may be rejected for lying off the plane."""
 

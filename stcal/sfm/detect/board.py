@@ -83,8 +83,7 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (n, 4 or 6) neighbours one pitch away, −1 for none, in the directions on which most agree, and (n, 2, 2)
-    steps. Distances are taken in coordinates that map the candidate to a circle of the board's radius."""
+    """Returns (n, 4 or 6) neighbours one pitch away, −1 for none, by direction, and the steps (n, 2, 2) to them."""
     n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
     neighbours = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]

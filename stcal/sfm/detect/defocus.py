@@ -18,13 +18,9 @@ BY_CHANCE = 1e-6
 """Share of images with even blur of which a law is found by chance."""
 RESPONSE, RESPONSE_OF_BLUR2 = 0.51, 5.8
 """Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
-square of the blur over the smaller radius. From 3751 circles of six scenes that were rendered through points of a pupil
-and corrected as here; single circles scatter about it by 0.11. The blur that fits show grows by up to a third faster
-than the variance of the pupil's image."""
+square of the blur over the smaller radius: from 3751 circles that were rendered through points of a pupil."""
 RESPONSE_SIGMA = 0.15
-"""σ of this multiple for one circle, as a share of it: the study's scatter of single circles, and what the circles of a
-face have in common in one image (0.04 where shifts are large), as ten of them take together; and pupils that are not
-round."""
+"""σ of this multiple for one circle, as a share of it, with what the circles of a face have in common."""
 FAR_BLUR, FAR_SIGMA = 0.45, 0.5
 """Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
 MAX_UNEXPLAINED = 0.5

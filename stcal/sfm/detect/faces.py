@@ -24,15 +24,13 @@ MIN_SUPPORT = 2
 FIRST_HYPOTHESES = 300
 """Number of the best supported hypotheses of an image that are all grown, so that rivals compete."""
 MAX_TRIES = 8
-"""Number of further hypotheses that are grown from each outline without a reading, as a dim face ranks behind all
-clutter."""
+"""Number of further hypotheses grown from each outline without a reading: a dim face ranks behind all clutter."""
 AT_ONCE = 32
 """Number of hypotheses that are grown side by side, ahead of their turn."""
 MAX_CONTRAST_RATIO = 4.0
 """Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
 MAX_SIZE_RATIO = 1.25
-"""Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter. It
-rejects printed grids of equal discs."""
+"""Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -244,8 +242,7 @@ class FaceFinder:
 
 
 def _candidate_pairs(candidates: Candidates):
-    """Returns pairs of neighbours of similar shape: first, step to the second if the first is a unit circle, size
-    ratio."""
+    """Returns neighbours of similar shape: first, step to the second if the first is a unit circle, ratio of sizes."""
     k = min(NEIGHBOURS_IN_IMAGE + 1, len(candidates))
     second = candidates.tree.query(candidates.xy, k=k)[1][:, 1:].ravel()
     first = np.repeat(np.arange(len(candidates)), k - 1)

@@ -53,8 +53,7 @@ COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECAS
 """Additions of file managers to the name of a second copy."""
 SAME_PLACE_PX = 4.0
 SAME_SHARE = 0.6
-"""Share of an image's circles that lie within the same squares of that side in another form of it; at a square's edge
-some change over."""
+"""Share of an image's circles that lie within the same squares of that side in another form of it."""
 
 P = TypeVar("P", Centres, FaceSighting, BoardSighting)
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]

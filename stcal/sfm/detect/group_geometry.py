@@ -19,13 +19,11 @@ from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.sightings import PlaneView, Readings
 
 MAX_SHIFT_PITCHES = 0.3
-"""Largest deviation of a plane from its place in an image's first pose, in steps of the pattern. A wrong numbering of
-the board deviates by a whole step."""
+"""Largest deviation of a plane from its place in an image's first pose, in steps; a wrong numbering deviates by one."""
 MAX_SEEDS = 8
 """Largest number of start images, until one explains everything."""
 MAX_OFF_PITCHES = 0.12
-"""Largest median deviation of a reading's circles after the adjustment, in steps of the pattern: 3 mm for the reference
-target. A design deviates by tenths of a step, a wrong numbering by a whole one."""
+"""Largest median deviation of a reading's circles after the adjustment, in steps: 3 mm for the reference target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,8 +25,7 @@ NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 FAINT = 0.25
 """Share of the required contrast that is used if an image shows too little with the full one."""
 MAX_FREE = 400
-"""Largest number of outlines outside of boards that are tried for faces; the largest outlines are used. Photographs
-have up to 130. A fine checkerboard has tens of thousands, and time and memory grow with each."""
+"""Number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -69,8 +69,7 @@ Named = tuple[str, str, ImageDetection]
 MIN_EXPECTED = 6
 """Least number of circles that other images must show for their absence to count: as many as identify a face."""
 STEEP_RAD = np.radians(85)
-"""Largest tilt of circles of the first look that are compared with their places. They are not searched for beyond
-``MAX_TILT_RAD``, but may have been found there."""
+"""Largest tilt of circles of the first look that are compared with their places."""
 MIN_CONFIRMED = 0.2
 """Least share of these circles that must be found. A face of which two images show less could not be mapped either."""
 

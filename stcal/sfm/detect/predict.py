@@ -26,11 +26,9 @@ from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.circles.fits import MIN_SIGMA
 
 MAX_STRETCH = 1.15
-"""Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end. If an
-edge is cut by a seventh of the diameter, the error of the centre is as large as the rim test admits."""
+"""Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end."""
 MAX_BLUR = 1.0
-"""Largest blur (σ) over the smaller radius. A rim that is more blurred merges with its opposite side and with what is
-near it: centres were up to 2 px off at 1.05 to 1.5, and 0.3 px at most below 0.9."""
+"""Largest blur (σ) over the smaller radius: a rim that is more blurred merges with its opposite side."""
 MAX_SIGMA_PX = 0.5
 """Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0

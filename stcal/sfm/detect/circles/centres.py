@@ -11,16 +11,11 @@ from stcal.sfm.detect.circles.fits import BAND_PX, CUSP, Fits, boxes, intruders,
 MIN_NOISE2 = 1e-12
 """Noise variance, in squared grey values, that counts as no noise."""
 CHANCE_WAVES = 3
-"""So many odd harmonics around the rim stand for the first: the third, the fifth, the seventh. Higher ones are shorter
-than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (JPEG
-50 to 95 on 240 sheets of 200 circles: errors over σ were within 0.9…1.15 on 227 with 1 wave, 235 with 2, 234 with 3,
-219 with 4; the fewer, the more is left to chance.)"""
+"""Number of odd harmonics around the rim, from the third on, that stand for the first; higher ones are too short."""
 MAX_CHANCE = 4.2
-"""Largest ratio of one circle's squares to the median: exceeded by chance by one in a thousand (χ² of six degrees of
-freedom). It bounds the influence of a dirty circle."""
+"""Largest ratio of one circle's squares to the median, exceeded by chance by one in a thousand (χ² of six freedoms)."""
 SHARP_PX, SHARP = 1.5, 0.33
-"""Blur, in pixels and in the ellipse's smaller radius, above which the response of the fit to a shift is computed from
-the image. Below it, this changed σ by 1 % only; it takes a tenth of the time of the fit."""
+"""Blur, in pixels and in smaller radii, from which on the response of the fit to a shift is computed from the image."""
 
 
 def correlation(chance: np.ndarray) -> float:
@@ -103,8 +98,7 @@ MIN_RIM = 0.8
 MAX_RIM_RESIDUAL = 0.15
 """Largest RMS residual of a sector that follows the model, as a fraction of the contrast."""
 UNTRUSTED = 0.2
-"""Largest share of the shift by uneven brightness that the correction leaves (circles of 8 to 28 px, halves darker by
-5 to 30 %). It is added to σ."""
+"""Largest share of the shift by uneven brightness that the correction leaves, which is added to σ."""
 
 
 def measure_centres(
