@@ -36,28 +36,33 @@ def find_on_faces(
     of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
     tags = find_tags(image, (*of_layouts, *of_charuco), windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
+
+    def charuco(board: CharucoDesign) -> tuple[BoardView | None, str]:
+        if not any((board.dictionary, tag) in read for tag in board.tag_ids()):
+            return None, f"no tag of {board.dictionary}"
+        return find_charuco(image, name, board), ""
+
+    def chessboard(board: ChessboardDesign) -> tuple[BoardView | None, str]:
+        view = find_chessboard(image, name, board, with_sigma=True)
+        return view, "" if view else why_no_chessboard(image, board)
+
+    finders = {
+        TagLayout: lambda board: (view_of_tags(name, tags, board), ""),
+        CharucoDesign: charuco,
+        ChessboardDesign: chessboard,
+        AprilGridDesign: lambda board: find_aprilgrid(image, name, board, camera),
+    }
     views: dict[str, BoardView] = {}
     notes: list[str] = []
     for face, board in boards.items():
         view, why, oblique = None, "", ""
         try:
-            if isinstance(board, TagLayout):
-                view, oblique = _not_oblique(view_of_tags(name, tags, board))
-                view = straightened(view, camera)
-            elif isinstance(board, CharucoDesign):
-                if any((board.dictionary, tag) in read for tag in board.tag_ids()):
-                    view = find_charuco(image, name, board)
-                elif face == BOARD:
-                    why = f"no tag of {board.dictionary}"
-            elif isinstance(board, ChessboardDesign):
-                view = find_chessboard(image, name, board, with_sigma=True)
-                why = "" if view else why_no_chessboard(image, board)
-            elif isinstance(board, AprilGridDesign):
-                found, why = find_aprilgrid(image, name, board, camera)
-                view, oblique = _not_oblique(found)
+            view, why = finders[type(board)](board)
+            if isinstance(board, TagLayout | AprilGridDesign):
+                view, oblique = _not_oblique(view)
                 view = straightened(view, camera)
         except StcalError as error:  # corners on a line, say
-            why = f"left out, {error}"
+            view, why = None, f"left out, {error}"
         where = BOARD if face == BOARD else f"face {face}"
         notes += [f"{where}: {oblique}"] if oblique else []
         if view is not None:

@@ -271,15 +271,17 @@ def find_aprilgrid(
 
 def _tags(image: np.ndarray, board: AprilGridDesign) -> tuple[Tags, str]:
     """Return the tags, read with the board's border width or the more likely one, and the widths tried, in words."""
-    names = (board.dictionary,)
+
+    def read(bits: int) -> tuple[Tags, int]:
+        tags = find_tags(image, (board.dictionary,), bits, joined=True)
+        return tags, sum(tag in board.tag_ids() for _, tag in tags.tags)
+
     if board.border_bits is not None:
-        return find_tags(image, names, board.border_bits, joined=True), f"{board.border_bits}"
-    of_two_bits = find_tags(image, names, KALIBR_BITS, joined=True)
-    two = sum(tag in board.tag_ids() for _, tag in of_two_bits.tags)
+        return read(board.border_bits)[0], f"{board.border_bits}"
+    of_two_bits, two = read(KALIBR_BITS)
     if two >= ENOUGH_SHARE * len(board.tag_ids()):
         return of_two_bits, f"{KALIBR_BITS}"
-    of_one_bit = find_tags(image, names, USUAL_BITS, joined=True)
-    one = sum(tag in board.tag_ids() for _, tag in of_one_bit.tags)
+    of_one_bit, one = read(USUAL_BITS)
     return (of_two_bits if 0 < two >= TELLING_SHARE * one else of_one_bit), f"{USUAL_BITS} or {KALIBR_BITS}"
 
 
