@@ -194,15 +194,15 @@ class TargetDesign(Brief):
         if BOARD in ids:
             raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
         circles = [face for face in self.faces if face.printed is None]
-        sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
-        radii = [radius(f"radius_mm of circle {label}", float(mm)) for label, mm in sizes]
+        sizes = _by_label((face, face.radius_mm) for face in circles)
+        radii = [radius(f"radius_mm of circle {label}", mm) for label, mm in sizes.items()]
         require_millimetres(radii, self.unusual_size, where)
         require_distinct(circles, where)
 
     @property
     def has_scale(self) -> bool:
         """True if the target itself determines the size: by printed faces, or by known distances."""
-        return bool(self.distances) or any(face.printed is not None for face in self.faces)
+        return bool(self.distances) or self.has_printed
 
     @property
     def up_to_scale(self) -> bool:
@@ -248,20 +248,16 @@ class TargetDesign(Brief):
 
     def radius_of(self) -> dict[CircleLabel, float]:
         """Returns the radius in mm by label."""
-        return {
-            label: float(radius)
-            for face in self.faces
-            for label, radius in zip(face.labels(), face.radius_mm, strict=True)
-        }
+        return _by_label((face, face.radius_mm) for face in self.faces)
 
     def rim_of(self) -> dict[CircleLabel, float]:
         """Returns the height of the rim in mm by label, of faces that state it."""
-        return {
-            label: float(height)
-            for face in self.faces
-            if face.rim_mm is not None
-            for label, height in zip(face.labels(), face.rim_mm, strict=True)
-        }
+        return _by_label((face, face.rim_mm) for face in self.faces if face.rim_mm is not None)
+
+
+def _by_label(faces: Iterable[tuple[FaceDesign, np.ndarray]]) -> dict[CircleLabel, float]:
+    pairs = (zip(face.labels(), values.tolist(), strict=True) for face, values in faces)
+    return {label: value for of_face in pairs for label, value in of_face}
 
 
 @dataclass(frozen=True, slots=True)

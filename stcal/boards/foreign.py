@@ -95,10 +95,10 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
                 f"{where}: {place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle, none "
                 "allowed: targets are flat here; give the tags of one plane",
             )
+    corners_of_one = UPRIGHT if data.upright or is_of_apriltag(data.tag_family) else CORNERS
     tags = []
-    as_printed = data.upright or is_of_apriltag(data.tag_family)
     for tag, rotation, middle in zip(bundle.layout, turn, at, strict=True):
-        corners = METRE_MM * tag.size * (UPRIGHT if as_printed else CORNERS) @ rotation[:2, :2].T + middle[:2]
+        corners = METRE_MM * tag.size * corners_of_one @ rotation[:2, :2].T + middle[:2]
         tags.append({"dictionary": data.tag_family, "id": tag.id, "corners_mm": (corners * [1, -1]).tolist()})
     return {"type": "tags", "name": bundle.name, "tag": tags}
 
