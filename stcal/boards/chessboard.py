@@ -46,10 +46,8 @@ PX_A_SQUARE = 25.0
 def find_chessboard(
     image: np.ndarray, name: str, board: ChessboardDesign, with_sigma: bool = False
 ) -> BoardView | None:
-    """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black.
-
-    A board that looks the same after half a turn may be returned rotated. ``with_sigma`` : whether covariances are.
-    """
+    """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black. A
+    board that looks the same after half a turn may be returned rotated. ``with_sigma`` : whether covariances are."""
     grey = grey_8bit(image)
     for detected in _read_corners(grey, board):
         measured = _refined(grey, detected)
@@ -198,13 +196,10 @@ LEAST_SIGMA_PX = 0.02
 
 
 def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardView | None:
-    """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen.
-
-    One visible neighbour tag is enough for a corner; of a blurred tag alone it may be several px off. Each measurement
-    therefore starts at the place that the surrounding corners predict, and must end near there. A corner is the
-    crossing of the edges by the areas that they cover in the pixels of a window clear of the tags; else the point where
-    the gradients of the edges meet; else, of blurred edges, the saddle of the grey values.
-    """
+    """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen. Each measurement
+    starts at the place that the surrounding corners predict, as one blurred tag alone may be several px off, and must
+    end near there: at the crossing of the edges by their areas; else where the gradients of the edges meet; else at the
+    saddle of the grey values."""
     grey = grey_8bit(image)
     ids, corners = _read(grey, board)
     if len(ids) < LEAST_CORNERS:

@@ -89,9 +89,7 @@ class EdgeCorners:
 
 def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
     """Refine the corners (n, 4, 2), in cyclic order, of dark tags with ``cells`` (n,) cells per side, border included.
-
-    An edge is not visible if it is too short, hidden, outside of the image, or without contrast.
-    """
+    An edge is not visible if it is too short, hidden, outside of the image, or without contrast."""
     n = len(corners)
     if not n:
         return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool))
@@ -453,10 +451,8 @@ def crossings(
     grey: np.ndarray, start: np.ndarray, along: np.ndarray, half: np.ndarray, clear_px: np.ndarray
 ) -> Crossings:
     """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
-
     ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest pattern
-    other than the two edges, from where blur carries light into pixels, which are not used then.
-    """
+    other than the two edges, from where blur carries light into pixels, which are not used then."""
     n = len(start)
     xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
     for side in np.unique(half).tolist():

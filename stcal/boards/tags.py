@@ -71,10 +71,8 @@ def find_tags(
     windows_px: Sequence[tuple[int, ...]] = (TOGETHER_PX,),
 ) -> Tags:
     """Return the tags of the dictionaries in a grey image (height, width), with corners from their edges.
-
     ``border_bits`` : width of the black border in cells; ``joined`` : True if black squares touch the tags' corners;
-    ``windows_px`` : sides of the threshold windows of each search.
-    """
+    ``windows_px`` : sides of the threshold windows of each search."""
     grey = grey_8bit(image)
     places_of: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
@@ -139,11 +137,9 @@ def _inside(place: np.ndarray, other: np.ndarray) -> bool:
 
 
 def seen_otherwise(image: np.ndarray, own: Collection[tuple[str, int]], place: str) -> str:
-    """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing.
-
-    Tags of ``own`` (dictionary, id) may be in view twice, mirrored, or white on black; or tags of another dictionary,
-    which is to be corrected in ``place``.
-    """
+    """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing. Tags
+    of ``own`` may be in view twice, mirrored, or white on black, or of another dictionary, to be corrected in
+    ``place``."""
     grey, known = grey_8bit(image), sorted({name for name, _ in own})
     if twice := [tag for tag in find_tags(grey, known).repeated if tag in own]:
         return f"tag {twice[0][1]} more than once; cover what is not the target, and mirrors"
@@ -181,12 +177,9 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
 
 
 def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ...] = TOGETHER_PX):
-    """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows.
-
-    The default settings lose small tags, in which only the middle of a cell keeps its colour: of 272 real tags of 19 to
-    60 px a side they read 86 %, these 97 %. Two sizes of the window find more if each has a search of its own: of the
-    outlines that both find of one tag, the detector keeps a single one, which need not be that which can be read.
-    """
+    """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows. The
+    default settings lose small tags, in which only the middle of a cell keeps its colour: of 272 real tags of 19 to 60
+    px a side they read 86 %, these 97 %. Two sizes of the window find more if each has a search of its own."""
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = border_bits
     settings.perspectiveRemovePixelPerCell = 10

@@ -371,9 +371,7 @@ def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None
 
 def files_of_arrays(images: Mapping[str, Sequence[np.ndarray]], exclude: Sequence[str] = ()) -> ImageFiles:
     """Return images in memory as files that carry their content, named ``12/0.png``, ``12/1.png`` … by group.
-
-    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of those not used.
-    """
+    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of those not used."""
     named = [(group, f"{group}/{k}.png", image) for group, arrays in images.items() for k, image in enumerate(arrays)]
     if not named:
         raise InputError("E-IMAGES-NONE", "images: no image in memory; give arrays by the name of their group")

@@ -302,11 +302,8 @@ class PlaneBundle:
 
     def adjusted(self, poses: PoseStack, planes: PoseStack) -> tuple[PoseStack, PoseStack]:
         """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
-        fixed.
-
-        Without convergence the last state is returned, and the start where a point lies behind its camera: predictions
-        are verified anyway.
-        """
+        fixed. Without convergence the last state is returned, and the start where a point lies behind its camera:
+        predictions are verified anyway."""
         if not np.isfinite(self._off(planes, poses)).all():
             return poses, planes
         a = Adjustment()
