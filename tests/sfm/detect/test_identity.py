@@ -179,21 +179,6 @@ def test_which_circles_name_a_face():
     assert all(any(len(s) == 9 for s in sets) for sets in confusable(TARGET).values())
 
 
-def test_hypotheses_that_agree_are_those_that_share_two_matches():
-    """As found by comparing each with the reading, circle by circle."""
-    candidates = Candidates.of(
-        joined(face_ellipses("1", pose(30, 0, 0, x=200)), face_ellipses("2", pose(40, 10, 0, x=-250))), CAMERA
-    )
-    starts = FaceFinder(TARGET)._hypotheses(candidates)
-    assert len(starts.origin) > 100
-    for rank in range(0, len(starts.origin), 17):
-        face, index = int(starts.face[rank]), starts.index(rank)
-        same = (index[starts.circles] == starts.candidates) & (starts.candidates >= 0)
-        wanted = np.flatnonzero((same.sum(1) >= 2) & (starts.face == face))
-        assert rank in wanted
-        np.testing.assert_array_equal(starts.agree(face, index), wanted)
-
-
 def test_a_design_without_faces_has_none():
     """As photographs of a dot board alone are read."""
     finding = FaceFinder(TargetDesign("none", "bright", ())).find(Candidates.of(face_ellipses("1", pose()), CAMERA))
