@@ -12,7 +12,7 @@ from stcal.geometry.arrays import Array, Brief, ByValue, freeze, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, dot_cells
 from stcal.lengths import Length, radius, require_millimetres, side
-from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, Likeness, whole_likeness
+from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
 
 Polarity = Literal["bright", "dark"]
 POINT_RADIUS_MM = 1e-6
@@ -407,8 +407,8 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
     for i, face in enumerate(faces):
         for second in faces[i:]:
             few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
-            patterns = (few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm)
-            like = _likeness(*(values.tobytes() for values in patterns), few is many)
+            in_place = np.arange(len(few.ids)) if few is many else None
+            like = whole_likeness(few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, in_place)
             if like is None:
                 continue
             size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
@@ -425,14 +425,6 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
                 f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
                 f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
             )
-
-
-@lru_cache(maxsize=256)
-def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, same: bool) -> Likeness | None:
-    """Returns the similarity of two patterns, as bytes for the cache: the same design is often made again."""
-    places, radii, other_places, other_radii = map(np.frombuffer, (xy, radius, other_xy, other_radius))
-    in_place = np.arange(len(radii)) if same else None
-    return whole_likeness(places.reshape(-1, 2), radii, other_places.reshape(-1, 2), other_radii, in_place)
 
 
 def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:

@@ -77,22 +77,15 @@ WIDEST_BLUR = 0.4
 """Largest σ of the blur, in half sides of the window: a wider one leaves no area of one colour."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeCorners:
-    """The refined corners of n tags. Two corners share the errors of the edge between them."""
-
-    corners_px: np.ndarray  # (n, 4, 2)
-    covariance_px2: np.ndarray  # (n, 8, 8) of the four corners together
-    seen: np.ndarray  # (n,) True if all four edges of a tag are visible; otherwise its values are meaningless
-    smear_px: float = 0.0  # way by which motion during the exposure blurs the edges; 0 where it is short beside a cell
-
-
-def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
+def corners_from_edges(
+    grey: np.ndarray, corners: np.ndarray, cells: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Refine the corners (n, 4, 2), in cyclic order, of dark tags with ``cells`` (n,) cells per side, border included.
-    An edge is not visible if it is too short, hidden, outside of the image, or without contrast."""
+    Return them with the covariances (n, 8, 8) of the four of a tag together, a mask (n,) of the tags of which all edges
+    are visible, and the way by which motion during the exposure blurs edges, px, 0 where it is short beside a cell."""
     n = len(corners)
     if not n:
-        return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool))
+        return np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool), 0.0
     frame = _frame(np.asarray(corners, float), cells)
     offset, good = _profiles(grey, frame)
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
@@ -104,7 +97,7 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
         covariance = _meet(frame, area.lines(rough, variance))[1]
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
-    return EdgeCorners(meeting, covariance, seen.all(1), area.smear_px)
+    return meeting, covariance, seen.all(1), area.smear_px
 
 
 def _told_by_lines(

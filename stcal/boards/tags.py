@@ -216,13 +216,11 @@ def _refined(
             own = np.zeros(int(colour.sum()), bool)
             refined[colour], covariance[colour], smears[i] = _refined(picture, corners[colour], cells[colour], own)
         return refined, covariance, max(smears)
-    measured = corners_from_edges(grey, corners, cells)
+    measured, joint, seen, smear_px = corners_from_edges(grey, corners, cells)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
-    away = np.linalg.norm(np.where(measured.seen[:, None, None], measured.corners_px - corners, 0), axis=2)
-    away = away.max(1, initial=0)
-    good = (measured.seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
-    covariance = np.where(good, measured.covariance_px2, UNREFINED_PX**2 * np.eye(8))
-    return np.where(good, measured.corners_px, corners), covariance, measured.smear_px
+    away = np.linalg.norm(np.where(seen[:, None, None], measured - corners, 0), axis=2).max(1, initial=0)
+    good = (seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
+    return np.where(good, measured, corners), np.where(good, joint, UNREFINED_PX**2 * np.eye(8)), smear_px
 
 
 KALIBR_BITS, USUAL_BITS = 2, 1

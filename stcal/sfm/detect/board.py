@@ -40,7 +40,6 @@ class BoardReading:
 
     candidates: np.ndarray  # (n,) the dots found
     numberings: np.ndarray  # (k, n, 2) row and column, by numbering that the image admits, the likeliest first
-    homographies: np.ndarray  # (k, 3, 3) from the board plane (mm) into normalised coordinates
     unlikely: np.ndarray  # (u, n, 2) further numberings, that hold where dots are covered
 
 
@@ -192,25 +191,27 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     common = np.logical_and.reduce([inside for inside, _ in likely])
     index = index[common]
     numberings = np.stack([cells[common] for _, cells in likely])
-    places = [board.pitch_mm * board.flat(n[:, ::-1].astype(float)) for n in numberings]
-    homographies = [fit_homography(xy_mm, candidates.xy[index]) for xy_mm in places]
     further = [cells[common] for count, inside, cells in placements if count > most and inside[common].all()]
-    return BoardReading(index, numberings, np.stack(homographies), np.array(further, int).reshape(-1, len(index), 2))
+    return BoardReading(index, numberings, np.array(further, int).reshape(-1, len(index), 2))
 
 
-def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
-    """Reading with the numberings that put the board's dots with a hole where the 8-bit image shows holes."""
+def by_rings(
+    reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
+) -> BoardReading:
+    """Reading with the numberings that put dots with a hole where the 8-bit image shows holes; ``xy``: all candidates."""
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     cells = board.cells()
     rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
     middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
     wrong = []
-    for homography in reading.homographies:
+    for numbering in reading.numberings:
+        xy_mm = board.pitch_mm * board.flat(numbering[:, ::-1].astype(float))
+        homography = fit_homography(xy_mm, xy[reading.candidates])
         values = []
         for share in RING_SHARES:
-            xy = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
-            px = camera.project(np.column_stack([xy, np.ones(len(xy))]))
+            rim = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
+            px = camera.project(np.column_stack([rim, np.ones(len(rim))]))
             sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
             values.append(sampled.reshape(len(cells), -1).mean(1))
         inside = ((px > 0) & (px < np.array(grey.shape[::-1]) - 1)).all(1).reshape(len(cells), -1).all(1)
@@ -220,7 +221,7 @@ def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera
     kept = [i for i, count in enumerate(wrong) if count == min(wrong)]
     if min(wrong) > MOST_WRONG:
         return reading
-    return replace(reading, numberings=reading.numberings[kept], homographies=reading.homographies[kept])
+    return replace(reading, numberings=reading.numberings[kept])
 
 
 RING_SHARES = (0.15, 0.75, 1.25)

@@ -74,8 +74,9 @@ def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
     boards: list[BoardReading] = []
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
-        for found in find_boards(Candidates.of(outlines[board.polarity], camera), board, image_corners(camera)):
-            boards.append(by_rings(found, board, grey, camera) if board.rings else found)
+        dots = Candidates.of(outlines[board.polarity], camera)
+        for found in find_boards(dots, board, image_corners(camera)):
+            boards.append(by_rings(found, board, grey, camera, dots.xy) if board.rings else found)
             free[board.polarity][found.candidates] = False
     all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
@@ -161,9 +162,10 @@ def _detect_circles(
     of_board = board.polarity if board else target.polarity
     used = [np.unique(np.concatenate([reading.used() for reading in nameless])) for nameless in refused]
     patterns: list[_Pattern] = [(target.polarity, free.select(face.used()), face.labels()) for face in named]
-    patterns += [(target.polarity, free.select(own), [NAMELESS] * len(own)) for own in used]
-    dots_of = [reading.found[of_board].select(grid.candidates) for grid in boards]
-    patterns += [(of_board, own, [DOT] * len(own)) for own in dots_of]
+    for own in used:
+        patterns.append((target.polarity, free.select(own), [NAMELESS] * len(own)))
+    for grid in boards:
+        patterns.append((of_board, reading.found[of_board].select(grid.candidates), [DOT] * len(grid.candidates)))
     measured = _measured(grey, camera, patterns, reading.found)
     notes: list[str] = []
     if reading.untried:

@@ -144,10 +144,11 @@ def detect_published(
     start = dict(zip(ellipses, np.cumsum([0, *counts]).tolist(), strict=False))
     candidates = {polarity: Candidates.of(of_polarity, camera) for polarity, of_polarity in ellipses.items()}
     boards, free, own = [], np.ones(len(ellipses[target.polarity]), bool), candidates[target.polarity]
-    for grid in [] if board is None else find_boards(candidates[board.polarity], board, image_corners(camera)):
-        boards.append(BoardSighting(start[board.polarity] + grid.candidates, grid.numberings, grid.unlikely))
-        if board.polarity == target.polarity:
-            free[grid.candidates] = False
+    if board is not None:
+        for grid in find_boards(candidates[board.polarity], board, image_corners(camera)):
+            boards.append(BoardSighting(start[board.polarity] + grid.candidates, grid.numberings, grid.unlikely))
+            if board.polarity == target.polarity:
+                free[grid.candidates] = False
     faces, notes = _Rules(pattern, target, own, ellipses[target.polarity]).find(free)
     centres = []
     for polarity, every in ellipses.items():

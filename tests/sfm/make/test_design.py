@@ -56,7 +56,7 @@ def test_no_four_circles_are_alike_in_two_readings(made):
     """Not with another face, not turned, not in a mirror: by the package's own search for likeness."""
     target = made.pattern.target
     assert made.pattern.likeness < MIN_COMMON
-    assert confusable(target) == {face.id: () for face in target.faces}
+    assert not any(confusable(face, target) for face in target.faces)
     assert mirror_images(target) == {}
     for face in target.faces:
         for other in target.faces:
