@@ -198,7 +198,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 def by_rings(
     reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
 ) -> BoardReading:
-    """Reading with the numberings that put dots with a hole where the 8-bit image shows holes; ``xy``: all candidates."""
+    """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates."""
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     cells = board.cells()

@@ -429,8 +429,6 @@ FOREIGN = "foreign"
 def _left_out(views: Readings, why: str = "") -> str:
     """Returns the note on a pattern without labels; ``why`` : ELSEWHERE or FOREIGN; else several numberings fit."""
     view, dots = views[0], f"board of {len(views[0].rows)} dots"
-    if not view.named:
-        return open_face_note(len(view.rows), (view.plane for view in views))
     if why == FOREIGN:
         return Note(
             f"a pattern like face {view.plane}: not where other groups see that face against the others, or turned "
@@ -439,6 +437,8 @@ def _left_out(views: Readings, why: str = "") -> str:
             ELSEWHERE,
             view.plane,
         )
+    if not view.named:
+        return open_face_note(len(view.rows), (view.plane for view in views))
     if why == ELSEWHERE:
         is_board = view.plane == BOARD
         name = f"a {dots}" if is_board else f"a pattern like face {view.plane}"
