@@ -1,4 +1,4 @@
-"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``io/design.py``."""
+"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``boards/target_file.py`` and ``boards/board_file.py``."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -20,7 +20,7 @@ POINT_RADIUS_MM = 1e-6
 
 
 @runtime_checkable
-class Printed(Protocol):
+class PrintedPattern(Protocol):
     """A board or tags printed on a face: what :mod:`stcal.boards` finds in images."""
 
     def xy_mm(self) -> np.ndarray:
@@ -56,7 +56,7 @@ class FaceDesign(Brief):
         Corners of its plate in order, face frame, for drawings.
     rim_mm : (n,) array, optional
         Heights of the rims in front of the circles, negative for discs that stand out; None if they lie in the surface.
-    printed : Printed, optional
+    printed : PrintedPattern, optional
         The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose frame
         is the face frame, Z into the body; None for a face of circles.
     sigma_mm : float, optional
@@ -78,7 +78,7 @@ class FaceDesign(Brief):
     rough_target_from_face: Rigid | None = None
     outline_mm: Array | None = None
     rim_mm: Array | None = None
-    printed: Printed | None = None
+    printed: PrintedPattern | None = None
     sigma_mm: float | None = None
     size_sigma: float = 0.0
     of_tags: bool = False

@@ -130,7 +130,7 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Frame:
+class _Edges:
     """Geometry of the edges, px."""
 
     middle: np.ndarray  # (n, 4, 2) of each edge
@@ -153,7 +153,7 @@ class _Lines:
     keep: np.ndarray  # (n, 4, POINTS) profiles that are no outliers
 
 
-def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
+def _frame(corners: np.ndarray, cells: np.ndarray) -> _Edges:
     """Return the edges from each corner to the next."""
     end = np.roll(corners, -1, axis=1)
     length = np.linalg.norm(end - corners, axis=2)
@@ -166,10 +166,10 @@ def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
     reach = np.clip(CELLS_ACROSS * cell, *REACH_PX)
     place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
     number = np.broadcast_to(np.reshape(cells, (-1, 1)), length.shape)
-    return _Frame(middle, along, normal, length, cell, number, reach, place)
+    return _Edges(middle, along, normal, length, cell, number, reach, place)
 
 
-def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
+def _profiles(grey: np.ndarray, frame: _Edges) -> tuple[np.ndarray, np.ndarray]:
     """Return the edge in each profile, px from the frame's line, and a mask of good profiles, (n, 4, POINTS)."""
     n = len(frame.length)
     across = np.linspace(-1, 1, SAMPLES) * frame.reach[..., None]
@@ -221,7 +221,7 @@ class _Pixels:
     rise: np.ndarray  # (m,) of ``across`` from one pixel to the next
 
 
-def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
+def _pixels(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Pixels:
     """Return the pixels within reach of the edges ``rough``, in the columns or rows of the profiles that are kept."""
     m, each = frame.length.size, np.arange(frame.length.size)
     middle, along, normal = (value.reshape(m, 2) for value in (frame.middle, frame.along, frame.normal))
@@ -270,7 +270,7 @@ class _Area:
         return _Lines(self.offset, self.slope, covariance, rough.keep)
 
 
-def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
+def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
     """Return the lines that split the pixels into dark and bright areas as the image has them."""
     pixels = _pixels(grey, frame, rough)
     m = len(pixels.level)
@@ -401,7 +401,7 @@ def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.n
     return (inverse @ np.stack([y0, y1], -1)[..., None])[..., 0], inverse
 
 
-def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
+def _meet(frame: _Edges, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
     """Return the intersection of each edge with the previous one, (n, 4, 2), and the covariance (n, 8, 8) of all."""
     row = frame.normal - lines.slope[..., None] * frame.along
     right = lines.offset + (row * frame.middle).sum(2)

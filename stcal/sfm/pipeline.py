@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.board_file import board_of
-from stcal.boards.faces import tags_of_no_face, why_unseen
+from stcal.boards.on_faces import tags_of_no_face, why_unseen
 from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, InputNote, StcalError
@@ -37,7 +37,7 @@ from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_dr
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays, seen_by
-from stcal.sfm.detect.labels import LabelledImage, is_board_alone, label_images
+from stcal.sfm.detect.labelling import LabelledImage, is_board_alone, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, plain_lens, unknown_lens

@@ -8,17 +8,17 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import CornerBoard
-from stcal.boards.faces import find_on_faces
+from stcal.boards.on_faces import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.board import BoardReading, by_rings, find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
+from stcal.sfm.detect.dot_grid import BoardReading, by_rings, find_boards
+from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"

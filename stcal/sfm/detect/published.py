@@ -20,7 +20,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.circles.candidates import (
     Candidates,
     EllipseOptions,
@@ -32,6 +31,7 @@ from stcal.sfm.detect.circles.candidates import (
     outline_area,
     outlines,
 )
+from stcal.sfm.detect.dot_grid import find_boards
 from stcal.sfm.detect.image import image_corners
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 

@@ -19,7 +19,7 @@ from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.image import detect_target
-from stcal.sfm.detect.labels import LabelledImage, label_single, labelled_image
+from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image
 from stcal.sfm.detect.predict import (
     PredictedCircles,
     common_shift,

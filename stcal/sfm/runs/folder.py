@@ -41,7 +41,7 @@ from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectedImage, DetectionResult
-from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model

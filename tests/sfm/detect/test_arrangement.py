@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import Centres
 from stcal.sfm.data.patterns import patterns_of
-from stcal.sfm.detect.labels import label_groups, label_single
+from stcal.sfm.detect.labelling import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 

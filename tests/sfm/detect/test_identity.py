@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
-from stcal.sfm.detect.faces import FaceFinder
+from stcal.sfm.detect.dot_grid import find_boards
+from stcal.sfm.detect.face_patterns import FaceFinder
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection, confusable, is_named, mirror_images
 from tests.sfm.detect.test_arrangement import centres_of
 from tests.support.circle_images import circle_conic, ellipse_of_conic

@@ -9,7 +9,7 @@ import pytest
 from stcal.boards.target_file import target_toml
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.labels import _is_symmetry, _numbered
+from stcal.sfm.detect.labelling import _is_symmetry, _numbered
 from stcal.sfm.detect.sightings import PlaneView
 from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet
