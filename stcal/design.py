@@ -1,4 +1,4 @@
-"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``boards/target_file.py`` and ``boards/board_file.py``."""
+"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``boards/*_file.py``."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
