@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, wraps
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -30,7 +30,7 @@ def _kept(function: Callable[P, R]) -> Callable[P, R]:
     @lru_cache(maxsize=512)
     def of_content(*parts):
         arrays = (np.frombuffer(p[0], p[1]).reshape(p[2]) if isinstance(p, tuple) else p for p in parts)
-        return function(*arrays)  # type: ignore[call-arg]
+        return cast(Callable[..., R], function)(*arrays)
 
     @wraps(function)
     def with_arrays(*given: P.args, **more: P.kwargs) -> R:

@@ -134,14 +134,16 @@ def load_target(path: str | Path, printed: bool = True) -> TargetDesign:
     face_of_tag: dict[tuple[str, int], str] = {}
     for face in data.face:
         of_face = f"{where}: face {face.id}"
-        if isinstance(face, _PrintedFile) and not printed:
+        if isinstance(face, _CirclesFile):
+            faces.append(_of_circles(face, of_face))
+        elif printed:
+            faces.append(_of_print(face, data.unusual_size, of_face))
+        else:
             raise InputError(
                 "E-TARGET-PRINTED",
                 f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect`, "
                 "`measure` and `simulate` do",
             )
-        make = _of_circles if isinstance(face, _CirclesFile) else _of_print
-        faces.append(make(face, data.unusual_size, of_face))  # type: ignore[arg-type]
     with named(where, f"target {data.name}"):
         target = TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size)
     known = {str(label): label for face in faces for label in face.labels()}
@@ -179,7 +181,7 @@ def _distance(entry: _ScaleFile, known: dict[str, Any], where: str) -> KnownDist
     return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm, entry.drawn)
 
 
-def _of_circles(face: _CirclesFile, unusual_size: bool, where: str) -> FaceDesign:
+def _of_circles(face: _CirclesFile, where: str) -> FaceDesign:
     """Return the face of an entry, whose places are in the frame of a drawing, in its own frame."""
     xy = np.array([[circle.x_mm, circle.y_mm] for circle in face.circles])
     ids, radii = tuple(circle.id for circle in face.circles), [circle.radius_mm for circle in face.circles]
