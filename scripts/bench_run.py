@@ -24,10 +24,11 @@ import cv2
 import numpy as np
 
 from scripts.runner import options_of
+from stcal.boards.board_file import board_toml, load_dots
+from stcal.boards.target_file import load_target
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_toml, load_board, load_target
 from stcal.io.images import decode, find_images
 from stcal.parallel import run_parallel
 from stcal.robot import IdentifyOptions, identify
@@ -141,7 +142,7 @@ def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> str:
 def detected(data: Path, cache: Path) -> str:
     """Detects all images; returns the counts of boards."""
     files, _ = find_images(data / "images")
-    designs = load_target(data / "target.toml"), load_board(data / "board.toml")
+    designs = load_target(data / "target.toml"), load_dots(data / "board.toml")
     result = detect_files(files, read_camera(data / "cameras.txt"), *designs, EllipseOptions(), cache)
     found = {i.file.name: i.detection for i in result.images}
     dots = {name: d.centres.centre_px[d.board.rows] for name, d in found.items() if d.board is not None}
@@ -150,7 +151,7 @@ def detected(data: Path, cache: Path) -> str:
 
 def detected_by_opencv(data: Path) -> str:
     """Finds all boards with OpenCV; returns the counts."""
-    board, true = load_board(data / "board.toml"), true_dots(data)
+    board, true = load_dots(data / "board.toml"), true_dots(data)
     # At 1 m ± 10 %, tilted by up to 70°, in images as wide as 22.3 mm behind 24 mm: half and twice that for safety.
     area = np.pi * (board.radius_mm * 24 / 22.3 * read_camera(data / "cameras.txt").width / 1000) ** 2
     size, areas = (board.columns, board.rows), (0.34 * area / 2, area * 2)
@@ -160,7 +161,7 @@ def detected_by_opencv(data: Path) -> str:
 
 def measured_stream(data: Path, faces: Path) -> str:
     """Measures all photographs of a set on one core; returns the number of images."""
-    design, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    design, board = load_target(data / "target.toml"), load_dots(data / "board.toml")
     circles, camera = read_target(faces, design), read_camera(data / "cameras.txt")
     result = measure(data / "images", camera, circles, design, board, MeasureOptions(workers=1))
     return f"{len(result.images)} images"

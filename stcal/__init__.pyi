@@ -7,11 +7,11 @@ from . import robot as robot
 from . import sfm as sfm
 from . import synthetic as synthetic
 from . import workflows as workflows
-from .boards.file import load_board as load_board
-from .boards.file import load_flat_board as load_flat_board
-from .boards.file import save_board as save_board
-from .boards.target import load_target as load_target
-from .boards.target import save_target as save_target
+from .boards.board_file import load_board as load_board
+from .boards.board_file import load_flat_board as load_flat_board
+from .boards.board_file import save_board as save_board
+from .boards.target_file import load_target as load_target
+from .boards.target_file import save_target as save_target
 from .design import BoardDesign as BoardDesign
 from .design import FaceDesign as FaceDesign
 from .design import TargetDesign as TargetDesign

@@ -1,4 +1,4 @@
-"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``io/design.py``."""
+"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``boards/*_file.py``."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -12,7 +12,7 @@ from stcal.geometry.arrays import Array, Brief, ByValue, freeze, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, dot_cells
 from stcal.lengths import Length, radius, require_millimetres, side
-from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, Likeness, whole_likeness
+from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
 
 Polarity = Literal["bright", "dark"]
 POINT_RADIUS_MM = 1e-6
@@ -20,7 +20,7 @@ POINT_RADIUS_MM = 1e-6
 
 
 @runtime_checkable
-class Printed(Protocol):
+class PrintedPattern(Protocol):
     """A board or tags printed on a face: what :mod:`stcal.boards` finds in images."""
 
     def xy_mm(self) -> np.ndarray:
@@ -56,7 +56,7 @@ class FaceDesign(Brief):
         Corners of its plate in order, face frame, for drawings.
     rim_mm : (n,) array, optional
         Heights of the rims in front of the circles, negative for discs that stand out; None if they lie in the surface.
-    printed : Printed, optional
+    printed : PrintedPattern, optional
         The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose frame
         is the face frame, Z into the body; None for a face of circles.
     sigma_mm : float, optional
@@ -78,7 +78,7 @@ class FaceDesign(Brief):
     rough_target_from_face: Rigid | None = None
     outline_mm: Array | None = None
     rim_mm: Array | None = None
-    printed: Printed | None = None
+    printed: PrintedPattern | None = None
     sigma_mm: float | None = None
     size_sigma: float = 0.0
     of_tags: bool = False
@@ -194,15 +194,15 @@ class TargetDesign(Brief):
         if BOARD in ids:
             raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
         circles = [face for face in self.faces if face.printed is None]
-        sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
-        radii = [radius(f"radius_mm of circle {label}", float(mm)) for label, mm in sizes]
+        sizes = _by_label((face, face.radius_mm) for face in circles)
+        radii = [radius(f"radius_mm of circle {label}", mm) for label, mm in sizes.items()]
         require_millimetres(radii, self.unusual_size, where)
         require_distinct(circles, where)
 
     @property
     def has_scale(self) -> bool:
         """True if the target itself determines the size: by printed faces, or by known distances."""
-        return bool(self.distances) or any(face.printed is not None for face in self.faces)
+        return bool(self.distances) or self.has_printed
 
     @property
     def up_to_scale(self) -> bool:
@@ -248,20 +248,16 @@ class TargetDesign(Brief):
 
     def radius_of(self) -> dict[CircleLabel, float]:
         """Returns the radius in mm by label."""
-        return {
-            label: float(radius)
-            for face in self.faces
-            for label, radius in zip(face.labels(), face.radius_mm, strict=True)
-        }
+        return _by_label((face, face.radius_mm) for face in self.faces)
 
     def rim_of(self) -> dict[CircleLabel, float]:
         """Returns the height of the rim in mm by label, of faces that state it."""
-        return {
-            label: float(height)
-            for face in self.faces
-            if face.rim_mm is not None
-            for label, height in zip(face.labels(), face.rim_mm, strict=True)
-        }
+        return _by_label((face, face.rim_mm) for face in self.faces if face.rim_mm is not None)
+
+
+def _by_label(faces: Iterable[tuple[FaceDesign, np.ndarray]]) -> dict[CircleLabel, float]:
+    pairs = (zip(face.labels(), values.tolist(), strict=True) for face, values in faces)
+    return {label: value for of_face in pairs for label, value in of_face}
 
 
 @dataclass(frozen=True, slots=True)
@@ -411,8 +407,8 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
     for i, face in enumerate(faces):
         for second in faces[i:]:
             few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
-            patterns = (few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm)
-            like = _likeness(*(values.tobytes() for values in patterns), few is many)
+            in_place = np.arange(len(few.ids)) if few is many else None
+            like = whole_likeness(few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, in_place)
             if like is None:
                 continue
             size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
@@ -429,14 +425,6 @@ def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
                 f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
                 f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
             )
-
-
-@lru_cache(maxsize=256)
-def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, same: bool) -> Likeness | None:
-    """Returns the similarity of two patterns, as bytes for the cache: the same design is often made again."""
-    places, radii, other_places, other_radii = map(np.frombuffer, (xy, radius, other_xy, other_radius))
-    in_place = np.arange(len(radii)) if same else None
-    return whole_likeness(places.reshape(-1, 2), radii, other_places.reshape(-1, 2), other_radii, in_place)
 
 
 def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:

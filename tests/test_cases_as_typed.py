@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.file import load_run_board
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.cli.main import main, main_sfm
-from stcal.io.design import load_target
 from stcal.io.table import read_table
 from tests.io.reported_cameras import SAMPLES
 from tests.levels import FULL
@@ -439,7 +439,7 @@ def test_stations_of_a_tracker_as_the_note_says(copied, called):
 def test_own_target_is_not_its_mirror_image(shared_case, tmp_path, called):
     """Three faces of nine circles, some off their grid of 35 mm: drawn and read; mirrored images are said."""
     folder = shared_case("own_target_mirror")
-    target, board = load_target(folder / "target.toml"), load_run_board(folder / "board.toml")
+    target, board = load_target(folder / "target.toml"), load_board(folder / "board.toml")
     assert (len(target.faces), len(board.labels())) == (3, 63)
     words = (
         f"stcal sfm simulate {tmp_path}/data --target {folder}/target.toml --board {folder}/board.toml --groups "

@@ -10,8 +10,8 @@ from typer.main import get_command
 
 import stcal
 import stcal.errors
-from stcal.boards.file import load_flat_board
-from stcal.boards.target import load_body
+from stcal.boards.board_file import load_flat_board
+from stcal.boards.target_file import load_target
 from stcal.cli.help import EXAMPLES, GROUPS
 from stcal.cli.main import app
 from stcal.locate.layout import load_layout
@@ -73,7 +73,7 @@ def test_links_lead_to_files(name):
 
 def test_examples_of_files_can_be_read(tmp_path):
     found = blocks(DOCUMENTS["docs/reference/files-in.md"], "toml")
-    for k, (read, text) in enumerate(zip((load_body, load_body, load_flat_board, load_layout), found, strict=True)):
+    for k, (read, text) in enumerate(zip((load_target, load_target, load_flat_board, load_layout), found, strict=True)):
         (tmp_path / f"{k}.toml").write_text(text, encoding="utf-8")
         read(tmp_path / f"{k}.toml")
 

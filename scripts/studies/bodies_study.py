@@ -17,7 +17,7 @@ import numpy as np
 
 from scripts.runner import options_of
 from stcal.boards.design import CharucoDesign
-from stcal.boards.target import printed_face
+from stcal.boards.target_file import printed_face
 from stcal.design import TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid

@@ -31,14 +31,14 @@ import pycolmap
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.board_file import board_of, load_flat_board
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset
 from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.model import CameraModel, camera_from_colmap
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_of, target_of
 from stcal.sfm import run
 from stcal.sfm.camera.calibrate import calibrate_camera
 from stcal.sfm.camera.checks import FOLDS, foretold

@@ -23,8 +23,9 @@ from same_results import prepare
 from scipy.spatial.transform import Rotation
 
 from scripts.runner import options_of
+from stcal.boards.board_file import load_flat_board
 from stcal.boards.design import ChessboardDesign
-from stcal.boards.file import load_flat_board
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, reference_board
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
@@ -33,7 +34,6 @@ from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Poses, skew
 from stcal.handeye.solve import handeye
 from stcal.io.cameras.read import load_camera
-from stcal.io.design import target_of
 from stcal.robot.identification.adjustment import tip_jacobian
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify

@@ -18,12 +18,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stcal.boards.board_file import load_flat_board
 from stcal.boards.design import CharucoDesign, ChessboardDesign
 from stcal.boards.dictionaries import dictionary_of
-from stcal.boards.file import load_flat_board
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign
 from stcal.errors import StcalError
-from stcal.io.design import target_of
 from stcal.io.images import find_images
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera, residual_rms_px
 from stcal.sfm.camera.checks import FOLDS

@@ -41,7 +41,7 @@ from stcal.sfm.checks.verdict import MOST_SIGMAS, ranked
 from stcal.sfm.data.model import ImageObservations, WorldModel
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
-from stcal.sfm.detect.labels import label_images
+from stcal.sfm.detect.labelling import label_images
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.report.judgement import CAUSE
 from stcal.sfm.runs.solve import LIKELY, explained, refine_or_explain, wrong_file

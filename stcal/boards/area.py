@@ -25,12 +25,10 @@ BY_CHANCE = 3.0
 
 
 def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the share of the bright side of m edges in pixels, and its derivatives by distance and by variance.
-
-    The square pixel as the edge's normal (m, 2) sees it is a trapezoid, the convolution of two boxes. The wider one,
-    and with it an edge along the rows, is integrated exactly; the narrower one, like the blur of ``variance`` (m,) px²,
-    as a Gaussian. ``distance`` : (m, ...) of the pixels' centres, positive on the bright side, px.
-    """
+    """Return the share of the bright side of m edges in pixels, and its derivatives by distance and by variance. The
+    square pixel as the edge's normal (m, 2) sees it is a trapezoid, the convolution of two boxes. The wider one, and
+    with it an edge along the rows, is integrated exactly; the narrower one, like the blur of ``variance`` (m,) px², as
+    a Gaussian. ``distance`` : (m, ...) of the pixels' centres, positive on the bright side, px."""
     narrow, wide = (side.reshape(-1, *(1,) * (distance.ndim - 1)) for side in np.sort(np.abs(normal), axis=1).T)
     sigma = np.sqrt(variance.reshape(narrow.shape) + narrow**2 / 12)
     first, last = ((distance + shift) / sigma for shift in (wide / 2, -wide / 2))
@@ -51,9 +49,8 @@ def across_edges(
     grey: np.ndarray, major: np.ndarray, column: np.ndarray, middle: np.ndarray, half: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return levels (m, p, s), places (m, p, s, 2) and whether they are in the image, of pixels across m edges.
-
-    ``major`` : (m,) 0 for an edge along the rows, whose pixels are taken by columns; ``column``, ``middle`` : (m, p).
-    """
+    ``major`` : (m,) 0 for an edge along the rows, whose pixels are taken by columns; ``column``, ``middle`` : (m,
+    p)."""
     across = middle[..., None] + np.arange(-half, half + 1)
     along = np.broadcast_to(column[..., None], across.shape)
     by_column = (major == 0)[:, None, None]
@@ -83,21 +80,16 @@ def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[n
 
 
 def passed_by_blur(rise: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Return the displacements (m,) of edges by sampling, relative to that of an edge along the rows.
-
-    They come from what the image contains at the frequency f of the pixels across the edge: 1/px along the rows, √2/px
-    along the diagonals. A Gaussian blur of ``variance`` σ² passes exp(−2π²σ²f²) of it. ``rise`` : (m,) change of the
-    distance from the edge from one pixel to the next.
-    """
+    """Return the displacements (m,) of edges by sampling, relative to that of an edge along the rows: a Gaussian blur
+    of ``variance`` σ² passes exp(−2π²σ²f²) of what the image contains at the frequency f of the pixels across the edge.
+    ``rise`` : (m,) change of the distance from the edge from one pixel to the next."""
     return np.exp(-2 * np.pi**2 * variance * (rise**-2 - 1))
 
 
 def of_sampling(distance: np.ndarray, rise: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Return the gradients (m, p, s, 2) by a displacement of 1 px that follows the cosine, or the sine, of the phase.
-
-    Sampling displaces an edge by its place between two pixels: all profiles of an edge along the rows alike. The first
-    harmonic is modelled. ``gradient`` : (m, p, s) derivative of the grey values by the place of the edge.
-    """
+    """Return the gradients (m, p, s, 2) by a displacement of 1 px that follows the cosine, or the sine, of the phase:
+    sampling displaces all profiles of an edge along the rows alike. ``gradient`` : (m, p, s) derivative of the grey
+    values by the place of the edge."""
     angle = -2 * np.pi * distance / rise[:, None, None]
     return gradient[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
@@ -125,11 +117,8 @@ class SamplingVariance:
 
 
 def displacement_variance(by_phase: Sequence[Displacement], otherwise: Sequence[Displacement] = ()) -> SamplingVariance:
-    """Return the variances that explain the estimates best, weighted by their certainty; at least 0.
-
-    Both have a prior: lines whose spacing is a whole number of pixels move together, and tell nothing. ``otherwise`` is
-    the scatter of lines that does not follow the phase; it counts if it is beyond chance.
-    """
+    """Return the variances that explain the estimates best, weighted by their certainty; at least 0. Both have a prior.
+    ``otherwise`` is the scatter of lines that does not follow the phase; it counts if it is beyond chance."""
     square, noise, lines, passed = _known(by_phase)
     design = np.stack([passed**2, np.ones_like(passed)], axis=-1)
     before = np.array([PRIOR_PX, POINTS_PX]) ** 2
@@ -156,13 +145,11 @@ def _known(parts: Sequence[Displacement]) -> list[np.ndarray]:
 CLEAR_BLURS = 2.5
 """Distance from other lines, in σ of blur and pixel, from which on pixels are used."""
 END_BLURS = 2.0
-"""Distance from the ends of a cell's side, in the same, from which on pixels are used. Past its end the contrast of the
-side changes, but not its place."""
+"""Distance from the ends of a cell's side, in the same, from which on pixels are used."""
 LEAST_BLURS, MOST_BLURS = 1.5, 4.0
 """Least and largest reach of pixels to either side of a line, in σ of blur and pixel."""
 FARTHEST_PX = 0.1
-"""Largest distance of a line from the tag's grid. Cells of a tag that is drawn or printed in dots are not all of one
-size; their lines are farther away."""
+"""Largest distance of a line from the tag's grid; cells that are printed in dots are not all of one size."""
 MOST_PX = 0.04
 """Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
 STEPS = 2
@@ -182,11 +169,9 @@ class OuterLines:
 
 
 def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> tuple[Displacement, Displacement]:
-    """Return the displacement of edges by sampling, estimated from the lines between cells, and that by other errors.
-
-    Apart from perspective and lens, the lines of a tag are evenly spaced. What is left of them follows the phase of the
-    pixels if sampling displaces them; the rest of their scatter, beyond noise, has other reasons, such as the print.
-    """
+    """Return the displacement of edges by sampling, estimated from the lines between cells, which are evenly spaced
+    apart from perspective and lens: what is left of them and follows the phase of the pixels. And that by other errors,
+    such as the print: the rest of their scatter."""
     square = np.broadcast_to(cells * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
     middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)

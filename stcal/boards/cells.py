@@ -46,11 +46,8 @@ def clear_mm(board: SquaresOrTags) -> float:
 
 
 def outlines(black: np.ndarray) -> list[np.ndarray]:
-    """Return closed lines around the black cells of a mask (rows, columns).
-
-    Each line is (k, 2) corners, column and row, with the black on the right if rows go down. Areas that touch only at a
-    corner stay separate.
-    """
+    """Return closed lines around the black cells of a mask (rows, columns). Each line is (k, 2) corners, column and
+    row, with the black on the right if rows go down. Areas that touch only at a corner stay separate."""
     padded = np.pad(black, 1)
     after: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for row, column in np.argwhere(black).tolist():

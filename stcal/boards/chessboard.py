@@ -30,8 +30,7 @@ MOST_BY_AREA = 10.0
 UNSEEN_PX = 0.1
 """σ of a corner that is where the gradients of its edges meet, as the areas in its window do not fit."""
 SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
-"""σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px. Smoothing does
-not move a saddle, but removes noise of the gradients, which would hold a corner at its start."""
+"""σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px."""
 MARGIN, LEAST_MARGIN = 3.0, 10.0
 """Margin about the corners in which the image is smoothed, in windows and then in px: no window comes near its end."""
 FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -41,17 +40,14 @@ PART, PART_FLAGS = (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 FIRST_SIDE, LEAST_SIDE = 1600, 300
 """Longer side of the largest image that is searched before the original, and of the smallest one, px."""
 PX_A_SQUARE = 25.0
-"""Longer side of the first image that is searched, per square of the board's longer side, px: a board that fills a
-third of it has squares of 8 px."""
+"""Longer side of the first image that is searched, px per square of the board's longer side."""
 
 
 def find_chessboard(
     image: np.ndarray, name: str, board: ChessboardDesign, with_sigma: bool = False
 ) -> BoardView | None:
-    """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black.
-
-    A board that looks the same after half a turn may be returned rotated. ``with_sigma`` : whether covariances are.
-    """
+    """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black. A
+    board that looks the same after half a turn may be returned rotated. ``with_sigma`` : whether covariances are."""
     grey = grey_8bit(image)
     for detected in _read_corners(grey, board):
         measured = _refined(grey, detected)
@@ -181,9 +177,8 @@ ROBUST_PASSES = 10
 LEAST_SCATTER_PX = 0.05
 """Smallest scatter of corners about a smooth field, px: printing and lenses cause it even in sharp views."""
 GATE = 5.0
-"""Largest deviation of a corner from the prediction by its neighbours. It is in units of the robust σ of such
-deviations in the view, or of the scatter of the neighbours themselves, whichever is larger. A bent board or a wide lens
-makes the latter large near an edge."""
+"""Largest deviation of a corner from the prediction by its neighbours, in robust σ of the view or, if larger, of the
+neighbours themselves, as of a bent board."""
 SMOOTHING_PX = 0.8
 """σ of the smoothing before gradients are taken."""
 ALIKE_PX2 = 4 * np.pi * SMOOTHING_PX**2
@@ -193,8 +188,7 @@ LEAST_WINDOW_PX, MOST_WINDOW_PX = 2, 30
 STEPS, SETTLED_PX = 20, 1e-3
 """Most steps of a corner's measurement, and the step at which it ends, px."""
 WIDEST_EDGE, MOST_FROM_SADDLE = 0.4, 0.25
-"""Largest σ of an edge's blur at which edges that meet are measured, and largest distance of their point from the
-saddle, in half sides of the window. Wider edges leave it, and only the saddle is measured."""
+"""Largest σ of an edge's blur, and distance of the edges' point from the saddle, in half sides of the window."""
 NOISE = 1e-6
 """Keeps the equations of a blank window regular."""
 LEAST_SIGMA_PX = 0.02
@@ -202,13 +196,10 @@ LEAST_SIGMA_PX = 0.02
 
 
 def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardView | None:
-    """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen.
-
-    One visible neighbour tag is enough for a corner; of a blurred tag alone it may be several px off. Each measurement
-    therefore starts at the place that the surrounding corners predict, and must end near there. A corner is the
-    crossing of the edges by the areas that they cover in the pixels of a window clear of the tags; else the point where
-    the gradients of the edges meet; else, of blurred edges, the saddle of the grey values.
-    """
+    """Return the inner corners of a ChArUco board, with covariances; None if fewer than four are seen. Each measurement
+    starts at the place that the surrounding corners predict, as one blurred tag alone may be several px off, and must
+    end near there: at the crossing of the edges by their areas; else where the gradients of the edges meet; else at the
+    saddle of the grey values."""
     grey = grey_8bit(image)
     ids, corners = _read(grey, board)
     if len(ids) < LEAST_CORNERS:

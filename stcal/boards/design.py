@@ -244,6 +244,11 @@ class LatticePart(BoardDesign):
 
     taken: np.ndarray | None = None  # (n, 2) rows and columns of these places
     circles: "AsymmetricCirclesDesign | None" = None  # that these are, if any
+    hexagonal: bool = False  # whether rows are shifted by half a pitch each
+
+    def steps(self) -> np.ndarray:
+        """Return the steps (2, 2), as columns, from column to column and from row to row, in pitches."""
+        return HEXAGONAL.copy() if self.hexagonal else BoardDesign.steps(self)
 
     def cells(self) -> np.ndarray:
         """Return row and column of every dot, (n, 2)."""
@@ -276,7 +281,7 @@ class AsymmetricCirclesDesign:
     polarity: Polarity
     sigma_mm: float = 0.005
     rings: tuple[tuple[int, int], ...] = ()
-    LATTICE: ClassVar[type[LatticePart]] = LatticePart
+    hexagonal: ClassVar[bool] = False
 
     def __post_init__(self):
         require_fields(self, "asymmetric circles")
@@ -315,16 +320,8 @@ class AsymmetricCirclesDesign:
         sizes = rows, columns, self.nearest_mm(), self.radii_mm()[0]
         ringed = (cells[row * self.columns + place].tolist() for row, place in self.rings)
         rings = tuple((row, column) for row, column in ringed)
-        return self.LATTICE(*sizes, self.polarity, self.sigma_mm, rings=rings, taken=cells, circles=self)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HexagonalPart(LatticePart):
-    """A hexagonal lattice of which circles occupy some places; rows are shifted by half a pitch each."""
-
-    def steps(self) -> np.ndarray:
-        """Return the steps (2, 2), as columns, from column to column and from row to row, in pitches."""
-        return HEXAGONAL.copy()
+        of = {"rings": rings, "taken": cells, "circles": self, "hexagonal": self.hexagonal}
+        return LatticePart(*sizes, self.polarity, self.sigma_mm, **of)
 
 
 HEXAGONAL = np.array([[1.0, 0.5], [0.0, np.sqrt(3) / 2]])
@@ -339,7 +336,7 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
     √3 / 2 · ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`.
     """
 
-    LATTICE: ClassVar[type[LatticePart]] = HexagonalPart
+    hexagonal: ClassVar[bool] = True
 
     def _steps(self) -> np.ndarray:
         return self._cells()[:, ::-1] @ HEXAGONAL.T

@@ -34,10 +34,8 @@ _APRILTAG = re.compile(r"(?:april)?[_ -]?(?:t(?:ag)?)?[_ -]?(standard|circle|cus
 
 @cache
 def known_dictionary(name: str) -> str:
-    """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
-
-    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``. Raises ValueError.
-    """
+    """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case. Families
+    of AprilTag have their own names, too: ``tag36h11``, ``t36h11``. Raises ValueError."""
     family = _APRILTAG.fullmatch(name.strip())
     if family is not None and f"DICT_APRILTAG_{family[2].lower()}" in dir(cv2.aruco) and family[1] is None:
         name = f"APRILTAG_{family[2]}"

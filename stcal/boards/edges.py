@@ -64,11 +64,9 @@ TOLD, LONG_SMEAR = 4.0, 0.4
 ROUNDING = 1 / 12
 """Variance of rounding to whole grey values."""
 BLURS, LEAST_INSIDE_PX = 2.5, 1.0
-"""Distance from the tag's inner cells, in σ of blur and pixel, from which on pixels are used, and the least width of
-the border's band that is used, px."""
+"""Distance of pixels from the tag's inner cells, in σ of blur and pixel, and least width of the border's band, px."""
 CLEAR_BLURS = 1.5
-"""Distance from the pattern next to a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what
-the blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
+"""Distance of pixels from the pattern next to a crossing, in σ of blur and pixel."""
 SHADED_HALF_PX = 4
 """Half the side of a window from which on grey values may change along it."""
 CROSSING_STEPS = 4
@@ -79,24 +77,15 @@ WIDEST_BLUR = 0.4
 """Largest σ of the blur, in half sides of the window: a wider one leaves no area of one colour."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeCorners:
-    """The refined corners of n tags. Two corners share the errors of the edge between them."""
-
-    corners_px: np.ndarray  # (n, 4, 2)
-    covariance_px2: np.ndarray  # (n, 8, 8) of the four corners together
-    seen: np.ndarray  # (n,) True if all four edges of a tag are visible; otherwise its values are meaningless
-    smear_px: float = 0.0  # way by which motion during the exposure blurs the edges; 0 where it is short beside a cell
-
-
-def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
+def corners_from_edges(
+    grey: np.ndarray, corners: np.ndarray, cells: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Refine the corners (n, 4, 2), in cyclic order, of dark tags with ``cells`` (n,) cells per side, border included.
-
-    An edge is not visible if it is too short, hidden, outside of the image, or without contrast.
-    """
+    Return them with the covariances (n, 8, 8) of the four of a tag together, a mask (n,) of the tags of which all edges
+    are visible, and the way by which motion during the exposure blurs edges, px, 0 where it is short beside a cell."""
     n = len(corners)
     if not n:
-        return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool))
+        return np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool), 0.0
     frame = _frame(np.asarray(corners, float), cells)
     offset, good = _profiles(grey, frame)
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
@@ -108,7 +97,7 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
         covariance = _meet(frame, area.lines(rough, variance))[1]
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
-    return EdgeCorners(meeting, covariance, seen.all(1), area.smear_px)
+    return meeting, covariance, seen.all(1), area.smear_px
 
 
 def _told_by_lines(
@@ -141,7 +130,7 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Frame:
+class _Edges:
     """Geometry of the edges, px."""
 
     middle: np.ndarray  # (n, 4, 2) of each edge
@@ -164,7 +153,7 @@ class _Lines:
     keep: np.ndarray  # (n, 4, POINTS) profiles that are no outliers
 
 
-def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
+def _frame(corners: np.ndarray, cells: np.ndarray) -> _Edges:
     """Return the edges from each corner to the next."""
     end = np.roll(corners, -1, axis=1)
     length = np.linalg.norm(end - corners, axis=2)
@@ -177,10 +166,10 @@ def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
     reach = np.clip(CELLS_ACROSS * cell, *REACH_PX)
     place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
     number = np.broadcast_to(np.reshape(cells, (-1, 1)), length.shape)
-    return _Frame(middle, along, normal, length, cell, number, reach, place)
+    return _Edges(middle, along, normal, length, cell, number, reach, place)
 
 
-def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
+def _profiles(grey: np.ndarray, frame: _Edges) -> tuple[np.ndarray, np.ndarray]:
     """Return the edge in each profile, px from the frame's line, and a mask of good profiles, (n, 4, POINTS)."""
     n = len(frame.length)
     across = np.linspace(-1, 1, SAMPLES) * frame.reach[..., None]
@@ -232,7 +221,7 @@ class _Pixels:
     rise: np.ndarray  # (m,) of ``across`` from one pixel to the next
 
 
-def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
+def _pixels(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Pixels:
     """Return the pixels within reach of the edges ``rough``, in the columns or rows of the profiles that are kept."""
     m, each = frame.length.size, np.arange(frame.length.size)
     middle, along, normal = (value.reshape(m, 2) for value in (frame.middle, frame.along, frame.normal))
@@ -281,7 +270,7 @@ class _Area:
         return _Lines(self.offset, self.slope, covariance, rough.keep)
 
 
-def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
+def _by_area(grey: np.ndarray, frame: _Edges, rough: _Lines) -> _Area:
     """Return the lines that split the pixels into dark and bright areas as the image has them."""
     pixels = _pixels(grey, frame, rough)
     m = len(pixels.level)
@@ -412,7 +401,7 @@ def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.n
     return (inverse @ np.stack([y0, y1], -1)[..., None])[..., 0], inverse
 
 
-def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
+def _meet(frame: _Edges, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
     """Return the intersection of each edge with the previous one, (n, 4, 2), and the covariance (n, 8, 8) of all."""
     row = frame.normal - lines.slope[..., None] * frame.along
     right = lines.offset + (row * frame.middle).sum(2)
@@ -455,10 +444,8 @@ def crossings(
     grey: np.ndarray, start: np.ndarray, along: np.ndarray, half: np.ndarray, clear_px: np.ndarray
 ) -> Crossings:
     """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
-
     ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest pattern
-    other than the two edges, from where blur carries light into pixels, which are not used then.
-    """
+    other than the two edges, from where blur carries light into pixels, which are not used then."""
     n = len(start)
     xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
     for side in np.unique(half).tolist():
@@ -551,14 +538,9 @@ def _growth(
     place: np.ndarray,  # (n, k) profiles of the pixels, px along the edges; different numbers on both
     noise: np.ndarray,  # (n,) variances of the pixels
     profiles: int,  # number on each edge
-    blur: float,  # variance, px²
+    blur: float,  # variance, px²; neighbours at a distance k correlate by exp(−k²/4σ²)
 ) -> float:
-    """Return the factor, 1 or more, of all variances that is due to edges that are not straight, as by print.
-
-    All pixels of a profile share the displacement of the edge there. The squares of their common pulls are compared
-    with what the noise of single pixels makes of them. The blur smooths displacements along the edge: neighbours at a
-    distance k correlate by exp(−k²/4σ²), and the variance of the sum is 2σ√π times what the single ones add up to.
-    """
+    """Return the factor, 1 or more, of all variances by edges that are not straight: all pixels of a profile move."""
     n = len(pull)
     number = np.rint(place).astype(int)
     number -= number.min()

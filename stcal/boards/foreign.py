@@ -13,12 +13,16 @@ from pydantic import AfterValidator, ConfigDict, Field
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
 from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
-from stcal.io.design import Count, Squares
 from stcal.io.poses.rotations import of_quaternions
 from stcal.io.toml import Finite, Positive, Strict, load_yaml, validated
 from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM
 
 KEYS = ("tag_bundles", "standalone_tags")
+Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
+Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
+Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
+"""Number in a row of a chessboard. A grid with fewer inner corners is not recognised as a chessboard; fewer squares
+have all inner corners on one line."""
 FAMILY = "tag36h11"
 """The family where the file names none: settings.yaml of apriltag_ros does."""
 METRE_MM = 1000.0
@@ -91,15 +95,12 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
                 f"{where}: {place}: {np.degrees(angle):.3g}° and {height:.3g} mm from the plane of the bundle, none "
                 "allowed: targets are flat here; give the tags of one plane",
             )
+    corners_of_one = UPRIGHT if data.upright or is_of_apriltag(data.tag_family) else CORNERS
     tags = []
-    as_printed = data.upright or is_of_apriltag(data.tag_family)
     for tag, rotation, middle in zip(bundle.layout, turn, at, strict=True):
-        corners = METRE_MM * tag.size * (UPRIGHT if as_printed else CORNERS) @ rotation[:2, :2].T + middle[:2]
+        corners = METRE_MM * tag.size * corners_of_one @ rotation[:2, :2].T + middle[:2]
         tags.append({"dictionary": data.tag_family, "id": tag.id, "corners_mm": (corners * [1, -1]).tolist()})
     return {"type": "tags", "name": bundle.name, "tag": tags}
-
-
-Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 
 def _metres(value: float) -> float:

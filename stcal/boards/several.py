@@ -7,11 +7,11 @@ from typing import Any, Literal
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from stcal.boards.board_file import SET, board_content, design_of, flat_board, load_flat_board
 from stcal.boards.design import BoardSet, CharucoDesign, ChessboardDesign, FlatBoard
-from stcal.boards.file import SET, board_content, design_of, flat_board, load_flat_board
-from stcal.boards.target import tags_on
+from stcal.boards.target_file import tags_on
 from stcal.design import BoardDesign
-from stcal.errors import InputError
+from stcal.errors import InputError, named
 from stcal.geometry.rigid import Rigid
 from stcal.io.toml import Finite, PoseEntry, Strict, validated
 
@@ -77,10 +77,8 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
     if extra := sorted(set(entry) - {"file"}):
         beside = f"{where}: {', '.join(extra)} beside file; the board's file says what the board is"
         raise InputError("E-BOARD-KEY-CONFLICT", beside)
-    try:
+    with named(where):
         return load_flat_board(path.parent / entry["file"])
-    except InputError as error:
-        raise InputError(error.code, f"{where}: {error}") from error
 
 
 def _require_told_apart(found: BoardSet, where: str) -> None:

@@ -23,18 +23,15 @@ SATURATED = 254
 EDGE_PX = 0.1
 """σ of the shift that all edges of a tag share, by a nonlinear response, stray light or ink."""
 SATURATED_EDGE_PX = 0.7
-"""σ that saturation adds to this shift. An edge blurred by 0.7 px whose bright side is clipped at ½ or ¼ of its height
-seems to lie 0.6 or 0.9 px farther towards the dark side (the mean of a normal density's tail)."""
+"""σ that saturation adds to this shift: an edge blurred by 0.7 px and clipped at half its height moves by 0.6 px."""
 SATURATION_POINTS = 8
 """Number of points along each edge at which saturation is tested."""
 WHITE_PX = 3
-"""Side of the window of the dilation, px. Without dilation, a blurred corner at which two black squares meet joins them
-to one outline."""
+"""Side of the window of the dilation, px, which separates black squares that meet at a blurred corner."""
 TOGETHER_PX, APART_PX = (5, 25), ((5,), (21,))
 """Sides of the windows of the threshold, px, of one search, and of two."""
 GROWN_LOOKS = ((2, 4e7), (3, 1e7), (1, 5e8))
-"""Scales of the dilated images, each with the largest number of pixels up to which it is used. Dilation by a pixel at
-the original scale grows the white too far into tags of 50 px and less."""
+"""Scales of the dilated images, each with the largest number of pixels up to which it is used."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,10 +71,8 @@ def find_tags(
     windows_px: Sequence[tuple[int, ...]] = (TOGETHER_PX,),
 ) -> Tags:
     """Return the tags of the dictionaries in a grey image (height, width), with corners from their edges.
-
     ``border_bits`` : width of the black border in cells; ``joined`` : True if black squares touch the tags' corners;
-    ``windows_px`` : sides of the threshold windows of each search.
-    """
+    ``windows_px`` : sides of the threshold windows of each search."""
     grey = grey_8bit(image)
     places_of: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
@@ -142,11 +137,9 @@ def _inside(place: np.ndarray, other: np.ndarray) -> bool:
 
 
 def seen_otherwise(image: np.ndarray, own: Collection[tuple[str, int]], place: str) -> str:
-    """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing.
-
-    Tags of ``own`` (dictionary, id) may be in view twice, mirrored, or white on black; or tags of another dictionary,
-    which is to be corrected in ``place``.
-    """
+    """Return in words what an image shows where no tag is read as it should be, with the remedy; empty if nothing. Tags
+    of ``own`` may be in view twice, mirrored, or white on black, or of another dictionary, to be corrected in
+    ``place``."""
     grey, known = grey_8bit(image), sorted({name for name, _ in own})
     if twice := [tag for tag in find_tags(grey, known).repeated if tag in own]:
         return f"tag {twice[0][1]} more than once; cover what is not the target, and mirrors"
@@ -184,12 +177,9 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
 
 
 def detector_settings(name: str, border_bits: int = 1, windows_px: tuple[int, ...] = TOGETHER_PX):
-    """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows.
-
-    The default settings lose small tags, in which only the middle of a cell keeps its colour: of 272 real tags of 19 to
-    60 px a side they read 86 %, these 97 %. Two sizes of the window find more if each has a search of its own: of the
-    outlines that both find of one tag, the detector keeps a single one, which need not be that which can be read.
-    """
+    """Return the settings of the detector; ``windows_px`` : smallest and largest side of its threshold windows. The
+    default settings lose small tags, in which only the middle of a cell keeps its colour: of 272 real tags of 19 to 60
+    px a side they read 86 %, these 97 %. Two sizes of the window find more if each has a search of its own."""
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = border_bits
     settings.perspectiveRemovePixelPerCell = 10
@@ -226,25 +216,21 @@ def _refined(
             own = np.zeros(int(colour.sum()), bool)
             refined[colour], covariance[colour], smears[i] = _refined(picture, corners[colour], cells[colour], own)
         return refined, covariance, max(smears)
-    measured = corners_from_edges(grey, corners, cells)
+    measured, joint, seen, smear_px = corners_from_edges(grey, corners, cells)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
-    away = np.linalg.norm(np.where(measured.seen[:, None, None], measured.corners_px - corners, 0), axis=2)
-    away = away.max(1, initial=0)
-    good = (measured.seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
-    covariance = np.where(good, measured.covariance_px2, UNREFINED_PX**2 * np.eye(8))
-    return np.where(good, measured.corners_px, corners), covariance, measured.smear_px
+    away = np.linalg.norm(np.where(seen[:, None, None], measured - corners, 0), axis=2).max(1, initial=0)
+    good = (seen & (away <= np.maximum(2.0, side / cells)))[:, None, None]
+    return np.where(good, measured, corners), np.where(good, joint, UNREFINED_PX**2 * np.eye(8)), smear_px
 
 
 KALIBR_BITS, USUAL_BITS = 2, 1
 """Widths of the black border of Kalibr's tags and of usual ones, cells."""
 TELLING_SHARE = 0.5
-"""Smallest share of the tags read with a border of one cell that a border of two cells must read to be accepted. A
-border of two cells is sometimes read as one, but a border of one cell never as two."""
+"""Smallest share of the tags read with a border of one cell that a border of two cells must read."""
 ENOUGH_SHARE = 0.5
 """Share of all tags of the board from which on a border of two cells is accepted without trying one cell."""
 MAX_OFF_SHARE = 0.15
-"""Largest deviation of a tag from its place in the board's plane, as a share of its side; a tag with a larger one is
-elsewhere, or rotated."""
+"""Largest deviation of a tag from its place in the board's plane, as a share of its side."""
 MOST_STRAY_SHARE = 1 / 3
 """Largest share of the tags in view that may be rejected for lying off the plane."""
 
@@ -276,15 +262,17 @@ def find_aprilgrid(
 
 def _tags(image: np.ndarray, board: AprilGridDesign) -> tuple[Tags, str]:
     """Return the tags, read with the board's border width or the more likely one, and the widths tried, in words."""
-    names = (board.dictionary,)
+
+    def read(bits: int) -> tuple[Tags, int]:
+        tags = find_tags(image, (board.dictionary,), bits, joined=True)
+        return tags, sum(tag in board.tag_ids() for _, tag in tags.tags)
+
     if board.border_bits is not None:
-        return find_tags(image, names, board.border_bits, joined=True), f"{board.border_bits}"
-    of_two_bits = find_tags(image, names, KALIBR_BITS, joined=True)
-    two = sum(tag in board.tag_ids() for _, tag in of_two_bits.tags)
+        return read(board.border_bits)[0], f"{board.border_bits}"
+    of_two_bits, two = read(KALIBR_BITS)
     if two >= ENOUGH_SHARE * len(board.tag_ids()):
         return of_two_bits, f"{KALIBR_BITS}"
-    of_one_bit = find_tags(image, names, USUAL_BITS, joined=True)
-    one = sum(tag in board.tag_ids() for _, tag in of_one_bit.tags)
+    of_one_bit, one = read(USUAL_BITS)
     return (of_two_bits if 0 < two >= TELLING_SHARE * one else of_one_bit), f"{USUAL_BITS} or {KALIBR_BITS}"
 
 

@@ -81,7 +81,7 @@ def calibrate(
     json_file: shared.JsonFile = None,
 ) -> None:
     """Find the corners of the target's tags, with σ, in the frame at the centre of the layout's origin tag."""
-    from stcal.boards.file import load_flat_board
+    from stcal.boards.board_file import load_flat_board
     from stcal.io.cameras.read import read_camera
     from stcal.locate.layout import layout_toml, load_plan, require_layout_written
     from stcal.locate.layout_calibration import calibrate as calibrated

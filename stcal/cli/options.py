@@ -416,13 +416,13 @@ def designs_told(
 ) -> Iterator[None]:
     """Prints which reference designs are assumed (unless switched off), and which faces are nearly alike; errors within
     the context name the designs."""
-    from stcal.boards.target import body_of
+    from stcal.boards.target_file import target_of
     from stcal.design import reference_board, reference_target
     from stcal.sfm.detect.sightings import likeness_notes
 
     assumed = []
     if target is not None:
-        design = body_of(target)
+        design = target_of(target)
         print_each("note", likeness_notes(design))
         with_board = with_board and not design.has_scale
     elif with_target:

@@ -439,15 +439,16 @@ def from_photos(
 ) -> None:
     """Measure the target on an arm in photographs, find axes and kinematics, and compensate poses, in one folder."""
     shared.load_ahead(workers)
+    from stcal.boards.board_file import load_dots
+    from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
     from stcal.io.files import require_new_folder, save_folder
     from stcal.robot import IdentifyOptions, load_robot
     from stcal.sfm import MeasureOptions, read_target
     from stcal.workflows.from_photos import files_of, require_files_written, robot_from_photos, story
 
     require_new_folder(out, images)
-    design = target_of(target)
+    design = target_of(target, printed=False)
     with StageProgress() as progress:
         result = robot_from_photos(
             images,
@@ -457,7 +458,7 @@ def from_photos(
             joints,
             load_robot(robot_file),
             targets,
-            load_board(board) if board else None,
+            load_dots(board) if board else None,
             key,
             MeasureOptions(workers=workers),
             IdentifyOptions(model=model, partial=partial),

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.board_file import board_content
 from stcal.boards.design import BoardSet, FlatBoard
-from stcal.boards.file import board_content
 from stcal.boards.several import load_boards
-from stcal.boards.target import load_body
+from stcal.boards.target_file import load_target
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.net import net_part
 from stcal.drawing.parts import LAYERS, Area, Disc, Part, Shape, Text, corners_of, parts_of, said_mm
@@ -255,7 +255,7 @@ def load_design(path: str | Path) -> Design:
             "E-DRAW-DESIGN", f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)"
         )
     content = board_content(path)
-    return load_body(path) if content is not None and "face" in content else load_boards(path)
+    return load_target(path) if content is not None and "face" in content else load_boards(path)
 
 
 def paper_for(parts: Sequence[Part]) -> str | None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stcal.boards.target_file import ROUGH_KEYS
 from stcal.design import FaceDesign, TargetDesign
 from stcal.drawing.parts import (
     Area,
@@ -20,7 +21,6 @@ from stcal.drawing.parts import (
     words_with_room,
 )
 from stcal.errors import InputError
-from stcal.io.design import ROUGH_KEYS
 
 TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
 """Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""

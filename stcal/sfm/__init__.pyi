@@ -3,8 +3,8 @@ from .camera.calibrate import calibrate_camera as calibrate_camera
 from .checks.verdict import Check as Check
 from .checks.verdict import Trial as Trial
 from .checks.verdict import judge as judge
-from .detect.labels import Detection as Detection
-from .detect.labels import detect_circles as detect_circles
+from .detect.labelling import Detection as Detection
+from .detect.labelling import detect_circles as detect_circles
 from .interop.crosscheck import crosscheck as crosscheck
 from .interop.export import export_run as export_run
 from .interop.export_database import export_database as export_database

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.target import save_body
+from stcal.boards.board_file import load_dots, save_board
+from stcal.boards.target_file import save_target
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
@@ -23,11 +24,10 @@ from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
-from stcal.io.design import load_board, save_design
 from stcal.parallel import Progress
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, images_px
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, diameter_limits_px
-from stcal.sfm.detect.faces import FaceFinder
+from stcal.sfm.detect.face_patterns import FaceFinder
 from stcal.sfm.detect.sightings import MIN_NAMING, in_common
 from stcal.sfm.planning.advise import expected_noise
 from stcal.sfm.planning.bodies import plan_body
@@ -476,7 +476,7 @@ def design_target(
         ``target.toml`` exists.
     """
     target_file, board_file = _free(out)
-    board = load_board(board_file) if board_file is not None and os.path.lexists(board_file) else None
+    board = load_dots(board_file) if board_file is not None and os.path.lexists(board_file) else None
     made = make_target(options, progress and partial(progress, "patterns"))
     target, noise, source = made.pattern.target, *expected_noise()
     session = PlanOptions(
@@ -490,10 +490,11 @@ def design_target(
     forecast = plan_with_board(session, target, board or made.board, target.rough_poses())
     files: tuple[Path, ...] = ()
     if target_file is not None and board_file is not None:
-        designs = {target_file: target} | ({} if board is not None else {board_file: made.board})
-        for path, each in designs.items():
-            save_design(path, each)
-        files = tuple(designs)
+        save_target(target_file, target)
+        files = (target_file,)
+        if board is None:
+            save_board(board_file, made.board)
+            files = target_file, board_file
     return DesignedTarget(target, board or made.board, forecast, "", source, made, files)
 
 
@@ -549,7 +550,7 @@ def design_tag_body(
             raise
         reason = str(error)
     if path is not None:
-        save_body(path, target)
+        save_target(path, target)
     return DesignedTarget(target, None, forecast, reason, source, None, () if path is None else (path,))
 
 

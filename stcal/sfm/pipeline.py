@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.faces import tags_of_no_face, why_unseen
-from stcal.boards.file import run_board_of as board_of
-from stcal.boards.target import body_of
+from stcal.boards.board_file import board_of
+from stcal.boards.on_faces import tags_of_no_face, why_unseen
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, InputNote, StcalError
 from stcal.geometry.arrays import require_arguments
@@ -37,7 +37,7 @@ from stcal.sfm.data.as_drawn import misnamed_groups, misplaced_images, not_as_dr
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.data.note import NOT_AS_DRAWN, Note, lost_groups
 from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, files_of_arrays, seen_by
-from stcal.sfm.detect.labels import LabelledImage, is_board_alone, label_images
+from stcal.sfm.detect.labelling import LabelledImage, is_board_alone, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, plain_lens, unknown_lens
@@ -178,7 +178,7 @@ def run_on_files(
         known = f"camera file {model.source}: states its focal length to ±{_focal_sigma(model):.3g} px only"
         warnings.warn(f"{known}; intrinsics are adjusted, as with --refine-camera", InputNote, stacklevel=2)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    target_design = body_of(target)
+    target_design = target_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
     board_design = scale_reference(known, target_design)
     if target_design.with_faces(printed=True).faces:
@@ -538,7 +538,7 @@ def detect_images(
         with scratch_folder("detect") as scratch:
             return detect_images(images, camera, scratch, target, board, options, progress)
     options, progress = options or RunOptions(), progress or (lambda *_: None)
-    target_design = body_of(target)
+    target_design = target_of(target)
     has_none = board is None and target_design.has_scale
     board_design = scale_reference(None, target_design) if has_none else board_of(board)
     require_no_calibration(out)

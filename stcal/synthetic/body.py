@@ -11,7 +11,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.cells import black_areas, clear_mm
-from stcal.boards.target import save_body
+from stcal.boards.target_file import save_target
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments, require_fields
@@ -468,7 +468,7 @@ def write_body(
     with new_dataset(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         save_camera(folder / "cameras.txt", scene.camera)
-        save_body(folder / "target.toml", scene.target)
+        save_target(folder / "target.toml", scene.target)
         truth = json.dumps(body_truth(scene, image_format).content())
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
         drawings, paths = scene.drawings(), [folder / "images" / image_name("", i, image_format) for i in range(count)]

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from stcal.boards.file import save_run_board
-from stcal.boards.target import save_body
+from stcal.boards.board_file import save_board
+from stcal.boards.target_file import save_target
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
 from stcal.io.cameras.read import save_camera
@@ -227,8 +227,8 @@ def write_dataset(
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
         save_camera(folder / "cameras.txt", scene.camera)
-        save_body(folder / "target.toml", scene.target)
-        save_run_board(folder / "board.toml", scene.board)
+        save_target(folder / "target.toml", scene.target)
+        save_board(folder / "board.toml", scene.board)
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
         views = [(group, i) for group, g in scene.groups.items() for i in range(len(g.camera_from_target))]
         paths = [folder / "images" / image_name(*view, image_format) for view in views]

@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.boards.design import TAG_SIGMA_MM, TagLayout
 from stcal.boards.dictionaries import dictionary_of, known_tags
-from stcal.boards.target import printed_face, tags_on
+from stcal.boards.target_file import printed_face, tags_on
 from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera

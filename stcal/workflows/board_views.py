@@ -21,7 +21,7 @@ from stcal.boards.design import (
     TagLayout,
     turns,
 )
-from stcal.boards.faces import shift_by_curves, straightened
+from stcal.boards.on_faces import shift_by_curves, straightened
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError

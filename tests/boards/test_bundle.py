@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import known_dictionary
-from stcal.boards.file import load_flat_board
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.locate.exposures import find_scenes

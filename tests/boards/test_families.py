@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from stcal.boards import dictionaries
+from stcal.boards.board_file import load_flat_board
 from stcal.boards.dictionaries import dictionary_of, known_dictionary, of_opencv
-from stcal.boards.file import load_flat_board
 from stcal.boards.tags import find_tags
 from tests.outcome import fails_with, refuses
 

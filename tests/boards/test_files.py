@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import load_flat_board
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, BoardSet, CharucoDesign, ChessboardDesign
-from stcal.boards.file import load_flat_board
 from stcal.boards.several import load_boards
 from stcal.errors import InputError
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.boards.design import HexagonalCirclesDesign
-from stcal.boards.file import load_flat_board, load_run_board, run_board_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.workflows.board_views import find_board
@@ -40,7 +40,7 @@ def test_a_file_and_back(tmp_path):
     (tmp_path / "b.toml").write_text(TEXT)
     board = load_flat_board(tmp_path / "b.toml")
     assert board == HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
-    (tmp_path / "again.toml").write_text(run_board_toml(load_run_board(tmp_path / "b.toml")))
+    (tmp_path / "again.toml").write_text(board_toml(load_board(tmp_path / "b.toml")))
     assert load_flat_board(tmp_path / "again.toml") == board
     (tmp_path / "b.toml").write_text(TEXT.replace("6.0", "10.5"))
     with fails_with("E-BOARD-RADIUS … 10.5 mm, under 10 mm … neighbours"):
@@ -141,7 +141,7 @@ def test_rings_in_files(tmp_path):
         (tmp_path / "b.toml").write_text(text)
         board = load_flat_board(tmp_path / "b.toml")
         assert board.rings == ((0, 3), (1, 2))
-        (tmp_path / "again.toml").write_text(run_board_toml(load_run_board(tmp_path / "b.toml")))
+        (tmp_path / "again.toml").write_text(board_toml(load_board(tmp_path / "b.toml")))
         assert load_flat_board(tmp_path / "again.toml").rings == board.rings
     for rings, named in (("[[5, 0]]", "[5, 0]"), ("[[0, 0], [4, 6]]", "2 rings that look the same after a turn")):
         (tmp_path / "b.toml").write_text(f"{dots}rings = {rings}\n")

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import stcal
+from stcal.boards.board_file import board_toml
 from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
+from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import POINT_MM, draw
 from stcal.drawing.parts import Disc, Line, Text, parts_of
@@ -23,7 +25,6 @@ from stcal.drawing.sheets import (
     paper_sheets,
     seams_between,
 )
-from stcal.io.design import board_toml, target_toml
 from tests.outcome import fails_with, refuses
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -6,13 +6,13 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from stcal.boards.target_file import target_toml
 from stcal.design import TargetDesign, reference_target
 from stcal.drawing.draw import draw, net_text
 from stcal.drawing.net import _is_clear, net_part
 from stcal.drawing.parts import Disc, Text
 from stcal.drawing.sheets import one_sheet
 from stcal.geometry.rigid import Rigid
-from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make import make_pattern, sides_of

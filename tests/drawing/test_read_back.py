@@ -6,15 +6,15 @@ import pytest
 from stcal.boards.chessboard import find_charuco, find_chessboard
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.tags import find_aprilgrid, find_tags
+from stcal.boards.target_file import target_toml
 from stcal.design import BoardDesign, TargetDesign, reference_target
 from stcal.drawing.draw import draw
 from stcal.drawing.parts import Area, Disc, parts_of
 from stcal.drawing.sheets import one_sheet
 from stcal.geometry.plane import apply_homography
-from stcal.io.design import target_toml
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.detect.labels import label_images, label_single  # noqa: F401
+from stcal.sfm.detect.labelling import label_images, label_single  # noqa: F401
 from stcal.synthetic.designs import second_design
 from tests.drawing.raster import camera_of, obliquely, page_image, pages_of, pixel_from_page, shapes_of
 from tests.support.circle_images import area_and_centroid

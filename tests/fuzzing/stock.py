@@ -8,12 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stcal.boards.target_file import target_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.forms import written
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import target_toml
 from stcal.io.files import digest_of
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.layout import layout_toml

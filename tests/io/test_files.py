@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.board_file import load_board, load_flat_board
 from stcal.errors import InputError
 from stcal.io import files
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import load_board
 from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, keep_apart, read_bytes
 from stcal.io.json import read_json
 from stcal.io.table import read_table

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.board_file import load_flat_board
+from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.design import load_target, target_toml
 from stcal.locate.layout import TargetLayout, layout_toml, load_layout, square
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.model import DHRow, Joint, Robot

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.boards.file import load_flat_board, load_run_board
+from stcal.boards.board_file import load_board, load_flat_board
 from stcal.boards.several import load_boards
-from stcal.boards.target import load_body
+from stcal.boards.target_file import load_target
 from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.inputs import read_pairs, require_own
 from stcal.handeye.data.record import Said
-from stcal.io.design import load_target
 from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.layout import load_plan
@@ -164,11 +163,11 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         'name = "a"\n\n[[face]]\nid = "1"\n'
         'board = { type = "charuco", rows = 5, columns = 5, square_mm = 10, marker_mm = 7, dictionary = "4X4_50" }\n'
         '\n[[face]]\nid = "2"\ntags = [{ dictionary = "tag36h11", id = 3, size_mm = 40, x_mm = 0, y_mm = 0 }]\n',
-        lambda path: np.concatenate([face.xy_mm for face in load_body(path).faces]),
+        lambda path: np.concatenate([face.xy_mm for face in load_target(path).faces]),
     ),
     "board of a run": (
         'type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30.0\nspacing = 0.3\nfirst_id = 5\n',
-        lambda path: load_run_board(path).xy_mm(),
+        lambda path: load_board(path).xy_mm(),
     ),
     "several boards": (
         'type = "boards"\n\n[[board]]\ntype = "aprilgrid"\nrows = 2\ncolumns = 2\ntag_mm = 30.0\nspacing = 0.3\n'

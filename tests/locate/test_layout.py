@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.boards.file import load_flat_board
+from stcal.boards.board_file import load_flat_board
 from stcal.locate.layout import layout_toml, load_layout, load_plan, obj_from_plane, square
 from tests.outcome import fails_with
 from tests.support.tags import example_layout

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.boards.target import body_toml
+from stcal.boards.target_file import target_toml
 from stcal.design import TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
@@ -92,7 +92,7 @@ def test_one_tag_of_another_size_or_id_is_named(tmp_path, what):
     write_body(
         tmp_path / "set", make_body_scene(CUBE, body_camera(640), BodyOptions(images=10, distance_mm=300, seed=5))
     )
-    text = body_toml(CUBE)
+    text = target_toml(CUBE)
     second = [line for line in text.splitlines() if "size_mm = " in line and "dictionary" in line][1]
     old, new = {"size": (second, second.replace("size_mm = 45.0", "size_mm = 40.0")), "id": ("id = 2,", "id = 77,")}[
         what

@@ -4,8 +4,8 @@ its dots."""
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import board_toml, load_board
 from stcal.boards.design import AsymmetricCirclesDesign, HexagonalCirclesDesign, LatticePart
-from stcal.boards.file import load_run_board, run_board_toml
 from stcal.labels import DotLabel
 from stcal.sfm import run
 from stcal.sfm.report.compare import compare
@@ -24,7 +24,7 @@ def written(folder, text):
 
 
 def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
-    board = load_run_board(written(tmp_path, run_board_toml(CIRCLES.lattice())))
+    board = load_board(written(tmp_path, board_toml(CIRCLES.lattice())))
     assert isinstance(board, LatticePart)
     assert board.circles == CIRCLES
     xy = board.xy_mm()
@@ -47,7 +47,7 @@ def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
 )
 def test_other_boards_are_refused_with_what_takes_them(tmp_path, text, error):
     with fails_with(error):
-        load_run_board(written(tmp_path, text))
+        load_board(written(tmp_path, text))
 
 
 @pytest.mark.slow

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stcal.boards.faces import shift_by_curves
-from stcal.boards.target import body_toml, load_body
+from stcal.boards.on_faces import shift_by_curves
+from stcal.boards.target_file import load_target, target_toml
 from stcal.design import KnownDistance, StatedSize, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.draw import net_text
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import camera_prior
-from stcal.io.design import load_target, target_toml
 from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
 from stcal.sfm.adjust.calibration import AdjustOptions, calibrate
@@ -65,13 +64,13 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_faces_of_boards_and_tags_are_read_and_written(tmp_path):
-    target = load_body(written(tmp_path, TARGET))
+    target = load_target(written(tmp_path, TARGET))
     board, tags = target.faces
     assert (len(board.ids), board.ids[5], board.sigma_mm, board.outward) == (16, "1.1", 0.01, -1)
     assert (tags.ids, tags.sigma_mm, tags.size_sigma) == (("3.0", "3.1", "3.2", "3.3"), 0.02, 0.1 / 40)
     np.testing.assert_allclose(board.xy_mm[5], (20, 20))
     np.testing.assert_allclose(tags.xy_mm[0], (20, -20), atol=1e-12)  # top left, turned by 90°
-    again = load_body(written(tmp_path, body_toml(target)))
+    again = load_target(written(tmp_path, target_toml(target)))
     for face, same in zip(target.faces, again.faces, strict=True):
         assert (face.ids, face.sigma_mm) == (same.ids, same.sigma_mm)
         np.testing.assert_allclose(face.xy_mm, same.xy_mm, atol=1e-9)
@@ -79,7 +78,7 @@ def test_faces_of_boards_and_tags_are_read_and_written(tmp_path):
 
 def test_rough_poses_of_printed_faces_are_kept(tmp_path):
     cube = tag_cube(60)
-    again = load_body(written(tmp_path, body_toml(cube)))
+    again = load_target(written(tmp_path, target_toml(cube)))
     for face, same in zip(cube.faces, again.faces, strict=True):
         np.testing.assert_allclose(
             face.rough_target_from_face.matrix(), same.rough_target_from_face.matrix(), atol=1e-8
@@ -104,12 +103,12 @@ def test_rough_poses_of_printed_faces_are_kept(tmp_path):
 )
 def test_mistakes_in_printed_faces_are_named(tmp_path, change, error):
     with fails_with(error):
-        load_body(written(tmp_path, TARGET.replace(*change)))
+        load_target(written(tmp_path, TARGET.replace(*change)))
 
 
 def test_commands_without_such_faces_say_so(tmp_path):
     with fails_with("E-TARGET-PRINTED … face 0 … stcal-sfm run"):
-        load_target(written(tmp_path, TARGET))
+        load_target(written(tmp_path, TARGET), printed=False)
 
 
 def test_circles_without_a_board_need_a_camera(tmp_path):
@@ -385,10 +384,10 @@ def test_tags_of_other_dictionaries_or_ids_are_named(tmp_path, stcal_sfm):
     scene = make_body_scene(tag_cube(60.0), body_camera(640), BodyOptions(images=2, distance_mm=300))
     write_body(tmp_path / "set", scene)
     other = tag_cube(60.0, "DICT_5X5_100")
-    target, out = written(tmp_path, body_toml(other)), tmp_path / "run"
+    target, out = written(tmp_path, target_toml(other)), tmp_path / "run"
     words = ("run", tmp_path / "set/images", "--target", target, "--out", out)
     assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "DICT_APRILTAG_36H11", "correct dictionary")
-    written(tmp_path, body_toml(tag_cube(60.0, first_id=100)))
+    written(tmp_path, target_toml(tag_cube(60.0, first_id=100)))
     assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "tags ", "correct the ids")
 
 
@@ -448,7 +447,7 @@ def test_few_photographs_end_in_a_line_or_a_result(tmp_path):
 
 def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):
     target = with_drawn_size(second_design()[0], [[CircleLabel("left", circle) for circle in "pqrstuvw"]])
-    (known,) = load_body(written(tmp_path, body_toml(target))).distances
+    (known,) = load_target(written(tmp_path, target_toml(target))).distances
     face = target.face("left")
     apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2).max()
     assert (known.first.face, known.second.face, known.drawn) == ("left", "left", True)  # the face that is seen

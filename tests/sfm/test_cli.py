@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import stcal
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.cli.main import LIBRARIES, main, main_sfm
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import load_board, load_target
 from tests.outcome import ended
 
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import board_toml, load_board, load_flat_board
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign, CornerBoard
 from stcal.boards.dictionaries import dictionary_of
-from stcal.boards.file import load_flat_board, load_run_board, run_board_toml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
@@ -138,11 +138,11 @@ def written(folder, text):
     ],
 )
 def test_a_run_reads_every_kind_of_board_and_writes_it_as_it_was(tmp_path, text):
-    board = load_run_board(written(tmp_path, text))
+    board = load_board(written(tmp_path, text))
     flat = load_flat_board(tmp_path / "board.toml")
     np.testing.assert_allclose(board.places_mm(board.labels())[:, :2], flat.xy_mm(), atol=1e-12)
     assert len(set(board.labels())) == len(flat.xy_mm())
-    again = load_run_board(written(tmp_path, run_board_toml(board)))
+    again = load_board(written(tmp_path, board_toml(board)))
     assert again.labels() == board.labels()
     assert type(again.printed) is type(flat)
     np.testing.assert_allclose(again.xy_mm(), flat.xy_mm(), atol=1e-12)
@@ -151,7 +151,7 @@ def test_a_run_reads_every_kind_of_board_and_writes_it_as_it_was(tmp_path, text)
 def test_a_gap_in_metres_is_no_ratio(tmp_path):
     text = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.0264\n"
     with fails_with("E-BOARD-SPACING … tagSpacing 0.0264 … 0.1 … 0.3"):
-        load_run_board(written(tmp_path, text))
+        load_board(written(tmp_path, text))
 
 
 def test_points_are_numbered_by_rows_and_columns_of_equal_places():

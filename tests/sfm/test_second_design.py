@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stcal.io.design import load_board, load_target
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.sfm import run
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import load_board, load_target
 from stcal.sfm import run
 from stcal.sfm.camera.calibrate import calibrate_camera
 from stcal.sfm.report.compare import compare

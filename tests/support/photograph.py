@@ -9,12 +9,13 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.special import ndtr
 
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.design import BoardDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset
 from stcal.geometry.rigid import Rigid, align_rigid
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import load_board, load_target
 from stcal.io.images import decode
 from stcal.labels import BOARD
 from stcal.synthetic.scene import rim_points

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import load_board, load_target
 from stcal.synthetic.dataset import TruthFile, write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design

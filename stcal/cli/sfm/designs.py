@@ -27,17 +27,19 @@ app = typer.Typer()
 @app.command()
 def init(folder: Annotated[Path, "Write the two files to this folder.", Arg()]) -> None:
     """Write target.toml and board.toml of the reference design, with comments, to edit."""
+    from stcal.boards.board_file import save_board
+    from stcal.boards.target_file import save_target
     from stcal.design import reference_board, reference_target
-    from stcal.io.design import save_design
 
     folder.mkdir(parents=True, exist_ok=True)
-    designs = {"target.toml": reference_target(), "board.toml": reference_board()}
-    for name in designs:
-        if (folder / name).exists():
-            raise InputError("E-OUTPUT-EXISTS", f"{folder / name}: exists; move it away, or give another folder")
-    for name, design in designs.items():
-        save_design(folder / name, design)
-        say(folder / name)
+    target, board = folder / "target.toml", folder / "board.toml"
+    for path in (target, board):
+        if path.exists():
+            raise InputError("E-OUTPUT-EXISTS", f"{path}: exists; move it away, or give another folder")
+    save_target(target, reference_target())
+    save_board(board, reference_board())
+    say(target)
+    say(board)
 
 
 @app.command()
@@ -86,7 +88,7 @@ def simulate(
 ) -> None:
     """Write a simulated data set with known truth, of the reference design or your own: images, cameras.txt,
     target.toml, board.toml, truth.json."""
-    from stcal.boards.target import body_of
+    from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
     from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
     from stcal.synthetic.dataset import write_dataset
@@ -105,7 +107,7 @@ def simulate(
         body_seed=body_seed,
     )
     kind = "png" if png or sixteen_bit else "jpg"
-    if target is not None and (body := body_of(target)).with_faces(printed=True).faces:
+    if target is not None and (body := target_of(target)).with_faces(printed=True).faces:
         names = "--groups --fisheye --f-number --rim-mm --board --slope --second-design --one-board --clutter --16-bit"
         others = groups, fisheye, f_number, rim, board, slope, second_design, one_board, clutter, sixteen_bit
         if unfit := [name for name, value in zip(names.split(), others, strict=True) if value]:
@@ -186,15 +188,15 @@ def _scene(
     fisheye: float | None,
 ) -> "Scene":
     """Returns a scene of the files' designs, or the second ones, before the camera of a file or the options."""
+    from stcal.boards.board_file import board_of
     from stcal.boards.design import CornerBoard
-    from stcal.boards.file import run_board_of
+    from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import target_of
     from stcal.sfm.planning.forecast import nominal_poses
     from stcal.sfm.planning.session import pairs_of_faces
     from stcal.synthetic import scene
 
-    designs = scene.second_design()[:2] if second_design else (target_of(target), run_board_of(board))
+    designs = scene.second_design()[:2] if second_design else (target_of(target, printed=False), board_of(board))
     if isinstance(designs[1], CornerBoard):
         raise InputError(
             "E-BOARD-TYPE",

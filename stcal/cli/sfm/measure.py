@@ -54,11 +54,11 @@ def calibrate_camera(
 ) -> None:
     """Calibrate the camera from views of the board, without start values, and write cameras.txt with σ and
     correlations."""
-    from stcal.boards.file import load_flat_board
+    from stcal.boards.board_file import board_of, load_flat_board
+    from stcal.boards.target_file import target_of
     from stcal.design import BoardDesign
     from stcal.geometry.camera import Camera
     from stcal.io.cameras.read import save_camera
-    from stcal.io.design import board_of, target_of
     from stcal.io.video import images_or_frames
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
@@ -67,7 +67,7 @@ def calibrate_camera(
 
     json_file = json_file or out.with_suffix(".json")
     shared.require_new([("--out", out), *([("--json", json_file)] if json_file != STANDARD_OUTPUT else [])])
-    target_design = target_of(target)
+    target_design = target_of(target, printed=False)
     board_design = board_of(None) if board is None else load_flat_board(board)
     dots = isinstance(board_design, BoardDesign)
     told = shared.designs_told(target, board, with_target=dots and board is None)
@@ -194,9 +194,9 @@ def measure(
                 "give the folder of its frames",
             )
         shared.load_ahead(workers)
-    from stcal.boards.target import body_of
+    from stcal.boards.board_file import load_dots
+    from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board
     from stcal.io.table import read_table
     from stcal.sfm.measurement import images as work
     from stcal.sfm.measurement import report as output
@@ -206,7 +206,7 @@ def measure(
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
-    design = body_of(target)
+    design = target_of(target)
     circles = read_target(faces, design)
     if serve or live:
         # A path has one slash where the URL of a stream has two.
@@ -214,7 +214,7 @@ def measure(
         source = None if serve else camera_index if images is None else url
         model = read_camera(camera)
         model = replace(model, source=Path(model.source).name)  # answers name no folder of this machine
-        others = load_board(board) if board else None, PoseOptions(sigma_factor=sigma_factor), ellipses
+        others = load_dots(board) if board else None, PoseOptions(sigma_factor=sigma_factor), ellipses
         limits = {"token": token, "max_megabytes": max_megabytes}
         _serve((replace(circles, design=design), model, *others), source, host, port, limits, json_file is not None)
         return
@@ -224,7 +224,7 @@ def measure(
     told = shared.designs_told(target, board, with_board=False)
     with told, shared.handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
-            images, read_camera(camera), circles, design, load_board(board) if board else None, options, progress
+            images, read_camera(camera), circles, design, load_dots(board) if board else None, options, progress
         )
     text, apart = output.poses_csv(result, table)
     document = output.measure_report(result, str(images), every=verbose())

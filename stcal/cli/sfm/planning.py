@@ -39,9 +39,9 @@ def plan(
     out: shared.JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, without Monte Carlo, and say what would help most."""
-    from stcal.boards.target import body_of
+    from stcal.boards.board_file import load_dots
+    from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board
     from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run
     from stcal.sfm.planning.bodies import plan as planned
     from stcal.sfm.planning.file import PlanFile, plan_text
@@ -50,7 +50,7 @@ def plan(
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
-    design = body_of(target)
+    design = target_of(target)
     if noise is not None and run is not None:
         raise InputError(
             "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
@@ -80,7 +80,7 @@ def plan(
         margin,
     )
     with shared.designs_told(target, board):
-        result = planned(options, design, load_board(board) if board else None, faces)
+        result = planned(options, design, load_dots(board) if board else None, faces)
     say(plan_text(result, source))
     write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
 

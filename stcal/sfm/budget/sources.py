@@ -9,12 +9,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
+from stcal.boards.board_file import BoardSizeEntry, SizeEntry
 from stcal.boards.design import TAG_SIGMA_MM
 from stcal.design import DOTS_SIGMA_MM, BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
 from stcal.sfm.adjust.calibration import FLATNESS_MM
 from stcal.sfm.adjust.uncertainty import (

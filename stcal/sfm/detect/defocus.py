@@ -18,13 +18,9 @@ BY_CHANCE = 1e-6
 """Share of images with even blur of which a law is found by chance."""
 RESPONSE, RESPONSE_OF_BLUR2 = 0.51, 5.8
 """Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
-square of the blur over the smaller radius. From 3751 circles of six scenes that were rendered through points of a pupil
-and corrected as here; single circles scatter about it by 0.11. The blur that fits show grows by up to a third faster
-than the variance of the pupil's image."""
+square of the blur over the smaller radius: from 3751 circles that were rendered through points of a pupil."""
 RESPONSE_SIGMA = 0.15
-"""σ of this multiple for one circle, as a share of it: the study's scatter of single circles, and what the circles of a
-face have in common in one image (0.04 where shifts are large), as ten of them take together; and pupils that are not
-round."""
+"""σ of this multiple for one circle, as a share of it, with what the circles of a face have in common."""
 FAR_BLUR, FAR_SIGMA = 0.45, 0.5
 """Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
 MAX_UNEXPLAINED = 0.5
@@ -46,7 +42,7 @@ class Focus:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Views:
+class _Blurs:
     """The n circles of one image whose plane has a pose."""
 
     rows: np.ndarray
@@ -107,7 +103,7 @@ def correct_defocus(
     return corrected, tuple(focus)
 
 
-def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> _Views:
+def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> _Blurs:
     planes: dict[str, list[int]] = {}
     for i, label in enumerate(image.labels):
         if image.blur_px[i] > 0:
@@ -131,7 +127,7 @@ def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_p
     blur2 = image.blur_px[chosen] ** 2
     smaller = np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px
     wide2 = blur2 / smaller**2
-    return _Views(
+    return _Blurs(
         chosen,
         np.concatenate(inverse_depth),
         np.concatenate(gradient),
@@ -141,7 +137,7 @@ def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_p
     )
 
 
-def _laws(views: Sequence[_Views]) -> list[_Law | None]:
+def _laws(views: Sequence[_Blurs]) -> list[_Law | None]:
     """Returns the law of each image, None of those with too few circles. Each a² is drawn towards the mean of all by as
     much as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7)."""
     enough = [circles for circles in views if len(circles.rows) >= MIN_CIRCLES]
@@ -169,7 +165,7 @@ def _mean_and_variance(values: np.ndarray, variances: np.ndarray) -> tuple[float
     return float((weight * values).sum() / weight.sum()), between + 1 / float(weight.sum())
 
 
-def _law(own: _Views, unit: float, curvature: tuple[float, float] | None = None) -> _Law:
+def _law(own: _Blurs, unit: float, curvature: tuple[float, float] | None = None) -> _Law:
     """Returns the law of one image by robust least squares, with mean and variance of the ``curvature`` of others."""
     about = float(own.inverse_depth.mean())
     u = (own.inverse_depth - about) / unit
@@ -213,7 +209,7 @@ LEAST_PX2 = 1e-6
 
 
 def _moved(
-    image: ImageObservations, own: _Views, law: _Law, camera: Camera, focal_px: float
+    image: ImageObservations, own: _Blurs, law: _Law, camera: Camera, focal_px: float
 ) -> tuple[ImageObservations, float]:
     """Returns the image with corrected centres, and the largest correction, px."""
     slope, slope_sigma = law.slope(own.inverse_depth)
@@ -231,7 +227,7 @@ def _moved(
     return moved, float(np.linalg.norm(shift, axis=1).max())
 
 
-def _focus(image: str, own: _Views, law: _Law, shift_px: float) -> Focus:
+def _focus(image: str, own: _Blurs, law: _Law, shift_px: float) -> Focus:
     near, far = own.inverse_depth.max(), own.inverse_depth.min()
     ends = np.sqrt(np.maximum(law.blur2(np.array([near, far])), 0.0))
     spread = float(np.ptp(np.percentile(np.sqrt(own.blur2), [5, 95])))

@@ -14,7 +14,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from stcal.boards.faces import shift_by_curves
+from stcal.boards.on_faces import shift_by_curves
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
@@ -53,8 +53,7 @@ COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECAS
 """Additions of file managers to the name of a second copy."""
 SAME_PLACE_PX = 4.0
 SAME_SHARE = 0.6
-"""Share of an image's circles that lie within the same squares of that side in another form of it; at a square's edge
-some change over."""
+"""Share of an image's circles that lie within the same squares of that side in another form of it."""
 
 P = TypeVar("P", Centres, FaceSighting, BoardSighting)
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
@@ -158,8 +157,7 @@ def _fingerprint(detector: Detector | None, camera: Camera, target, board, optio
     dots = {key: value for key, value in asdict(board).items() if key != "stated"} if board else None
     lens = {key: value for key, value in asdict(camera).items() if key not in ("colmap_model", "covariance")}
     parts = [CACHE_VERSION, made_by(), cv2.__version__, lens, asdict(target.patterns_alone()), dots, asdict(options)]
-    parts += [detector.__name__] if detector else []
-    parts += [] if pictures else ["no picture"]
+    parts += [*([detector.__name__] if detector else []), *([] if pictures else ["no picture"])]
     plain = json.dumps(parts, default=lambda each: getattr(each, "tolist", each.__str__)(), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()
 
@@ -262,7 +260,11 @@ def look_again(
     pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
     paths: list[Path] = []
     for image, predicted in jobs:
-        path = cache / f"again-{_predicted_key(image.digest, predicted, camera, options)}.npz"
+        stated = CACHE_VERSION, made_by(), cv2.__version__, image.digest, predicted.labels, predicted.polarity, options
+        hasher = hashlib.sha256("\0".join(map(str, stated)).encode())
+        for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
+            hasher.update(values.tobytes())
+        path = cache / f"again-{hasher.hexdigest()[:40]}.npz"
         known = kept(path, _stored_look)
         if known is None:
             pending.append((image.file, camera, predicted, options))
@@ -274,14 +276,6 @@ def look_again(
             keep(paths[k], _arrays("centres", look.centres), {"labels": look.labels, "missed": look.missed})
             looks[pending[k][0].name] = look
     return looks
-
-
-def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, options: EllipseOptions) -> str:
-    stated = (CACHE_VERSION, made_by(), cv2.__version__, digest, predicted.labels, predicted.polarity, options)
-    hasher = hashlib.sha256("\0".join(map(str, stated)).encode())
-    for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
-        hasher.update(values.tobytes())
-    return hasher.hexdigest()[:40]
 
 
 def _look_again(
@@ -307,20 +301,18 @@ def _without_copies(
     """Returns the images without copies of photographs, and the files that are skipped. Of equal content the plainest
     name stays, of several ``forms`` the lossless one; if ``grouped``, none of a photograph that is in two groups."""
     detected = [outcome for outcome in outcomes if isinstance(outcome, DetectedImage)]
-    same: dict[str, list[DetectedImage]] = {}
+    same: dict[str, list[ImageFile]] = {}
     for image in sorted(detected, key=lambda image: _plainness(image.file)):
-        same.setdefault(image.digest, []).append(image)
-    groups = {digest: {image.file.group for image in images} for digest, images in same.items()}
-    whole = {group for each in groups.values() if len(each) == 1 for group in each}  # others are copied folders
+        same.setdefault(image.digest, []).append(image.file)
+    groups = [{file.group for file in files} for files in same.values()]
+    whole = {group for each in groups if len(each) == 1 for group in each}  # others are copied folders
     copies: dict[str, Skipped] = {}
-    for digest, (first, *others) in same.items():
-        both = sorted(groups[digest] & whole) if grouped else []
-        reason = f"the same photograph is in groups {' and '.join(both)}, and belongs to one; delete the other file"
-        for image in (first, *others) if len(both) > 1 else others:
-            skipped = (
-                Skipped(image.file.name, reason, "copy") if len(both) > 1 else copy_of(image.file, first.file.name)
-            )
-            copies[image.file.name] = skipped
+    for (first, *others), shown in zip(same.values(), groups, strict=True):
+        if grouped and len(both := sorted(shown & whole)) > 1:
+            reason = f"the same photograph is in groups {' and '.join(both)}, and belongs to one; delete the other file"
+            copies |= {file.name: Skipped(file.name, reason, "copy") for file in (first, *others)}
+        else:
+            copies |= {file.name: copy_of(file, first.name) for file in others}
     for pair in _in_two_forms([image for image in detected if image.file.name not in copies] if forms else []):
         first, second = sorted((image.file for image in pair), key=_plainness)
         if not {first.name, second.name} & copies.keys() and _same_pixels(first, second):
@@ -340,10 +332,8 @@ def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, 
     kinds = [each.file.path.suffix.lower()[:4].replace(".jpe", ".jpg") for each in images]
     if len(set(kinds)) < 2:
         return
-    cells = [
-        {tuple(cell) for cell in np.floor(each.detection.centres.centre_px / SAME_PLACE_PX).astype(int).tolist()}
-        for each in images
-    ]
+    places = [np.floor(each.detection.centres.centre_px / SAME_PLACE_PX).astype(int) for each in images]
+    cells = [set(map(tuple, each.tolist())) for each in places]
     images_of: dict[tuple, list[int]] = {}
     for i, own in enumerate(cells):
         for cell in own:
@@ -381,9 +371,7 @@ def require_upright(images: tuple[DetectedImage, ...], board: BoardDesign | None
 
 def files_of_arrays(images: Mapping[str, Sequence[np.ndarray]], exclude: Sequence[str] = ()) -> ImageFiles:
     """Return images in memory as files that carry their content, named ``12/0.png``, ``12/1.png`` … by group.
-
-    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of those not used.
-    """
+    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of those not used."""
     named = [(group, f"{group}/{k}.png", image) for group, arrays in images.items() for k, image in enumerate(arrays)]
     if not named:
         raise InputError("E-IMAGES-NONE", "images: no image in memory; give arrays by the name of their group")

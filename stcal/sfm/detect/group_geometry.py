@@ -18,13 +18,11 @@ from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.sightings import PlaneView, Readings
 
 MAX_SHIFT_PITCHES = 0.3
-"""Largest deviation of a plane from its place in an image's first pose, in steps of the pattern. A wrong numbering of
-the board deviates by a whole step."""
+"""Largest deviation of a plane from its place in an image's first pose, in steps; a wrong numbering deviates by one."""
 MAX_SEEDS = 8
 """Largest number of start images, until one explains everything."""
 MAX_OFF_PITCHES = 0.12
-"""Largest median deviation of a reading's circles after the adjustment, in steps of the pattern: 3 mm for the reference
-target. A design deviates by tenths of a step, a wrong numbering by a whole one."""
+"""Largest median deviation of a reading's circles after the adjustment, in steps: 3 mm for the reference target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +72,7 @@ def arrange(images: Sequence[list[Readings]], step_mm: float, focal_px: float) -
         if any(reading is view for view in best.views.get(i, ())):
             continue  # a start with this image gives the same arrangement
         found = _adjusted(_grown(images, i, reading, MAX_SHIFT_PITCHES * step_mm), focal_px)
-        found = _checked(images, found, step_mm)
-        if found.explained() > best.explained():
-            best = found
+        best = max(best, _checked(images, found, step_mm), key=Arrangement.explained)
         if best.explained() >= total:
             break
     return best
@@ -98,22 +94,19 @@ def across_groups(groups: Sequence[Arrangement], reach_mm: float) -> list[Arrang
     elsewhere is removed, and the last face with the others: alone it may be mirrored. A face known from other groups is
     added; the second look decides."""
     faces = [_as_faces(group) for group in groups]
-    best: Arrangement = Arrangement({}, {}, {})
-    for i, view in _seeds(faces):
-        grown = _grown(faces, i, view, reach_mm)
-        if grown.explained() > best.explained():
-            best = grown
+    grown = (_grown(faces, i, view, reach_mm) for i, view in _seeds(faces))
+    best = max((Arrangement({}, {}, {}), *grown), key=Arrangement.explained)
     settled = []
     for i, group in enumerate(groups):
         if i in best.views:
             agreed = {view.plane for view in best.views[i]}
-            others = {p for p in group.group_from_plane if p != BOARD} - agreed
+            others = group.group_from_plane.keys() - agreed - {BOARD}
             if len(agreed) == 1 < len(groups) and (others or any(group.foreign.values())):
                 settled.append(group.without(others | agreed))
                 continue
-            group = group.without(others)
             pose = best.camera_from_group[i]
             known = {p: pose @ target_from_face for p, target_from_face in best.group_from_plane.items()}
+            group = group.without(others)
             group = replace(group, group_from_plane=known | group.group_from_plane)
         settled.append(group)
     return settled
@@ -158,7 +151,7 @@ def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_m
         placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
         pose = view.camera_from_plane @ known[view.plane].inverse()
         placed[seed] = pose, [view, *_agreeing(others, pose, known, reach_mm, {view.plane})[0]]
-        new = _new_planes(images, placed, known, reach_mm) or _agreed_plane(images, placed, known, reach_mm)
+        new = _new_planes(images, placed, known, reach_mm)
         if not new:
             break
         known |= new
@@ -170,31 +163,24 @@ def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, 
     """Pose of an image with the most planes, then faces, and the readings that agree; None if several fit."""
     best, best_score, rivals = None, (0, 0, 0), 0
     for views in readings:
-        for view in views:
-            if view.plane not in known:
-                continue
+        others = [v for v in readings if v is not views]
+        for view in (each for each in views if each.plane in known):
             pose = view.camera_from_plane @ known[view.plane].inverse()
-            others, _ = _agreeing([v for v in readings if v is not views], pose, known, reach_mm, {view.plane})
-            agreed = [view, *others]
+            agreed = [view, *_agreeing(others, pose, known, reach_mm, {view.plane})[0]]
             faces = sum(v.plane != BOARD and v.named for v in agreed)
             score = (len(agreed), faces, sum(len(v.rows) for v in agreed))
             if score > best_score:
                 best, best_score, rivals = (pose, agreed), score, 0
-            elif score == best_score:
-                rivals += best is None or not _alike(best[0], pose, agreed[0], reach_mm)
-    if best is None or (rivals and (len(best[1]) == 1 or not all(v.named for v in best[1]))):
+            elif best is not None and score == best_score:  # a rival, unless both put the plane at one place
+                span = best[1][0].span_mm()
+                rivals += np.abs(best[0].inverse() @ pose @ span - span).max() >= reach_mm
+    if best is None:
         return None
-    if not any(v.named for v in best[1]) and len(best[1]) == 1:
+    agreed = best[1]
+    of_board = by_convention and agreed[0].plane == BOARD and len(readings) > 1
+    if len(agreed) == 1 and (rivals or of_board or not agreed[0].named):
         return None
-    if by_convention and len(best[1]) == 1 and best[1][0].plane == BOARD and len(readings) > 1:
-        return None
-    return best
-
-
-def _alike(pose: Rigid, other: Rigid, view: PlaneView, reach_mm: float) -> bool:
-    """Returns whether two poses put a plane at the same place, to less than a step at its rim."""
-    difference = pose.inverse() @ other
-    return bool(np.abs(difference @ view.span_mm() - view.span_mm()).max() < reach_mm)
+    return None if rivals and not all(v.named for v in agreed) else best
 
 
 def _agreeing(readings: list[Readings], camera_from_group: Rigid, known, reach_mm: float, taken: set[str]):
@@ -228,40 +214,29 @@ def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]
 
 
 def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
-    """Poses of unknown planes, each at the place with the largest area: a target in the background is smaller."""
+    """Poses of unknown planes that images name, each at the place with the largest area: a target in the background is
+    smaller. Else that of the plane without a name that most images, two at least, have at one place."""
+    unknown: dict[bool, dict[str, list[tuple[int, PlaneView, Rigid]]]] = {True: {}, False: {}}
+    for i, (pose, agreed) in placed.items():
+        for views in images[i]:
+            for view in () if any(view is each for view in views for each in agreed) else views:
+                if view.plane not in known:
+                    group_from_plane = pose.inverse() @ view.camera_from_plane
+                    unknown[view.named].setdefault(view.plane, []).append((i, view, group_from_plane))
     new = {}
-    for plane, found in _unknown_planes(images, placed, known, named=True).items():
+    for plane, found in unknown[True].items():
         support = _together(found, reach_mm) @ np.array([view.area for _, view, _ in found])
         new[plane] = found[int(np.argmax(support))][2]
-    return new
-
-
-def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float):
-    """Plane that no image alone names, and its pose, if two images agree, and more than on any other; or {}."""
     ranked = []
-    for plane, found in _unknown_planes(images, placed, known, named=False).items():
+    for plane, found in unknown[False].items() if not new else ():
         by_image = np.array([i for i, _, _ in found])
         support = [len(np.unique(by_image[row])) for row in _together(found, reach_mm)]
         k = int(np.argmax(support))
         ranked.append((support[k], plane, found[k][2]))
     ranked.sort(key=lambda each: -each[0])
-    if not ranked or ranked[0][0] < 2 or (len(ranked) > 1 and ranked[1][0] == ranked[0][0]):
-        return {}
-    return {ranked[0][1]: ranked[0][2]}
-
-
-def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], named: bool):
-    """Returns (image, view, group_from_plane) by unknown plane of readings, ``named`` or at odds with known planes."""
-    unknown: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
-    for i, (pose, agreed) in placed.items():
-        for views in images[i]:
-            if any(view is each for view in views for each in agreed):
-                continue
-            for view in views:
-                if view.plane not in known and view.named == named:
-                    group_from_plane = pose.inverse() @ view.camera_from_plane
-                    unknown.setdefault(view.plane, []).append((i, view, group_from_plane))
-    return unknown
+    if ranked and ranked[0][0] >= 2 and (len(ranked) == 1 or ranked[1][0] < ranked[0][0]):
+        new[ranked[0][1]] = ranked[0][2]
+    return new
 
 
 def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.ndarray:
@@ -290,27 +265,21 @@ def _adjusted(arrangement: Arrangement, focal_px: float) -> Arrangement:
 def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: float) -> Arrangement:
     """Returns the arrangement with all readings compared with it, after its adjustment."""
     views, contradicted, unsettled = {}, {}, {}
-
-    def off_mm(view: PlaneView) -> float:
-        """Median distance of circles from their places in the arrangement, at the depth of these places."""
-        xyz = pose @ (found.group_from_plane[view.plane] @ view.xyz_mm())
-        return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
-
     for i, pose in found.camera_from_group.items():
         agreed, ambiguous = _agreeing(images[i], pose, found.group_from_plane, MAX_SHIFT_PITCHES * step_mm, set())
-        views[i] = tuple(v for v in agreed if off_mm(v) < MAX_OFF_PITCHES * step_mm)
-        accepted_ids = [id(v) for v in views[i]]
-        others = [r for r in images[i] if not any(id(v) in accepted_ids for v in r)]
-        contradicted[i] = tuple(r for r in others if not any(r is each for each in ambiguous))
-        unsettled[i] = tuple(ambiguous)
+        accepted = []
+        for view in agreed:
+            xyz = pose @ (found.group_from_plane[view.plane] @ view.xyz_mm())
+            off_mm = np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)
+            accepted += [view] * bool(np.median(off_mm) < MAX_OFF_PITCHES * step_mm)
+        left = [r for r in images[i] if not any(v is each for v in r for each in accepted)]
+        views[i], unsettled[i] = tuple(accepted), tuple(ambiguous)
+        contradicted[i] = tuple(r for r in left if not any(r is each for each in ambiguous))
     return replace(found, views=views, contradicted=contradicted, open=unsettled)
 
 
 HUBER_PX = 1.5
-"""Residual beyond which an observation loses weight.
-
-Such residuals are deviations of printed planes, not of centres.
-"""
+"""Residual beyond which an observation loses weight: such residuals are of printed planes, not of centres."""
 BUNDLE_SETTLED = 1e-4
 """Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
 BUNDLE_STEPS = 30
@@ -332,11 +301,8 @@ class PlaneBundle:
 
     def adjusted(self, poses: Poses, planes: Poses) -> tuple[Poses, Poses]:
         """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
-        fixed.
-
-        Without convergence the last state is returned, and the start where a point lies behind its camera: predictions
-        are verified anyway.
-        """
+        fixed. Without convergence the last state is returned, and the start where a point lies behind its camera:
+        predictions are verified anyway."""
         if not np.isfinite(self._off(planes, poses)).all():
             return poses, planes
         a = Adjustment()
@@ -372,19 +338,19 @@ class PlaneBundle:
         placed = np.einsum("nij,nj->ni", poses.rotation[self.image], turned + planes.translation[self.plane])
         return turned, placed, placed + poses.translation[self.image]
 
+    def in_cameras(self, planes: Poses, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+        """Returns rotations camera_from_plane (n, 3, 3), and the points in the cameras' frames (n, 3)."""
+        return poses[self.image].rotation @ planes[self.plane].rotation, self.placed(planes, poses)[2]
+
 
 MIN_LIMIT_PX = 0.5
-"""Largest deviation that never counts as outlying.
-
-Centres of clear circles are good to hundredths, designs to tenths.
-"""
+"""Largest deviation that never counts as outlying. Centres are good to hundredths, designs to tenths."""
 BEYOND = 4.0
 """Factor on the median deviation of the plane's circles: 4.7 σ of normal errors, exceeded by one in 60 000."""
 BEYOND_SIGMA = 5.0
 """Smallest outlying distance in σ of the centre; one normal error in 270 000 is larger (two coordinates)."""
 MIN_USUAL = 6
-"""Least number of circles for a plane's own pose and median. Circles of other planes
-are judged by the poses and the median of all."""
+"""Least number of circles for a plane's own pose and median; those of other planes are judged by the median of all."""
 ALIKE = 0.5
 """Relative difference up to which a circle's deviation in another image counts as the same."""
 MAX_ROUNDS = 10
@@ -395,115 +361,81 @@ def outlying_circles(
 ) -> tuple[Arrangement, dict[int, dict[Label, str]]]:
     """Finds circles that contradict the others of their group; returns the arrangement adjusted without them, the same
     object if there are none, and reasons by image and label."""
-    circles = _Circles.of(arrangement, images, patterns, focal_px)
-    if not len(circles.rows):
+    names = list(arrangement.group_from_plane)
+    design = {
+        label: (k, *xyz, radius)
+        for k, pattern in enumerate(patterns[plane] for plane in names)
+        for label, xyz, radius in zip(pattern.labels, pattern.xyz_mm(), pattern.radius_mm, strict=True)
+    }
+    rows, table = [], []
+    for a, i in enumerate(arrangement.camera_from_group):
+        for label, centre, sigma in zip(images[i].labels, images[i].centre, images[i].sigma_px(), strict=True):
+            if label in design:
+                rows.append((i, label))
+                table.append((a, *design[label], *centre, sigma))
+    if not rows:
         return arrangement, {}
-    keep, reasons = np.ones(len(circles.rows), bool), {}
+    numbers = np.array(table, float)
+    image, plane = numbers[:, :2].astype(int).T
+    cameras, planes = arrangement.stacks()
+    bundle = PlaneBundle(image, plane, numbers[:, 2:5], focal_px * numbers[:, 6:8], focal_px)
+    rotation, xyz = bundle.in_cameras(planes, cameras)
+    centre = circle_image_offset(xyz, rotation[:, :, 2], numbers[:, 5])
+    eccentricity_px = focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
+    bundle = replace(bundle, seen=bundle.seen - eccentricity_px)
+    shown = np.array([len(np.unique(image[plane == p])) for p in range(len(names))])
+    alone = (shown[plane] == 1) & [label.plane != BOARD for _, label in rows]
+    circles = _Circles(rows, bundle, numbers[:, 8], alone, np.bincount(plane)[plane] >= MIN_USUAL)
+    keep, reasons = np.ones(len(rows), bool), {}
     for _ in range(MAX_ROUNDS):
-        circles = circles.adjusted(keep)
-        new = _worst(circles, keep)
+        if (use := keep & circles.enough).any():
+            cameras, planes = bundle.select(use).adjusted(cameras, planes)
+        new = circles.worst(keep, planes, cameras)
         if not new:
             break
         reasons |= new
         keep[list(new)] = False
-    if not reasons:
-        return arrangement, {}
     found: dict[int, dict[Label, str]] = {}
-    for (image, label), reason in ((circles.rows[k], reason) for k, reason in reasons.items()):
-        found.setdefault(image, {})[label] = reason
-    return arrangement.moved(circles.camera_from_group, circles.group_from_plane), found
+    for (i, label), reason in ((rows[k], reason) for k, reason in reasons.items()):
+        found.setdefault(i, {})[label] = reason
+    return arrangement.moved(cameras, planes) if found else arrangement, found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Circles:
-    """n circles of a group, and its arrangement as stacks."""
+    """n circles of a group."""
 
     rows: list[tuple[int, Label]]  # image and label of each
     bundle: PlaneBundle  # by places in the arrangement; the images of the circles' centres, without eccentricity
     sigma_px: np.ndarray
-    camera_from_group: Poses
-    group_from_plane: Poses
+    alone: np.ndarray  # (n,) those of faces that only one image shows
+    enough: np.ndarray  # (n,) those on planes with enough circles
 
-    @classmethod
-    def of(cls, arrangement: Arrangement, images, patterns: dict[str, Pattern], focal_px: float) -> "_Circles":
-        """Returns the circles that the images show of planes of the arrangement."""
-        names, planes = list(arrangement.camera_from_group), list(arrangement.group_from_plane)
-        design = {}
-        for pattern in (patterns[plane] for plane in planes):
-            design |= dict(zip(pattern.labels, np.column_stack([pattern.xyz_mm(), pattern.radius_mm]), strict=True))
-        rows, columns = [], []
-        for a, i in enumerate(names):
-            sigma = images[i].sigma_px()
-            for k, label in enumerate(images[i].labels):
-                if label in design:
-                    rows.append((i, label))
-                    columns.append((a, planes.index(label.plane), *images[i].centre[k], sigma[k], *design[label]))
-        table = np.array(columns, float).reshape(-1, 9)
-        image, plane = table[:, :2].astype(int).T
-        bundle = PlaneBundle(image, plane, table[:, 5:8], focal_px * table[:, 2:4], focal_px)
-        circles = cls(rows, bundle, table[:, 4], *arrangement.stacks())
-        if not rows:
-            return circles
-        rotation, xyz = circles._placed()
-        centre = circle_image_offset(xyz, rotation[:, :, 2], table[:, 8])
-        eccentricity_px = focal_px * (centre[:, :2] / centre[:, 2:] - xyz[:, :2] / xyz[:, 2:])
-        return replace(circles, bundle=replace(bundle, seen=bundle.seen - eccentricity_px))
-
-    def adjusted(self, keep: np.ndarray) -> "_Circles":
-        """Returns the circles with poses adjusted to those to ``keep`` on planes with enough circles for a pose."""
-        use = keep & self.enough()
-        if not use.any():
-            return self
-        cameras, planes = self.bundle.select(use).adjusted(self.camera_from_group, self.group_from_plane)
-        return replace(self, camera_from_group=cameras, group_from_plane=planes)
-
-    def enough(self) -> np.ndarray:
-        """Returns the mask of the circles on planes with enough circles."""
-        return np.bincount(self.bundle.plane, minlength=1)[self.bundle.plane] >= MIN_USUAL
-
-    def in_one_image(self) -> np.ndarray:
-        """Returns the mask of the circles of faces that only one image shows."""
+    def worst(self, keep: np.ndarray, planes: Poses, cameras: Poses) -> dict[int, str]:
+        """Returns the worst outlying circle to ``keep`` of each plane and image, as it biases the others."""
         image, plane = self.bundle.image, self.bundle.plane
-        images = np.array([len(np.unique(image[plane == p])) for p in range(len(self.group_from_plane))])
-        return (images[plane] == 1) & [label.plane != BOARD for _, label in self.rows]
-
-    def off_px(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns centres minus their places, (n, 2) px, and derivatives (n, 2, 2) by the place in the plane, px/mm."""
-        rotation, xyz = self._placed()
-        off_px = self.bundle.seen - self.bundle.focal_px * (xyz[:, :2] / xyz[:, 2:])
-        return off_px, self.bundle.by_point(xyz) @ rotation[:, :, :2]
-
-    def _placed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns rotations camera_from_plane (n, 3, 3), and circles in the camera frame (n, 3)."""
-        camera, plane = self.camera_from_group[self.bundle.image], self.group_from_plane[self.bundle.plane]
-        xyz = self.bundle.placed(self.group_from_plane, self.camera_from_group)[2]
-        return camera.rotation @ plane.rotation, xyz
-
-
-def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
-    """Returns the worst outlying circle to ``keep`` of each plane and image, as it biases the others."""
-    image, plane = circles.bundle.image, circles.bundle.plane
-    shift, by_place = circles.off_px()
-    off_px, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * circles.sigma_px)
-    alone, enough = circles.in_one_image(), circles.enough()
-    usual = np.full(len(off_px), np.median(off_px[keep]))
-    for p in np.unique(plane[keep & enough]):
-        usual[plane == p] = np.median(off_px[keep & (plane == p)])
-    limit = np.where(alone & enough, limit, np.maximum(limit, BEYOND * usual))
-    outlying = keep & (off_px > limit)
-    moved_mm = np.linalg.solve(by_place, shift[..., None])[..., 0]
-    reasons: dict[int, str] = {}
-    for k in np.flatnonzero(outlying):
-        same = keep & (image != image[k]) & [label == circles.rows[k][1] for _, label in circles.rows]
-        apart_px = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
-        outlying[k] = not (apart_px < ALIKE * off_px[k]).any()
-    for i, p in {(image[k], plane[k]) for k in np.flatnonzero(outlying)}:
-        circles_of_face = np.flatnonzero(keep & (image == i) & (plane == p))
-        worst = circles_of_face[np.argmax(np.where(outlying, off_px / limit, 0)[circles_of_face])]
-        error = f"{off_px[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
-        if alone[worst] and enough[worst]:
-            why = f"{circles.rows[worst][1]} is {error}, and no other image of the group tells which circles are right"
-            reasons |= dict.fromkeys(circles_of_face.tolist(), why)
-        else:
-            reasons[int(worst)] = error
-    return reasons
+        rotation, xyz = self.bundle.in_cameras(planes, cameras)
+        shift = self.bundle.seen - self.bundle.focal_px * (xyz[:, :2] / xyz[:, 2:])
+        by_place = self.bundle.by_point(xyz) @ rotation[:, :, :2]
+        off_px, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * self.sigma_px)
+        usual = np.full(len(off_px), np.median(off_px[keep]))
+        for p in np.unique(plane[keep & self.enough]):
+            usual[plane == p] = np.median(off_px[keep & (plane == p)])
+        limit = np.where(self.alone & self.enough, limit, np.maximum(limit, BEYOND * usual))
+        outlying = keep & (off_px > limit)
+        moved_mm = np.linalg.solve(by_place, shift[..., None])[..., 0]
+        for k in np.flatnonzero(outlying):
+            same = keep & (image != image[k]) & [label == self.rows[k][1] for _, label in self.rows]
+            apart_px = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
+            outlying[k] = not (apart_px < ALIKE * off_px[k]).any()
+        reasons: dict[int, str] = {}
+        for i, p in {(image[k], plane[k]) for k in np.flatnonzero(outlying)}:
+            of_plane = np.flatnonzero(keep & (image == i) & (plane == p))
+            worst = int(of_plane[np.argmax(np.where(outlying, off_px / limit, 0)[of_plane])])
+            error = f"{off_px[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
+            if self.alone[worst] and self.enough[worst]:
+                why = f"{self.rows[worst][1]} is {error}, and no other image of the group tells which circles are right"
+                reasons |= dict.fromkeys(of_plane.tolist(), why)
+            else:
+                reasons[worst] = error
+        return reasons

@@ -8,25 +8,24 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import CornerBoard
-from stcal.boards.faces import find_on_faces
+from stcal.boards.on_faces import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.board import BoardReading, by_rings, find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
+from stcal.sfm.detect.dot_grid import BoardReading, by_rings, find_boards
+from stcal.sfm.detect.face_patterns import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 FAINT = 0.25
 """Share of the required contrast that is used if an image shows too little with the full one."""
 MAX_FREE = 400
-"""Largest number of outlines outside of boards that are tried for faces; the largest outlines are used. Photographs
-have up to 130. A fine checkerboard has tens of thousands, and time and memory grow with each."""
+"""Number of the largest outlines outside of boards that are tried for faces. Photographs have up to 130."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,9 +50,10 @@ def read_image(
     target: TargetDesign,
     board: BoardDesign | None,
     options: EllipseOptions,
-    aside: np.ndarray | None = None,  # (k, 2) px, polygon whose outlines are left out
+    aside: np.ndarray | None = None,
 ) -> ImageReading:
-    """Finds outlines in an 8-bit image, and boards and faces among them; fainter outlines if too few are recognised."""
+    """Finds outlines in an 8-bit image, and boards and faces among them; fainter outlines if too few are recognised.
+    ``aside``: (k, 2) px, polygon whose outlines are left out."""
     reading = _read_once(grey, camera, target, board, options, aside)
     wanted = min(len(target.faces), 1 if board is None else 2)
     short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
@@ -64,14 +64,7 @@ def read_image(
     return reading
 
 
-def _read_once(
-    grey: np.ndarray,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: EllipseOptions,
-    aside: np.ndarray | None,
-) -> ImageReading:
+def _read_once(grey, camera, target, board, options, aside) -> ImageReading:
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
     outlines: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
     if aside is not None:
@@ -81,11 +74,10 @@ def _read_once(
     boards: list[BoardReading] = []
     free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
-        boards = find_boards(Candidates.of(outlines[board.polarity], camera), board, image_corners(camera))
-        if board.rings:
-            boards = [by_rings(each, board, grey, camera) for each in boards]
-        for each in boards:
-            free[board.polarity][each.candidates] = False
+        dots = Candidates.of(outlines[board.polarity], camera)
+        for found in find_boards(dots, board, image_corners(camera)):
+            boards.append(by_rings(found, board, grey, camera, dots.xy) if board.rings else found)
+            free[board.polarity][found.candidates] = False
     all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
     finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
@@ -165,44 +157,48 @@ def _detect_circles(
 ) -> ImageDetection:
     """Finds and measures all circles of the target and, with ``dots``, the board outside of the polygon ``aside``."""
     reading = read_image(grey_8bit(image), camera, target, board, options, aside)
-    grey = grey_fine(image)
+    grey, free = grey_fine(image), reading.free
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards if dots else ()
     of_board = board.polarity if board else target.polarity
-    free, found = reading.free, reading.found[of_board]
-    patterns = [_Pattern(target.polarity, free.select(face.used()), face.labels()) for face in named]
     used = [np.unique(np.concatenate([reading.used() for reading in nameless])) for nameless in refused]
-    for candidates in used:
-        patterns.append(_Pattern(target.polarity, free.select(candidates), [NAMELESS] * len(candidates)))
+    patterns: list[_Pattern] = [(target.polarity, free.select(face.used()), face.labels()) for face in named]
+    for own in used:
+        patterns.append((target.polarity, free.select(own), [NAMELESS] * len(own)))
     for grid in boards:
-        patterns.append(_Pattern(of_board, found.select(grid.candidates), [DOT] * len(grid.candidates)))
+        patterns.append((of_board, reading.found[of_board].select(grid.candidates), [DOT] * len(grid.candidates)))
     measured = _measured(grey, camera, patterns, reading.found)
     notes: list[str] = []
     if reading.untried:
         every, tried = len(free) + reading.untried, f"the {len(free)} largest were tried for faces"
         remedy = "keep fine patterns out of view, or raise --min-diameter"
         notes.append(f"{every} outlines like circles beside the board, {tried}; {remedy}")
-    for pattern, centres in zip(patterns, measured, strict=True):
-        notes += [_rim_note(pattern.names[i], centres.rim[i]) for i in np.flatnonzero(~centres.ok).tolist()]
+    for (_, _, names), centres in zip(patterns, measured, strict=True):
+        for i in np.flatnonzero(~centres.ok).tolist():
+            share = f"{100 * centres.rim[i]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
+            why = f"{share}; partly hidden or disturbed, left out"
+            if centres.rim[i] >= MIN_RIM:
+                why = "σ of its centre is not determined, left out; check the distortion in the camera file"
+            notes.append(f"{names[i]}: {why}")
     ends = np.cumsum([0, *(int(centres.ok.sum()) for centres in measured)])
-    measured_rows = [(centres.ok, np.arange(*rows)) for centres, rows in zip(measured, pairwise(ends), strict=True)]
+    rows = [(centres.ok, np.arange(*own)) for centres, own in zip(measured, pairwise(ends), strict=True)]
     first, second = len(named), len(named) + len(refused)
-    faces, open_faces, board_sightings = [], [], []
-    for face, (ok, rows) in zip(named, measured_rows[:first], strict=True):
-        faces.append(FaceSighting(face.face.id, rows, np.flatnonzero(face.index >= 0)[ok]))
-    for nameless, candidates, (ok, rows) in zip(refused, used, measured_rows[first:second], strict=True):
-        row = np.full(len(reading.free), -1)  # of each candidate among the centres, −1 if it is not measured
-        row[candidates[ok]] = rows
-        found_rows = [np.where(face.index >= 0, row[face.index], -1) for face in nameless]
-        circles = [np.flatnonzero(each >= 0) for each in found_rows]
-        sightings = zip(nameless, found_rows, circles, strict=True)
-        open_faces.append(tuple(FaceSighting(face.face.id, each[own], own) for face, each, own in sightings))
-    for grid, (ok, rows) in zip(boards, measured_rows[second:], strict=True):
-        board_sightings.append(BoardSighting(rows, grid.numberings[:, ok], grid.unlikely[:, ok]))
+    faces, open_faces = [], []
+    for face, (ok, own) in zip(named, rows[:first], strict=True):
+        faces.append(FaceSighting(face.face.id, own, np.flatnonzero(face.index >= 0)[ok]))
+    for nameless, candidates, (ok, own) in zip(refused, used, rows[first:second], strict=True):
+        row = np.full(len(free) + 1, -1)  # of each candidate among the centres; −1, as for none, if it is not measured
+        row[candidates[ok]] = own
+        sightings = []
+        for face in nameless:
+            circles = np.flatnonzero(row[face.index] >= 0)
+            sightings.append(FaceSighting(face.face.id, row[face.index[circles]], circles))
+        open_faces.append(tuple(sightings))
+    grids = zip(boards, rows[second:], strict=True)
     none = measure_centres(grey, camera, free.select(np.zeros(0, int)), free)
     return ImageDetection(
         Centres.concatenate([none, *(centres.select(np.flatnonzero(centres.ok)) for centres in measured)]),
         tuple(faces),
-        tuple(board_sightings),
+        tuple(BoardSighting(own, grid.numberings[:, ok], grid.unlikely[:, ok]) for grid, (ok, own) in grids),
         tuple(face.face.id for face in reading.mirrored),
         tuple(notes),
         sum(len(e) for e in reading.found.values()),
@@ -210,13 +206,8 @@ def _detect_circles(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pattern:
-    """Ellipses of one face or board, their polarity, and their names for notes."""
-
-    polarity: Polarity
-    ellipses: Ellipses
-    names: Sequence[Label | str]
+_Pattern = tuple[Polarity, Ellipses, Sequence[Label | str]]
+"""Polarity of one face or board, its ellipses, and their names for notes."""
 
 
 def _measured(
@@ -225,23 +216,13 @@ def _measured(
     """Returns the centres of each pattern. All patterns of one polarity are measured at once."""
     measured: dict[int, Centres] = {}
     for polarity, every in found.items():
-        members = [i for i, pattern in enumerate(patterns) if pattern.polarity == polarity]
-        if not members:
-            continue
-        groups = np.repeat(np.arange(len(members)), [len(patterns[i].ellipses) for i in members])
-        together = Ellipses.concatenate([patterns[i].ellipses for i in members])
-        centres = measure_centres(image, camera, together, every, groups)
-        measured |= {i: centres.select(np.flatnonzero(groups == k)) for k, i in enumerate(members)}
+        members = [i for i, pattern in enumerate(patterns) if pattern[0] == polarity]
+        if members:
+            groups = np.repeat(np.arange(len(members)), [len(patterns[i][1]) for i in members])
+            together = Ellipses.concatenate([patterns[i][1] for i in members])
+            centres = measure_centres(image, camera, together, every, groups)
+            measured |= {i: centres.select(np.flatnonzero(groups == k)) for k, i in enumerate(members)}
     return [measured[i] for i in range(len(patterns))]
-
-
-def _rim_note(label: Label | str, rim: float) -> str:
-    if rim >= MIN_RIM:
-        return f"{label}: σ of its centre is not determined, left out; check the distortion in the camera file"
-    return (
-        f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed; partly hidden or "
-        "disturbed, left out"
-    )
 
 
 def image_corners(camera: Camera) -> np.ndarray:

@@ -1,18 +1,19 @@
 """Search for circles at places predicted by an arrangement, or by the previous image."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from stcal.design import BoardDesign, Polarity, TargetDesign
+from stcal.design import Polarity
 from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres, ImageObservations
-from stcal.sfm.data.patterns import MAX_TILT_RAD, ideal_border, images_px, in_view, patterns_of
+from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, ideal_border, images_px, in_view
 from stcal.sfm.detect.circles.candidates import (
     MAX_POSITION_ERROR,
     MAX_POSITION_ERROR_PX,
@@ -23,14 +24,11 @@ from stcal.sfm.detect.circles.candidates import (
 )
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.circles.fits import MIN_SIGMA
-from stcal.sfm.detect.group_geometry import Arrangement
 
 MAX_STRETCH = 1.15
-"""Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end. If an
-edge is cut by a seventh of the diameter, the error of the centre is as large as the rim test admits."""
+"""Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end."""
 MAX_BLUR = 1.0
-"""Largest blur (σ) over the smaller radius. A rim that is more blurred merges with its opposite side and with what is
-near it: centres were up to 2 px off at 1.05 to 1.5, and 0.3 px at most below 0.9."""
+"""Largest blur (σ) over the smaller radius: a rim that is more blurred merges with its opposite side."""
 MAX_SIGMA_PX = 0.5
 """Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0
@@ -79,28 +77,22 @@ class SecondLook:
 
 
 def predict_circles(
-    arrangement: Arrangement,
-    image: int,
-    seen: Sequence[Label],
-    target: TargetDesign,
-    board: BoardDesign | None,
+    camera_from_group: Rigid,
+    group_from_plane: Mapping[str, Rigid],
+    seen: Collection[Label],
+    patterns: Mapping[str, Pattern],
     camera: Camera,
     max_tilt_rad: float = MAX_TILT_RAD,
-) -> PredictedCircles | None:
-    """Predicts the circles in view of an image, None if the arrangement lacks it; those not in ``seen`` are wanted."""
-    pose = arrangement.camera_from_group.get(image)
-    if pose is None:
-        return None
+) -> PredictedCircles:
+    """Predicts the circles in view on planes of known poses; those not in ``seen`` are wanted."""
     labels: list[Label] = []
     centre, shape, polarity = [np.zeros((0, 2))], [np.zeros((0, 2, 2))], []
     border = ideal_border(camera)
-    for plane, pattern in patterns_of(target, board).items():
-        if plane not in arrangement.group_from_plane:
+    for plane, pattern in patterns.items():
+        if plane not in group_from_plane:
             continue
-        camera_from_plane = pose @ arrangement.group_from_plane[plane]
+        camera_from_plane = camera_from_group @ group_from_plane[plane]
         shown = np.flatnonzero(in_view(pattern, camera_from_plane, camera, border, max_tilt_rad))
-        if not len(shown):
-            continue
         place, outline = images_px(pattern, camera_from_plane, camera, shown)
         labels += [pattern.labels[i] for i in shown.tolist()]
         centre.append(place)
@@ -116,37 +108,35 @@ def contradictions(predicted: PredictedCircles, observed: ImageObservations, cam
     common size ratio of a plane's circles is attributed to the design and accepted."""
     place = {label: i for i, label in enumerate(predicted.labels)}
     rows = np.array([k for k, label in enumerate(observed.labels) if label in place], int)
-    predicted_rows = np.array([place[observed.labels[k]] for k in rows], int)
-    shapes_px = predicted.shape_px[predicted_rows]
+    labels = [observed.labels[k] for k in rows]
+    shapes_px = predicted.shape_px[np.array([place[label] for label in labels], int)]
     widest, narrowest = _stretch(shapes_px, observed.shape[rows], observed.centre[rows], camera)
-    planes = np.array([observed.labels[k].plane for k in rows], str)
+    planes = np.array([label.plane for label in labels], str)
     reasons: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
             stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])
-            _, reason = _disagreement(shapes_px[k], 0.0, stretch, blur)
-            if reason:
-                reasons[observed.labels[rows[k]]] = reason
+            if reason := _disagreement(shapes_px[k], 0.0, stretch, blur)[1]:
+                reasons[labels[k]] = reason
     return reasons
 
 
 def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
     """Returns the largest and smallest ratio, in any direction, of measured ellipses (normalised) to expected ones."""
-    local = camera.pixel_jacobian(centre)
-    return singular_values(np.linalg.solve(shape_px, local @ shape))
+    return singular_values(np.linalg.solve(shape_px, camera.pixel_jacobian(centre) @ shape))
 
 
 def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float], blur_px: float) -> tuple[str, str]:
     """Returns why a measured ellipse is not the expected one: the key of its remedy and the reason; empty if it is."""
     largest, smallest = singular_values(shape_px)
+    allowed_px = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
+    most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
     if blur_px > MAX_BLUR * smallest:
         return "blur", f"blurred by {blur_px:.2g} px, {MAX_BLUR * float(smallest):.2g} px allowed by its smaller radius"
-    allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
-    if off_px > allowed:
-        return "place", f"{off_px:.3g} px from its place, {allowed:.3g} allowed"
-    most, limit = max(stretch[0], 1 / stretch[1]), MAX_STRETCH * (1 + 0.5 / float(smallest))
+    if off_px > allowed_px:
+        return "place", f"{off_px:.3g} px from its place, {allowed_px:.3g} allowed"
     if most > limit:
         return "shape", f"{most:.3g} times its size along one direction, {limit:.3g} allowed"
     return "", ""
@@ -156,22 +146,35 @@ def measure_predicted(
     image: np.ndarray, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook:
     """Measures the wanted circles in a grey image of any depth, if the options admit their size."""
-    grey = grey_fine(image)
     everything = Ellipses(predicted.centre_px, predicted.shape_px, np.ones(len(predicted.labels)))
-    wanted = np.flatnonzero(predicted.wanted)
     low, high = options.min_diameter_px or MIN_DIAMETER_PX, options.max_diameter_px
-    diameter = 2 * everything.radius_px()
-    missed = {}
-    for i in wanted[(diameter[wanted] < low) | (diameter[wanted] > high)]:
+    diameter, missed = 2 * everything.radius_px(), {}
+    admitted = (diameter >= low) & (diameter <= high)
+    for i in np.flatnonzero(predicted.wanted & ~admitted):
         remedy = REMEDIES["small" if diameter[i] < low else "large"]
         missed[predicted.labels[i]] = f"{diameter[i]:.1f} px across, {low:g} to {high:g} px asked for; {remedy}"
-    wanted = np.array([i for i in wanted if predicted.labels[i] not in missed], int)
+    wanted = np.flatnonzero(predicted.wanted & admitted)
     expected = everything.select(wanted)
-    centres = measure_centres(grey, camera, expected, everything)
-    reasons = _reasons(centres, expected, [predicted.polarity[i] for i in wanted], camera)
-    accepted = np.array([k for k, reason in enumerate(reasons) if not reason], int)
-    missed |= {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason}
-    return SecondLook(tuple(predicted.labels[i] for i in wanted[accepted]), centres.select(accepted), missed)
+    found = measure_centres(grey_fine(image), camera, expected, everything)
+    contrast, needed = _contrast(found, [predicted.polarity[i] for i in wanted])
+    off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
+    widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
+    accepted = []
+    for k, i in enumerate(wanted):
+        kind, reason = "rim", f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
+        if found.ok[k] and contrast[k] < needed[k]:
+            kind, reason = "contrast", f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
+        elif found.ok[k]:
+            stretch, blur = (widest[k], narrowest[k]), float(found.blur_px[k])
+            kind, reason = _disagreement(expected.shape_px[k], float(off[k]), stretch, blur)
+            if not reason and sigma[k] > MAX_SIGMA_PX:
+                kind, reason = "sigma", f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
+        if reason:
+            missed[predicted.labels[i]] = f"{reason}; {REMEDIES[kind]}"
+        else:
+            accepted.append(k)
+    labels = tuple(predicted.labels[i] for i in wanted[accepted])
+    return SecondLook(labels, found.select(np.array(accepted, int)), missed)
 
 
 def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray, np.ndarray]:
@@ -180,37 +183,16 @@ def _contrast(found: Centres, polarity: Sequence[Polarity]) -> tuple[np.ndarray,
     return contrast, MIN_SIGNIFICANCE * np.maximum(found.noise, MIN_SIGMA)
 
 
-def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
-    """Returns by fit why it is not the expected circle, with the remedy; empty if it is."""
-    contrast, needed = _contrast(found, polarity)
-    off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
-    widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
-    reasons = []
-    for k in range(len(found)):
-        if not found.ok[k]:
-            kind = "rim"
-            reason = f"{100 * found.rim[k]:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed"
-        elif contrast[k] < needed[k]:
-            kind, reason = "contrast", f"contrast {contrast[k]:z.1f}, {needed[k]:.1f} needed"
-        else:
-            stretch, blur = (widest[k], narrowest[k]), float(found.blur_px[k])
-            kind, reason = _disagreement(expected.shape_px[k], float(off[k]), stretch, blur)
-            if not reason and sigma[k] > MAX_SIGMA_PX:
-                kind, reason = "sigma", f"σ {sigma[k]:.2f} px, {MAX_SIGMA_PX:g} allowed"
-        reasons.append(f"{reason}; {REMEDIES[kind]}" if reason else "")
-    return reasons
-
-
 def missed_notes(missed: dict[Label, str]) -> list[str]:
     """Returns one note for each face, and one for the board, on circles that were expected in view and not measured."""
-    planes: dict[str, list[tuple[Label, str]]] = {}
-    for label, reason in missed.items():
-        planes.setdefault(label.plane, []).append((label, reason))
     notes = []
-    for plane, rows in planes.items():
-        place, (first, reason) = "board" if plane == BOARD else f"face {plane}", rows[0]
+    for plane in dict.fromkeys(label.plane for label in missed):
+        place, rows = (
+            "board" if plane == BOARD else f"face {plane}",
+            [label for label in missed if label.plane == plane],
+        )
         others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-        notes.append(f"{place}: {first}{others} should be in view and not measured; {first}: {reason}")
+        notes.append(f"{place}: {rows[0]}{others} should be in view and not measured; {rows[0]}: {missed[rows[0]]}")
     return notes
 
 

@@ -20,7 +20,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.circles.candidates import (
     Candidates,
     EllipseOptions,
@@ -32,6 +31,7 @@ from stcal.sfm.detect.circles.candidates import (
     outline_area,
     outlines,
 )
+from stcal.sfm.detect.dot_grid import find_boards
 from stcal.sfm.detect.image import image_corners
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
@@ -91,8 +91,8 @@ class PublishedPattern:
         largest = max(radius[circle] for circle in common)
         large = {i: place[i] for i in common if radius[i] > 0.75 * largest and i != first.origin}
         small = {i: place[i] for i in common if i not in large and i != first.origin}
-        lines = [_along(np.array(direction), large) for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))]
-        (a, step_x), (b, step_y) = (_along(np.array(direction), small)[0] for direction in ((1.0, 0.0), (0.0, 1.0)))
+        lines = [_along(direction, large) for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0))]
+        (a, step_x), (b, step_y) = (_along(direction, small)[0] for direction in ((1.0, 0.0), (0.0, 1.0)))
         if not np.isclose(step_x, step_y) or len(large) != sum(map(len, lines)) or len(small) != 2:
             raise ValueError("its circles lie elsewhere")
         (c,), last = names_face, lines[2][-1][0]
@@ -107,13 +107,13 @@ class PublishedPattern:
         return cls(first.origin, a, b, c, last, in_steps, names, step_radii, c_radii, small_share)
 
 
-def _along(direction: np.ndarray, place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
+def _along(direction: tuple[float, float], place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
     """Returns the circles in a direction from the origin, nearest first, with distances in units of ``direction``."""
-    aligned = []
-    for circle, xy in place.items():
-        far = float(xy @ direction / (direction @ direction))
-        if far > 0 and np.allclose(xy, far * direction, atol=0.01 * far):
-            aligned.append((circle, far))
+    way = np.array(direction)
+    distances = {circle: float(xy @ way / (way @ way)) for circle, xy in place.items()}
+    aligned = [
+        (i, far) for i, far in distances.items() if far > 0 and np.allclose(place[i], far * way, atol=0.01 * far)
+    ]
     if not aligned:
         raise ValueError(f"no circle along ({direction[0]:g}, {direction[1]:g})")
     return sorted(aligned, key=lambda each: each[1])
@@ -143,23 +143,20 @@ def detect_published(
     counts = [len(of_polarity) for of_polarity in ellipses.values()]
     start = dict(zip(ellipses, np.cumsum([0, *counts]).tolist(), strict=False))
     candidates = {polarity: Candidates.of(of_polarity, camera) for polarity, of_polarity in ellipses.items()}
-    boards, free = [], np.ones(len(ellipses[target.polarity]), bool)
+    boards, free, own = [], np.ones(len(ellipses[target.polarity]), bool), candidates[target.polarity]
     if board is not None:
         for grid in find_boards(candidates[board.polarity], board, image_corners(camera)):
             boards.append(BoardSighting(start[board.polarity] + grid.candidates, grid.numberings, grid.unlikely))
             if board.polarity == target.polarity:
                 free[grid.candidates] = False
-    faces, notes = _Rules(pattern, target, candidates[target.polarity], ellipses[target.polarity]).find(free)
-    first, centres = start[target.polarity], []
+    faces, notes = _Rules(pattern, target, own, ellipses[target.polarity]).find(free)
+    centres = []
     for polarity, every in ellipses.items():
         equal, found = np.broadcast_to(EQUAL_SIGMA_PX**2 * np.eye(2), (len(every), 2, 2)), candidates[polarity]
         centres.append(Centres.without_rims(every.centre_px, found.xy, found.shape, equal, every.contrast))
+    sightings = (FaceSighting(face, start[target.polarity] + rows, circles) for face, rows, circles in faces)
     return ImageDetection(
-        centres=Centres.concatenate(centres),
-        faces=tuple(FaceSighting(face, first + rows, circles) for face, rows, circles in faces),
-        boards=tuple(boards),
-        notes=tuple(notes),
-        candidates=sum(counts),
+        Centres.concatenate(centres), tuple(sightings), tuple(boards), notes=tuple(notes), candidates=sum(counts)
     )
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -126,21 +125,22 @@ Readings = list[PlaneView]
 
 def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
     """Returns the readings of one image with poses; not of patterns in view twice, one of which may be a reflection."""
-    readings: list[list[PlaneView | None]] = []
     ids = [each.face for each in detection.faces]
-    for each in (each for each in detection.faces if ids.count(each.face) == 1):
-        readings.append([_face_view(each, target, detection, named=True)])
-    for faces in detection.open_faces:
-        views = [_face_view(each, target, detection, named=False) for each in faces]
+    patterns = [((each,), True) for each in detection.faces if ids.count(each.face) == 1]
+    readings: list[Readings] = []
+    for faces, named in (*patterns, *((faces, False) for faces in detection.open_faces)):
+        views = [_face_view(each, target, detection, named) for each in faces]
         readings.append([view for view in views if view is not None])
-    if board is not None and BOARD not in detection.repeated:
-        for each in detection.boards:
-            labels = [tuple(DotLabel(*cell) for cell in n.tolist()) for n in (*each.numberings, *each.unlikely)]
-            views = [_view(BOARD, own, each.rows, board.places_mm(own)[:, :2], detection) for own in labels]
-            count = len(each.numberings)
-            covered = [replace(view, likely=False) for view in views[count:] if view is not None]
-            readings.append(views[:count] + covered)
-    return [[v for v in views if v is not None] for views in readings if views and all(v is not None for v in views)]
+    boards = () if board is None or BOARD in detection.repeated else detection.boards
+    for each, places_mm in ((each, board.places_mm) for each in boards if board is not None):
+        views = []
+        for k, cells in enumerate((*each.numberings, *each.unlikely)):
+            labels = tuple(DotLabel(*cell) for cell in cells.tolist())
+            view = _view(BOARD, labels, each.rows, places_mm(labels)[:, :2], detection)
+            views.append(view and replace(view, likely=k < len(each.numberings)))
+        if all(views[: len(each.numberings)]):
+            readings.append([view for view in views if view is not None])
+    return [views for views in readings if views]
 
 
 def likely_views(readings: list[Readings]) -> list[Readings]:
@@ -157,31 +157,16 @@ def _view(
     plane: str, labels, rows: np.ndarray, xy_mm: np.ndarray, detection: ImageDetection, named: bool = True
 ) -> PlaneView | None:
     xy = detection.centres.centre[rows]
-    if len(rows) < MIN_POSE_CIRCLES:
-        return None
-    pose = planar_pose(xy_mm, xy)
-    if pose is None:
-        return None
+    pose = planar_pose(xy_mm, xy) if len(rows) >= MIN_POSE_CIRCLES else None
     area = float(np.abs(np.linalg.det(detection.centres.shape[rows])).sum())
-    return PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
+    return None if pose is None else PlaneView(plane, labels, rows, xy_mm, xy, area, pose, named)
 
 
-def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
-    """Returns by face the sets of its circles that another reading explains as well; such a set names no face."""
-    key = tuple((f.id, f.xy_mm.tobytes(), f.radius_mm.tobytes()) for f in target.faces)
-    return _confusable(key)
-
-
-@lru_cache(maxsize=8)
-def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
-    faces = [(face_id, np.frombuffer(xy).reshape(-1, 2), np.frombuffer(radius)) for face_id, xy, radius in key]
-    sets_of_face = {}
-    for face_id, xy, radius in faces:
-        sets: set[frozenset[int]] = set()
-        for other_id, *other in faces:
-            sets |= common_circles(xy, radius, *other, same=face_id == other_id)
-        sets_of_face[face_id] = tuple(s for s in sets if not any(s < t for t in sets))
-    return sets_of_face
+def confusable(face: FaceDesign, target: TargetDesign) -> set[frozenset[int]]:
+    """Returns the sets of a face's circles that another reading explains as well; such a set names no face."""
+    return set().union(
+        *(common_circles(face.xy_mm, face.radius_mm, o.xy_mm, o.radius_mm, o.id == face.id) for o in target.faces)
+    )
 
 
 def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
@@ -196,7 +181,7 @@ def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> in
 def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
     """Returns whether the circles found (mask) name the face, as no other reading explains them all."""
     circles = frozenset(np.flatnonzero(found).tolist())
-    return not any(circles <= rival for rival in confusable(target)[face.id])
+    return not any(circles <= rival for rival in confusable(face, target))
 
 
 def likeness_notes(target: TargetDesign) -> list[str]:
@@ -258,12 +243,6 @@ def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def mirrored_as(face: FaceDesign, other: FaceDesign) -> tuple[np.ndarray, ...]:
+def mirrored_as(face: FaceDesign, other: FaceDesign) -> list[np.ndarray]:
     """Returns the circles of a face's mirror image that pass for circles of another."""
-    return _mirrored_as(*(a.tobytes() for a in (face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)))
-
-
-@lru_cache(maxsize=256)
-def _mirrored_as(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes) -> tuple[np.ndarray, ...]:
-    own, other = np.frombuffer(xy).reshape(-1, 2), np.frombuffer(other_xy).reshape(-1, 2)
-    return tuple(mirrored_circles(own, np.frombuffer(radius), other, np.frombuffer(other_radius)))
+    return mirrored_circles(face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)

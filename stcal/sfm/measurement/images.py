@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.faces import why_unseen
-from stcal.boards.target import body_of
+from stcal.boards.on_faces import why_unseen
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, StcalError
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
@@ -23,7 +23,7 @@ from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
-from stcal.sfm.detect.labels import label_single, without_defocus
+from stcal.sfm.detect.labelling import label_single, without_defocus
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
 from stcal.sfm.measurement.target import TargetCircles, read_target
 from stcal.sfm.measurement.tracker import Tracker
@@ -135,7 +135,7 @@ def measure(
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
     if design is None and isinstance(target, TargetCircles):
         design = target.design
-    design = body_of(design)
+    design = target_of(design)
     target = read_target(target, design) if isinstance(target, str | Path) else target
     camera = read_camera(camera) if isinstance(camera, str | Path) else camera_model(camera)
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)

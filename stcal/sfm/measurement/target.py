@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stcal.boards.target import load_body
+from stcal.boards.target_file import load_target
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments
@@ -109,7 +109,7 @@ def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCi
     InputError
         If the file is no ``faces.json``, or belongs to another design.
     """
-    path, design = Path(path), load_body(design) if isinstance(design, str | Path) else design
+    path, design = Path(path), load_target(design) if isinstance(design, str | Path) else design
     faces = read_result(path, FacesFile, "faces", "give RUN/faces.json, the faces.json of a run")
     try:
         labels = circle_labels(faces.circles)

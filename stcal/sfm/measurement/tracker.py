@@ -18,9 +18,8 @@ from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
-from stcal.sfm.detect.group_geometry import Arrangement
 from stcal.sfm.detect.image import detect_target
-from stcal.sfm.detect.labels import LabelledImage, label_single, labelled_image
+from stcal.sfm.detect.labelling import LabelledImage, label_single, labelled_image
 from stcal.sfm.detect.predict import (
     PredictedCircles,
     common_shift,
@@ -215,10 +214,7 @@ class Tracker:
         return seen.plus(measured.labels, measured.centres, missed_notes(measured.missed))
 
     def _predicted(self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float) -> PredictedCircles:
-        arrangement = Arrangement(self._planes, {0: pose}, {})
-        predicted = predict_circles(arrangement, 0, seen, self.design, None, camera, max_tilt_rad)
-        assert predicted is not None  # the arrangement has this image
-        return predicted
+        return predict_circles(pose, self._planes, seen, self._patterns, camera, max_tilt_rad)
 
     def _pose(self, seen: ImageObservations, camera: Camera) -> TargetPose | StcalError:
         sharp = correct_defocus([seen], camera, self._patterns)[0][0]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.special import ellipe, ellipk
 
+from stcal.boards.target_file import ROUGH_KEYS
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, reference_target
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_fields, rms
@@ -15,7 +16,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import circle_image_offset, singular_values
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
-from stcal.io.design import ROUGH_KEYS
 from stcal.io.json import read_result
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.file import save_run_board
-from stcal.boards.target import save_body
+from stcal.boards.board_file import save_board
+from stcal.boards.target_file import save_target
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments
@@ -41,7 +41,7 @@ from stcal.report.text import join
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectedImage, DetectionResult
-from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
@@ -124,9 +124,9 @@ def write_run(result: RunResult, out: Path, progress: Progress) -> Judgement:
     save_camera(out / CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
         save_camera(out / REFINED_CAMERA, refined)
-    save_body(out / TARGET, result.target_design)
+    save_target(out / TARGET, result.target_design)
     if result.board_design.rows:
-        save_run_board(out / BOARD, result.board_design)
+        save_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     judgement = Judgement.model_validate(report["judgement"])
     if result.target.target_from_face:  # a run of the board alone has no faces

@@ -26,7 +26,7 @@ from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.detect.files import DetectionResult
-from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.report.judgement import Judgement

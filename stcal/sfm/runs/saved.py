@@ -10,8 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from stcal.boards.file import load_run_board
-from stcal.boards.target import load_body
+from stcal.boards.board_file import load_board
+from stcal.boards.target_file import load_target
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import Brief, frozen, require_arguments
@@ -188,7 +188,7 @@ def load_run(folder: str | Path) -> SavedRun:
     require_run(folder)
     complete_interrupted(folder)
     has_target = (folder / TARGET).is_file()
-    target = load_body(folder / TARGET) if has_target else None
+    target = load_target(folder / TARGET) if has_target else None
     without_board = target is not None and target.has_scale and not (folder / BOARD).exists()
     inputs = (CAMERA, TARGET) if without_board else (CAMERA, TARGET, BOARD)
     needed = (*inputs, "labels.csv", DATABASE, "report.json", "faces.json")
@@ -207,7 +207,7 @@ def load_run(folder: str | Path) -> SavedRun:
     assert target is not None
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
-    board = scale_reference(None if without_board else load_run_board(folder / BOARD), target)
+    board = scale_reference(None if without_board else load_board(folder / BOARD), target)
     with as_written(folder / RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
         options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)

@@ -32,7 +32,7 @@ from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_grou
 from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
-from stcal.sfm.detect.labels import (
+from stcal.sfm.detect.labelling import (
     Detection,
     LabelledImage,
     is_board_alone,

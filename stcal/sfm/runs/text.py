@@ -12,7 +12,7 @@ from stcal.report.document import Block, Document, Printed, Section, Table
 from stcal.report.text import join, wrapped
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
-from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.detect.predict import REMEDIES
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, without_sigma_of

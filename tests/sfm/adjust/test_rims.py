@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.boards.board_file import board_toml, load_board
+from stcal.boards.target_file import load_target, target_toml
 from stcal.errors import InputError
-from stcal.io.design import board_toml, load_board, load_target, target_toml
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.detect.labels import label_single
+from stcal.sfm.detect.labelling import label_single
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.render import RenderOptions, render

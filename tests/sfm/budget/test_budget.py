@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stcal.boards.board_file import board_toml, load_board
 from stcal.design import KnownDistance, ScaleReference, StatedSize
 from stcal.errors import StcalError
-from stcal.io.design import board_toml, load_board
 from stcal.io.files import RUN_MARKER, digest_of, json_text
 from stcal.labels import CircleLabel
 from stcal.sfm.budget import combine

@@ -11,7 +11,7 @@ from stcal.io.images import find_images
 from stcal.sfm.data.model import detections_csv
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
-from stcal.sfm.detect.labels import LabelledImage, label_images
+from stcal.sfm.detect.labelling import LabelledImage, label_images
 from tests.scripts import load_script
 from tests.support.photograph import Photograph, RenderedSet
 

@@ -9,7 +9,8 @@ from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.labels import label_groups, label_single
+from stcal.sfm.data.patterns import patterns_of
+from stcal.sfm.detect.labelling import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
@@ -96,7 +97,8 @@ def test_the_arrangement_predicts_circles_to_a_fraction_of_a_pixel(scene, group)
     """The circles are 0.02 mm off the design: 0.06 px here."""
     _, arrangement = labelled(scene, [Seen(o).detection() for o in group])
     for i, image in enumerate(group):
-        predicted = predict_circles(arrangement, i, [], scene.target, scene.board, scene.camera)
+        pose, planes = arrangement.camera_from_group[i], arrangement.group_from_plane
+        predicted = predict_circles(pose, planes, [], patterns_of(scene.target, scene.board), scene.camera)
         truth = dict(zip(image.labels, image.centre_px, strict=True))
         own = [
             np.linalg.norm(at - truth[x])

@@ -112,17 +112,29 @@ def test_light_that_slopes_across_a_disc_does_not_move_its_centre(radius, blur):
     assert abs(found.centre_px[0, 0] - middle[0]) < 0.003  # the fine grid leaves 0.002
 
 
-@pytest.mark.parametrize("bright", [True, False])
-def test_without_noise_the_centre_is_the_ideal_ellipses_centre(bright):
-    """Quantisation to 1/8 px on the fine grid and 8 bit leave about 0.002 px, more on the
-    steepest; distortion neglected would cost 0.02."""
-    image = draw(CAMERA, CIRCLES, bright=bright)
-    start = start_from(CAMERA, CIRCLES)
+NEAR = [circle(0, 0, 0, 0), circle(8 + 4 + 2.2, 0, 0, 0, radius=4.0)]
+"""A small circle 3 px beside a big one, whose pixels are left out."""
+
+
+@pytest.mark.parametrize(
+    ("circles", "how", "most_px"),
+    [
+        (CIRCLES, {"bright": True}, 0.006),
+        (CIRCLES, {"bright": False}, 0.006),
+        (CIRCLES, {"gradient": 0.15}, 0.015),
+        (NEAR, {}, 0.01),
+    ],
+)
+def test_without_noise_the_centre_is_the_ideal_ellipses_centre(circles, how, most_px):
+    """Quantisation to 1/8 px on the fine grid and 8 bit leave about 0.002 px, more on the steepest; distortion
+    neglected would cost 0.02. Neither a gradient of brightness nor a neighbour pulls."""
+    image, start = draw(CAMERA, circles, **how), start_from(CAMERA, circles)
     found = measure_centres(image, CAMERA, start, start)
     assert found.ok.all()
-    error = found.centre_px - exact(CAMERA, CIRCLES)
-    assert np.abs(error).max() < 0.006
-    assert (found.contrast > 0).all() == bright
+    assert np.abs(found.centre_px - exact(CAMERA, circles)).max() < most_px
+    assert (found.contrast > 0).all() == how.get("bright", True)
+    of_16_bits = measure_centres(image.astype(np.uint16), CAMERA, start, start)
+    np.testing.assert_array_equal(of_16_bits.centre_px, found.centre_px)
 
 
 def test_the_projected_centre_of_the_circle_is_not_what_is_measured():
@@ -131,13 +143,6 @@ def test_the_projected_centre_of_the_circle_is_not_what_is_measured():
     start = start_from(CAMERA, CIRCLES)
     gap = np.linalg.norm(measure_centres(image, CAMERA, start, start).centre_px - CAMERA.project(centre), axis=1)
     assert gap[2] > 0.03  # 60° at 1 m: r²·sinθ·cosθ/(D²)·f ≈ 0.04 px
-
-
-def test_a_brightness_gradient_does_not_pull():
-    image = draw(CAMERA, CIRCLES, gradient=0.15)
-    start = start_from(CAMERA, CIRCLES)
-    found = measure_centres(image, CAMERA, start, start)
-    assert np.abs(found.centre_px - exact(CAMERA, CIRCLES)).max() < 0.015
 
 
 def test_noise_spreads_centres_as_the_stated_sigma_says():
@@ -165,24 +170,6 @@ def test_a_circle_partly_hidden_is_not_measured():
     assert not found.ok[0]
     assert found.rim[0] < 0.8
     assert found.ok[1]
-
-
-def test_a_neighbour_does_not_pull():
-    """A small circle 3 px beside a big one: its pixels are left out."""
-    near = [circle(0, 0, 0, 0), circle(8 + 4 + 2.2, 0, 0, 0, radius=4.0)]
-    image = draw(CAMERA, near)
-    start = start_from(CAMERA, near)
-    found = measure_centres(image, CAMERA, start, start)
-    assert found.ok.all()
-    assert np.abs(found.centre_px - exact(CAMERA, near)).max() < 0.01
-
-
-def test_sixteen_bit_values_give_the_same_centres():
-    image = draw(CAMERA, CIRCLES)
-    start = start_from(CAMERA, CIRCLES)
-    a = measure_centres(image, CAMERA, start, start)
-    b = measure_centres(image.astype(np.uint16), CAMERA, start, start)
-    np.testing.assert_array_equal(a.centre_px, b.centre_px)
 
 
 def test_circles_are_measured_together_as_each_alone():

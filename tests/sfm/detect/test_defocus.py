@@ -11,7 +11,7 @@ from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.image import detect_image
-from stcal.sfm.detect.labels import label_single
+from stcal.sfm.detect.labelling import label_single
 from stcal.synthetic.optics import ThinLens
 from stcal.synthetic.render import RenderOptions, encode, render
 from stcal.synthetic.scene import SceneOptions, make_scene

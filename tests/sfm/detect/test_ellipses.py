@@ -45,22 +45,24 @@ def test_a_tilted_circle_keeps_its_shape(tilt_deg):
     assert axes[0] / axes[1] == pytest.approx(np.cos(np.radians(tilt_deg)), abs=0.06)
 
 
-def test_the_other_polarity_is_not_seen():
-    image = add_ellipse(picture(), (600, 450), (20, 20))
-    assert len(find_ellipses(image, "dark", EllipseOptions())) == 0
-
-
-def test_squares_and_bars_are_no_ellipses():
+def of_a_square_and_a_bar():
     image = picture()
     cv2.rectangle(image, (200, 200), (260, 260), 200, -1)
-    cv2.rectangle(image, (500, 200), (700, 215), 200, -1)
-    assert len(find_ellipses(image, "bright", EllipseOptions())) == 0
+    return cv2.rectangle(image, (500, 200), (700, 215), 200, -1)
 
 
-def test_what_is_cut_by_the_border_is_left_out():
-    image = picture()
-    cv2.circle(image, (5, 400), 25, 200, -1)
-    assert len(find_ellipses(image, "bright", EllipseOptions())) == 0
+@pytest.mark.parametrize(
+    ("image", "polarity"),
+    [
+        (picture(), "bright"),
+        (add_ellipse(picture(), (600, 450), (20, 20)), "dark"),
+        (of_a_square_and_a_bar(), "bright"),
+        (cv2.circle(picture(), (5, 400), 25, 200, -1), "bright"),
+    ],
+    ids=["plain", "the other polarity", "no ellipses", "cut by the border"],
+)
+def test_what_is_no_circle_is_not_found(image, polarity):
+    assert len(find_ellipses(image, polarity, EllipseOptions())) == 0
 
 
 def test_size_limits_are_kept():
@@ -72,7 +74,3 @@ def test_size_limits_are_kept():
 def test_faint_blobs_are_left_out_against_bright_ones():
     image = add_ellipse(add_ellipse(picture(), (300, 300), (20, 20), value=240), (700, 500), (20, 20), value=48)
     assert len(find_ellipses(image, "bright", EllipseOptions())) == 1
-
-
-def test_a_plain_image_has_none():
-    assert len(find_ellipses(picture(), "bright", EllipseOptions())) == 0

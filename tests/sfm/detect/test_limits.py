@@ -8,7 +8,6 @@ from stcal.design import reference_board, reference_target
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.sfm.detect import image as stage
-from stcal.sfm.detect.board import MAX_UNEXPLAINED, _offsets
 from stcal.sfm.detect.circles.candidates import OPTION_RANGES, EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from tests.outcome import fails_with
@@ -43,23 +42,6 @@ def test_of_a_fine_pattern_the_largest_outlines_are_tried_and_it_is_said(monkeyp
         "the 60 largest were tried for faces; keep fine patterns out of view, or raise --min-diameter" in found.notes[0]
     )
     assert found.boards == found.faces == ()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_shifts_of_a_board_are_those_that_leave_few_dots_outside(seed):
-    """Against all shifts, tried one by one; holes and strays among the dots."""
-    rng, size = np.random.default_rng(seed), np.array([5, 4])
-    grid = np.stack(np.meshgrid(np.arange(5), np.arange(3)), -1).reshape(-1, 2) - [7, -2]
-    cells = np.vstack([rng.permutation(grid)[:11], [[3, 9]]])
-    tried = np.stack(np.meshgrid(np.arange(-20, 20), np.arange(-20, 20)), -1).reshape(-1, 2)
-    outside = [(~((cells + o >= 0) & (cells + o < size)).all(1)).sum() for o in tried]
-    wanted = tried[np.array(outside) <= MAX_UNEXPLAINED].tolist()
-    found = _offsets(cells, size).tolist()
-    kept = [o for o in found if o in wanted]
-    assert kept == wanted
-    assert len(wanted) > 0
-    assert len(found) < 30
-    assert len(_offsets(np.vstack([cells + np.array([100 * k, 0]) for k in range(9)]), size)) == 0
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e308, np.inf, np.nan])

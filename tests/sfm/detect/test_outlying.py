@@ -8,7 +8,7 @@ import pytest
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.group_geometry import MIN_LIMIT_PX, Arrangement, outlying_circles
-from stcal.sfm.detect.labels import label_groups
+from stcal.sfm.detect.labelling import label_groups
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen
 
 

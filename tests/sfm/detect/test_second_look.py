@@ -10,7 +10,7 @@ from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.detect.labels import _second, labelled_image
+from stcal.sfm.detect.labelling import _second, labelled_image
 from stcal.sfm.detect.predict import REMEDIES, PredictedCircles, SecondLook, contradictions, measure_predicted
 from tests.sfm.detect.test_arrangement import centres_of
 from tests.sfm.detect.test_centres import sheet

@@ -240,7 +240,7 @@ SPOILT = {
 
 @pytest.mark.parametrize("kind", SPOILT)
 def test_an_impossible_or_missing_design(small_set, stcal_sfm, kind):
-    """One of each; the others are in tests/io/test_design.py."""
+    """One of each; the others are in tests/boards/test_target_files.py."""
     old, new, error, part = SPOILT[kind]
     small = small_set("12")
     path = small.folder / f"{kind}.toml"

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.boards.target_file import target_toml
 from stcal.design import reference_board
 from stcal.geometry.rigid import Rigid
-from stcal.io.design import target_toml
-from stcal.sfm.detect.labels import _is_symmetry, _numbered
+from stcal.sfm.detect.labelling import _is_symmetry, _numbered
 from stcal.sfm.detect.sightings import PlaneView
 from tests.outcome import COMPUTATION, INPUT
 from tests.sfm.conftest import SmallSet

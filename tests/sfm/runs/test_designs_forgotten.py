@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+from stcal.boards.target_file import target_toml
 from stcal.design import reference_board, reference_target
-from stcal.io.design import target_toml
 from stcal.sfm.data.patterns import measured_pitch_mm, pitch_hint
 from stcal.sfm.detect.sightings import likeness_notes
 from stcal.synthetic.scene import second_design

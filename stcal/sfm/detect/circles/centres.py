@@ -1,28 +1,21 @@
 """Centres to the sub-pixel from blurred ellipses, and their σ from pixel errors."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
-from stcal.sfm.data.model import Centres, CircleRows
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.fits import BAND_PX, CUSP, Fits, boxes, intruders, local_ideal_maps
 
 MIN_NOISE2 = 1e-12
 """Noise variance, in squared grey values, that counts as no noise."""
 CHANCE_WAVES = 3
-"""So many odd harmonics around the rim stand for the first: the third, the fifth, the seventh. Higher ones are shorter
-than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (JPEG
-50 to 95 on 240 sheets of 200 circles: errors over σ were within 0.9…1.15 on 227 with 1 wave, 235 with 2, 234 with 3,
-219 with 4; the fewer, the more is left to chance.)"""
+"""Number of odd harmonics around the rim, from the third on, that stand for the first; higher ones are too short."""
 MAX_CHANCE = 4.2
-"""Largest ratio of one circle's squares to the median: exceeded by chance by one in a thousand (χ² of six degrees of
-freedom). It bounds the influence of a dirty circle."""
+"""Largest ratio of one circle's squares to the median, exceeded by chance by one in a thousand (χ² of six freedoms)."""
 SHARP_PX, SHARP = 1.5, 0.33
-"""Blur, in pixels and in the ellipse's smaller radius, above which the response of the fit to a shift is computed from
-the image. Below it, this changed σ by 1 % only; it takes a tenth of the time of the fit."""
+"""Blur, in pixels and in smaller radii, from which on the response of the fit to a shift is computed from the image."""
 
 
 def correlation(chance: np.ndarray) -> float:
@@ -105,80 +98,53 @@ MIN_RIM = 0.8
 MAX_RIM_RESIDUAL = 0.15
 """Largest RMS residual of a sector that follows the model, as a fraction of the contrast."""
 UNTRUSTED = 0.2
-"""Largest share of the shift by uneven brightness that the correction leaves (circles of 8 to 28 px, halves darker by
-5 to 30 %). It is added to σ."""
+"""Largest share of the shift by uneven brightness that the correction leaves, which is added to σ."""
 
 
 def measure_centres(
     image: np.ndarray,
     camera: Camera,
     ellipses: Ellipses,
-    neighbours: Ellipses,  # all candidates of the image; pixels of near ones are excluded
-    # (n,) patterns, whose circles share the factor for correlation; None: one pattern
+    neighbours: Ellipses,
     groups: np.ndarray | None = None,
 ) -> Centres:
-    """Measures ``ellipses`` in a grey image of 8 or 16 bits."""
+    """Measures ``ellipses`` in a grey image of 8 or 16 bits. ``neighbours``: all candidates; pixels of near ones are
+    excluded. ``groups``: (n,) patterns, whose circles share the factor for correlation; None: one pattern."""
     focal = float(np.sqrt(camera.focal.prod()))
     rims = _fitted(image, camera, ellipses, neighbours)
-    centre, uneven = rims.centre / focal, rims.uneven / focal
-    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, rims.rim >= MIN_RIM
-    factor = np.array([correlation(rims.chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
-    covariance = factor[groups, None, None] * rims.covariance / focal**2
+    centre, uneven, chance = rims.pop("centre") / focal, rims.pop("uneven") / focal, rims.pop("chance")
+    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, rims["rim"] >= MIN_RIM
+    factor = np.array([correlation(chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
+    covariance = factor[groups, None, None] * rims.pop("covariance") / focal**2
     covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     covariance_px2 = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
     # Far beyond any lens, as with k1 = 1e9, rounding leaves negative variances.
     ok &= (np.diagonal(covariance_px2, axis1=1, axis2=2) > 0).all(1)
-    return Centres(
-        centre_px=distorted * camera.focal + camera.centre,
-        centre=centre,
-        shape=rims.shape / focal,
-        covariance_px2=covariance_px2,
-        blur_px=rims.blur,
-        contrast=rims.contrast,
-        noise=rims.noise,
-        rim=rims.rim,
-        uneven_px=(jacobian @ uneven[..., None])[..., 0],
-        domes=rims.domes,
-        ok=ok,
-    )
+    rims |= {"shape": rims["shape"] / focal, "uneven_px": (jacobian @ uneven[..., None])[..., 0]}
+    centre_px = distorted * camera.focal + camera.centre
+    return Centres(centre_px=centre_px, centre=centre, covariance_px2=covariance_px2, ok=ok, **rims)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rims(CircleRows):
-    """n fitted ellipses, ideal px, covariances for independent pixels; contrast and rim are zero if the fit failed."""
-
-    centre: np.ndarray
-    shape: np.ndarray
-    covariance: np.ndarray
-    chance: np.ndarray
-    blur: np.ndarray
-    contrast: np.ndarray
-    noise: np.ndarray
-    rim: np.ndarray
-    uneven: np.ndarray
-    domes: np.ndarray
-
-
-def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> _Rims:
-    """Fits circles of similar size side by side, as many as a processor's cache holds pixels."""
+def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> dict[str, np.ndarray]:
+    """Fits circles of similar size side by side, as many as a processor's cache holds pixels; as :func:`_rims`."""
     half = boxes(ellipses)
     to_ideal = local_ideal_maps(camera, ellipses.centre_px, half)
     masks = intruders(ellipses, neighbours, half)
     size = ellipses.radius_px()
     order = np.argsort(size, kind="stable")
     pixels = np.cumsum(2 * np.pi * size[order] * 2 * BAND_PX)
-    ends = np.flatnonzero(np.diff(pixels // PIXELS_AT_ONCE)) + 1
     parts = [
         _rims(Fits(image, ellipses.select(own), half[own], to_ideal[own], [masks[i] for i in own]))
-        for own in np.split(order, ends)
+        for own in np.split(order, np.flatnonzero(np.diff(pixels // PIXELS_AT_ONCE)) + 1)
     ]
-    return _Rims.concatenate(parts).select(np.argsort(order))
+    return {name: np.concatenate([part[name] for part in parts])[np.argsort(order)] for name in parts[0]}
 
 
-def _rims(fits: Fits) -> _Rims:
-    """Returns the fitted ellipses with noise, rim and covariance."""
+def _rims(fits: Fits) -> dict[str, np.ndarray]:
+    """Returns n fitted ellipses by the names of :class:`Centres`, ideal px; contrast and rim are zero if a fit failed.
+    ``covariance`` is for independent pixels, ``chance`` for :func:`correlation`."""
     n = len(fits.blur)
     near = (np.abs(fits.reduced) * fits.blur[:, None] < np.maximum(1.5, fits.blur)[:, None]) & (fits.real > 0)
     angle = np.arctan2(fits.on_unit[:, 1][near], fits.on_unit[:, 0][near])
@@ -192,17 +158,12 @@ def _rims(fits: Fits) -> _Rims:
         covariance, chance = covariances(fits)
         domes = fits.domes()
     ok = ~fits.failed
-    numbers = (chance, fits.blur, contrast, noise, rim)
-    chance, blur, contrast, noise, rim = (np.where(ok, value, 0.0) for value in numbers)
-    return _Rims(
-        np.where(ok[:, None], fits.centre, fits.start),
-        np.where(ok[:, None, None], np.linalg.inv(fits.inverse_shape), fits.radius[:, None, None] * np.eye(2)),
-        np.where(ok[:, None, None], covariance, np.eye(2)),
-        chance,
-        blur,
-        contrast,
-        noise,
-        rim,
-        np.where(ok[:, None], fits.uneven, 0.0),
-        np.where(ok[:, None] & np.isfinite(domes), domes, 0.0),
-    )
+    one, all_of = ok[:, None], ok[:, None, None]
+    numbers = {"chance": chance, "blur_px": fits.blur, "contrast": contrast, "noise": noise, "rim": rim}
+    return {name: np.where(ok, value, 0.0) for name, value in numbers.items()} | {
+        "centre": np.where(one, fits.centre, fits.start),
+        "shape": np.where(all_of, np.linalg.inv(fits.inverse_shape), fits.radius[:, None, None] * np.eye(2)),
+        "covariance": np.where(all_of, covariance, np.eye(2)),
+        "uneven": np.where(one, fits.uneven, 0.0),
+        "domes": np.where(one & np.isfinite(domes), domes, 0.0),
+    }

@@ -115,16 +115,13 @@ MIN_SIGMA = 0.4
 WAVES = (1, 2, 3)
 """Harmonics around the rim of brightness that the planes do not describe."""
 UNEVEN = 0.004
-"""Amplitude of the third harmonic from which it is relevant, as a share of the contrast: it moves a centre by about 2
-µm in 100."""
+"""Amplitude of the third harmonic from which it matters, as a share of the contrast."""
 UNEVEN_CHI2 = 23.0
-"""χ² of the third harmonic, two degrees of freedom, from which it is significant: a false alarm in one of 100 000
-circles."""
+"""χ² of the third harmonic (two freedoms) from which it is significant: a false alarm in one of 100 000 circles."""
 WAVE_STEPS = 8
 TINY = 1e-9
 CUSP = 0.3
-"""The edge's distance has a cusp in the middle of the ellipse; slopes and waves are kept to what they are at this share
-of the radius."""
+"""Share of the radius below which slopes and waves keep their values: the edge's distance has a cusp in the middle."""
 
 
 class Fits:

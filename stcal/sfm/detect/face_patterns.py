@@ -24,15 +24,13 @@ MIN_SUPPORT = 2
 FIRST_HYPOTHESES = 300
 """Number of the best supported hypotheses of an image that are all grown, so that rivals compete."""
 MAX_TRIES = 8
-"""Number of further hypotheses that are grown from each outline without a reading, as a dim face ranks behind all
-clutter."""
+"""Number of further hypotheses grown from each outline without a reading: a dim face ranks behind all clutter."""
 AT_ONCE = 32
 """Number of hypotheses that are grown side by side, ahead of their turn."""
 MAX_CONTRAST_RATIO = 4.0
 """Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
 MAX_SIZE_RATIO = 1.25
-"""Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter. It
-rejects printed grids of equal discs."""
+"""Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,11 +130,10 @@ def _pairs(target: TargetDesign) -> _Pairs:
     most = max(len(face.ids) for face in target.faces)
     width = min(SUPPORT + 2, most)
     xy, radii_of_face = np.zeros((len(target.faces), most, 2)), np.zeros((len(target.faces), most))
-    for i, face in enumerate(target.faces):
-        n = len(face.ids)
-        xy[i], xy[i, :n], radii_of_face[i, :n] = face.xy_mm[0], face.xy_mm, face.radius_mm
     occurrences: dict[tuple, list] = {}
     for number, face in enumerate(target.faces):
+        n = len(face.ids)
+        xy[number], xy[number, :n], radii_of_face[number, :n] = face.xy_mm[0], face.xy_mm, face.radius_mm
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
         for row in np.argsort(distance, axis=1, kind="stable"):
             nearest = row[:width]
@@ -144,25 +141,17 @@ def _pairs(target: TargetDesign) -> _Pairs:
             same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
             for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(nearest) - 1) + 1):
                 occurrences.setdefault((second, *same), [offset, radius, []])[2].append((number, nearest))
-    offsets, radii = np.zeros((len(occurrences), width, 2)), np.ones((len(occurrences), width))
-    exists = np.zeros((len(occurrences), width), bool)
+    p = len(occurrences)
+    offsets, radii, exists = np.zeros((p, width, 2)), np.ones((p, width)), np.zeros((p, width), bool)
     for i, (offset, radius, _) in enumerate(occurrences.values()):
         offsets[i, : len(radius)], radii[i, : len(radius)], exists[i, : len(radius)] = offset, radius, True
     uses = [use for _, _, uses in occurrences.values() for use in uses]
     circles = np.full((len(uses), width), -1)
     for i, (_, nearest) in enumerate(uses):
         circles[i, : len(nearest)] = nearest
-    return _Pairs(
-        offsets,
-        radii,
-        exists,
-        np.array([second for second, *_ in occurrences], int),
-        np.cumsum([0, *(len(uses) for _, _, uses in occurrences.values())]),
-        np.array([number for number, _ in uses], int),
-        circles,
-        xy,
-        radii_of_face,
-    )
+    seconds, starts = [second for second, *_ in occurrences], [len(of_pair) for _, _, of_pair in occurrences.values()]
+    of_uses = np.cumsum([0, *starts]), np.array([number for number, _ in uses], int), circles
+    return _Pairs(offsets, radii, exists, np.array(seconds, int), *of_uses, xy, radii_of_face)
 
 
 class FaceFinder:
@@ -177,8 +166,7 @@ class FaceFinder:
         if len(candidates) < MIN_NAMING or not self.target.faces:
             return _decide(readings, self.target)
         starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
-        is_open = np.ones(len(starts.origin), bool)
-        explained = np.zeros(len(candidates), bool)
+        is_open, explained = np.ones(len(starts.origin), bool), np.zeros(len(candidates), bool)
         grown: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
         for rank, first in enumerate(starts.origin.tolist()):
             if rank == FIRST_HYPOTHESES:
@@ -186,8 +174,7 @@ class FaceFinder:
                     explained[reading.used()] |= reading.count() >= needed_circles(reading.face)
             if not is_open[rank] or tries[first] == MAX_TRIES or explained[first]:
                 continue
-            if rank >= FIRST_HYPOTHESES:
-                tries[first] += 1
+            tries[first] += rank >= FIRST_HYPOTHESES
             if rank not in grown:
                 wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
                 wanted[list(grown)] = False
@@ -204,13 +191,12 @@ class FaceFinder:
 
     def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
         """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
-        circles = _pairs(self.target)
+        circles, face = _pairs(self.target), starts.face[ranks]
         index = np.stack([starts.index(rank, circles.face_radius.shape[1]) for rank in ranks])
-        face = starts.face[ranks]
-        found, homographies, holds = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
+        found = grow_matches(candidates, index, circles.face_xy[face], circles.face_radius[face])
         size = [len(self.target.faces[number].ids) for number in face.tolist()]
-        grown = [(own[:n], homography) for own, homography, n in zip(found, homographies, size, strict=True)]
-        return {rank: own if sure else None for rank, own, sure in zip(ranks, grown, holds, strict=True)}
+        grown = zip(ranks, *found, size, strict=True)
+        return {rank: (own[:n], homography) if sure else None for rank, own, homography, sure, n in grown}
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
         """Returns faces that appear mirrored in the image; none if a ``named`` face shows that it is not mirrored."""
@@ -244,8 +230,7 @@ class FaceFinder:
 
 
 def _candidate_pairs(candidates: Candidates):
-    """Returns pairs of neighbours of similar shape: first, step to the second if the first is a unit circle, size
-    ratio."""
+    """Returns neighbours of similar shape: first, step to the second if the first is a unit circle, ratio of sizes."""
     k = min(NEIGHBOURS_IN_IMAGE + 1, len(candidates))
     second = candidates.tree.query(candidates.xy, k=k)[1][:, 1:].ravel()
     first = np.repeat(np.arange(len(candidates)), k - 1)

@@ -1,20 +1,32 @@
-"""Labels of all circles: readings of images are compared with the arrangement of their group, then a second look.
+"""Labels of all circles: what a pattern may be is decided by its image, its group, and all groups.
+
+1. An image offers readings (:mod:`.sightings`): of a face that it names one, of a pattern that fits several faces one
+   each, of a board one for each numbering. A pattern in view twice has none: one of the two may be a reflection.
+2. A group decides (:mod:`.group_geometry`): its faces and board are rigid to one another. From the most reliable images
+   arrangements are grown, and the one that explains most circles holds. A reading that fits it gives its labels. One
+   that does not, or of which several fit, gives a note. A face that is turned by more than ``FAR_DEG`` from its rough
+   pose, against most others, is not that face.
+3. All groups decide: faces have the same poses in all of them. A face that most groups have elsewhere goes out.
+4. A second look (:mod:`.predict`) measures circles that must be in view and have no label. What is not as large as
+   its plane asks for, or not where its group has it, goes out. So does a face that one image alone reads, and others,
+   which must show it, do not.
 
 In photographs of the board alone, the camera's motion numbers a plain board, which looks the same after half a turn.
-The numbering of a group's first image is a convention.
+The numbering of a group's first image is a convention. The corners of printed faces name themselves.
 """
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stcal.boards.board_file import board_of
 from stcal.boards.design import CornerBoard
-from stcal.boards.file import run_board_of
-from stcal.boards.target import body_of
+from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.arrays import ByValue, require_arguments
 from stcal.geometry.camera import Camera
@@ -52,17 +64,20 @@ from stcal.sfm.detect.sightings import ImageDetection, PlaneView, Readings, like
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+Named = tuple[str, str, ImageDetection]
+"""Name and group of an image, and what it shows."""
 MIN_EXPECTED = 6
 """Least number of circles that other images must show for their absence to count: as many as identify a face."""
 STEEP_RAD = np.radians(85)
-"""Largest tilt of circles of the first look that are compared with their places. They are not searched for beyond
-``MAX_TILT_RAD``, but may have been found there."""
+"""Largest tilt of circles of the first look that are compared with their places."""
 MIN_CONFIRMED = 0.2
 """Least share of these circles that must be found. A face of which two images show less could not be mapped either."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledImage:
+    """One image with the labels of its circles."""
+
     observations: ImageObservations
     notes: tuple[str, ...]  # on what was excluded
     focus: Focus | None = None  # from which the observations are corrected; None if it has too few circles
@@ -85,14 +100,11 @@ def labelled_image(
 ) -> LabelledImage:
     """Returns the image of labelled circles; identical notes are merged."""
     measured = {f.name: getattr(centres, f.name) for f in fields(ImageObservations)[3:]}
-    observations = ImageObservations(name, group, tuple(labels), **measured)
-    times = Counter(notes)
-    return LabelledImage(observations, tuple(note if n == 1 else _repeatedly(note, n) for note, n in times.items()))
-
-
-def _repeatedly(note: str, times: int) -> Note:
-    code, place = (note.code, note.place) if isinstance(note, Note) else ("", "")
-    return Note(f"{note} ({times} times)", code, place)
+    merged = [
+        note if n == 1 else Note(f"{note} ({n} times)", getattr(note, "code", ""), getattr(note, "place", ""))
+        for note, n in Counter(notes).items()
+    ]
+    return LabelledImage(ImageObservations(name, group, tuple(labels), **measured), tuple(merged))
 
 
 def unlabelled(name: str, group: str, detection: ImageDetection, *notes: str) -> LabelledImage:
@@ -177,8 +189,8 @@ def detect_circles(
         The array is no image, or not of the camera's size.
     """
     grey = grey_of(image, "image")
-    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), body_of(target)
-    board = None if board is None else run_board_of(board)
+    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), target_of(target)
+    board = None if board is None else board_of(board)
     found = detect_image(grey, camera, target, board, options or EllipseOptions())
     circles, labelled = target.with_faces(printed=False), unlabelled("image", "", found)
     if circles.faces or board is not None:
@@ -219,14 +231,14 @@ def label_images(
     cache: Path,
     workers: int | None = None,
 ) -> list[LabelledImage]:
-    """Returns the labelled circles of all images, in the order of their groups."""
-    circles = target.with_faces(printed=False)
+    """Returns the labelled circles and corners of all images, in the order of their groups."""
+    circles, groups = target.with_faces(printed=False), _groups(detection)
+    files = {image.file.name: image for image in detection.images}
     if circles.faces or board is not None:
-        labelled = _label_circles(detection, circles, board, options, cache, workers)
+        labelled = _in_two_looks(files, groups, detection.camera, circles, board, options, cache, workers)
     else:
-        labelled = [unlabelled(*image) for _, images in _groups(detection) for image in images]
-    by_name = {image.file.name: image.detection for image in detection.images}
-    return [_with_corners(image, by_name[image.observations.name], target) for image in labelled]
+        labelled = [unlabelled(*image) for images in groups for image in images]
+    return [_with_corners(image, files[image.observations.name].detection, target) for image in labelled]
 
 
 def _with_corners(image: LabelledImage, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
@@ -236,36 +248,34 @@ def _with_corners(image: LabelledImage, detection: ImageDetection, target: Targe
     return image.plus(labels, detection.centres.select(np.concatenate(rows)), ()) if rows else image
 
 
-def _label_circles(
-    detection: DetectionResult,
+def _in_two_looks(
+    files: Mapping[str, DetectedImage],
+    groups: Sequence[Sequence[Named]],
+    camera: Camera,
     target: TargetDesign,
     board: BoardDesign | None,
     options: EllipseOptions,
     cache: Path,
-    workers: int | None = None,
+    workers: int | None,
 ) -> list[LabelledImage]:
     """Returns the labelled circles of all images, in the order of their groups."""
-    camera, groups = detection.camera, _groups(detection)
-    named, focal_px = [images for _, images in groups], float(np.sqrt(camera.focal.prod()))
-    board = in_scale(named, target, board)
+    board = in_scale(groups, target, board)
+    focal_px, patterns = float(np.sqrt(camera.focal.prod())), patterns_of(target, board)
     dots = None if isinstance(board, CornerBoard) else board  # corners are not searched at predicted places
-    patterns = patterns_of(target, board)
+    sought = patterns_of(target, dots)
     first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
-    for (members, _), labelled in zip(groups, label_groups(named, target, board, focal_px), strict=True):
+    for labelled in label_groups(groups, target, board, focal_px):
         group, arrangement = _without_outlying(*labelled, patterns, focal_px)
-        for i, (image, labels) in enumerate(zip(members, group, strict=True)):
-            seen = labels.observations
+        for i, pose in arrangement.camera_from_group.items():
+            seen, planes = group[i].observations, arrangement.group_from_plane
             predicted, steep = (
-                predict_circles(arrangement, i, seen.labels, target, dots, camera, tilt)
-                for tilt in (MAX_TILT_RAD, STEEP_RAD)
+                predict_circles(pose, planes, seen.labels, sought, camera, tilt) for tilt in (MAX_TILT_RAD, STEEP_RAD)
             )
-            if predicted is None or steep is None:
-                continue
             wrong = contradictions(steep, seen, camera)
-            group[i] = labels.without(wrong, contradicted_notes(wrong))
+            group[i] = group[i].without(wrong, contradicted_notes(wrong))
             if predicted.wanted.any():
-                jobs.append((image, predicted))
+                jobs.append((files[seen.name], predicted))
         first_looks.append((group, arrangement))
     looks = look_again(jobs, camera, options, cache, workers)
     second = [_without_outlying(_second(group, looks), known, patterns, focal_px)[0] for group, known in first_looks]
@@ -274,18 +284,16 @@ def _label_circles(
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
     """Labels all images as :func:`label_images`, without a second look."""
-    groups = [named for _, named in _groups(detection)]
+    groups, focal_px = _groups(detection), float(np.sqrt(detection.camera.focal.prod()))
     board = in_scale(groups, target, board)
-    focal_px = float(np.sqrt(detection.camera.focal.prod()))
     return [each for found, _ in label_groups(groups, target, board, focal_px) for each in found]
 
 
-def _groups(detection: DetectionResult) -> list[tuple[list[DetectedImage], list[tuple[str, str, ImageDetection]]]]:
-    """Returns the images of each group, and their (name, group, detection)."""
-    groups: dict[str, list[DetectedImage]] = {}
+def _groups(detection: DetectionResult) -> list[list[Named]]:
+    groups: dict[str, list[Named]] = {}
     for image in detection.images:
-        groups.setdefault(image.file.group, []).append(image)
-    return [(members, [(i.file.name, i.file.group, i.detection) for i in members]) for members in groups.values()]
+        groups.setdefault(image.file.group, []).append((image.file.name, image.file.group, image.detection))
+    return list(groups.values())
 
 
 def _without_outlying(
@@ -299,11 +307,18 @@ def _without_outlying(
 
 def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[LabelledImage]:
     """Adds the circles of the second look, and removes faces of a single image that others must show and do not."""
-    images = []
-    for image in group:
-        look = looks.get(image.observations.name)
-        images.append(image if look is None else image.plus(look.labels, look.centres, missed_notes(look.missed)))
-    for face, found, expected in _unconfirmed(group, looks):
+    faces = [image.observations.face_ids() for image in group]
+    own = [looks.get(image.observations.name) for image in group]
+    images = [
+        image if look is None else image.plus(look.labels, look.centres, missed_notes(look.missed))
+        for image, look in zip(group, own, strict=True)
+    ]
+    for face in [face for face, count in Counter(chain.from_iterable(faces)).items() if count == 1]:
+        others = [look for shown, look in zip(faces, own, strict=True) if look is not None and face not in shown]
+        found = sum(label.plane == face for look in others for label in look.labels)
+        expected = found + sum(label.plane == face for look in others for label in look.missed)
+        if expected < MIN_EXPECTED or found >= MIN_CONFIRMED * expected:
+            continue
         read = f"face {face}: read in one image of the group alone, {found} of {expected} of its circles found"
         note = f"{read} that other images must show; left out, it is a reflection or another object, or hidden there"
         for i, image in enumerate(images):
@@ -312,28 +327,12 @@ def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[La
     return images
 
 
-def _unconfirmed(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[tuple[str, int, int]]:
-    """Returns unconfirmed faces of single images, with the numbers of circles found and expected in other images."""
-    read = Counter(face for image in group for face in image.observations.face_ids())
-    unconfirmed = []
-    for face in [face for face, images in read.items() if images == 1]:
-        others = [e.observations.name for e in group if face not in e.observations.face_ids()]
-        looks_of_others = [looks[name] for name in others if name in looks]
-        confirmed = sum(label.plane == face for look in looks_of_others for label in look.labels)
-        expected = confirmed + sum(label.plane == face for look in looks_of_others for label in look.missed)
-        if expected >= MIN_EXPECTED and confirmed < MIN_CONFIRMED * expected:
-            unconfirmed.append((face, confirmed, expected))
-    return unconfirmed
-
-
 OTHER_SIZE, CLEARER = 0.005, 3.0
 """Relative difference of the board's size from what the faces say, and by how many times it must put the board better
 at one place against each face, for images to be labelled with it."""
 
 
-def in_scale(
-    groups: Sequence[Sequence[tuple[str, str, ImageDetection]]], target: TargetDesign, board: BoardDesign | None
-) -> BoardDesign | None:
+def in_scale(groups: Sequence[Sequence[Named]], target: TargetDesign, board: BoardDesign | None) -> BoardDesign | None:
     """Returns the board in the size at which its middle stays at one place against each face of a group. With another
     size, it seems to move from image to image; that the drawing has another is for the checks to say."""
     if board is None:
@@ -364,7 +363,7 @@ def in_scale(
 
 
 def label_groups(
-    groups: Sequence[Sequence[tuple[str, str, ImageDetection]]],
+    groups: Sequence[Sequence[Named]],
     target: TargetDesign,
     board: BoardDesign | None,
     focal_px: float,
@@ -404,19 +403,19 @@ def _labelled(
         shown = f"the image is mirrored: it shows face {', '.join(detection.mirrored)} as a mirror does"
         remedy = "left out, turn it back, or use the file that the camera wrote"
         return unlabelled(name, group, detection, f"{shown}; {remedy}")
-    notes = [*detection.notes, *_repeated(detection)]
     if image in arrangement.views:
         views = list(arrangement.views[image])
-        notes += [_contradiction(each) for each in arrangement.contradicted.get(image, ())]
-        notes += [_open(each) for each in arrangement.open.get(image, ())]
-        notes += [_foreign(each) for each in arrangement.foreign.get(image, ())]
+        notes = [_left_out(each, ELSEWHERE) for each in arrangement.contradicted.get(image, ())]
+        notes += [_left_out(each) for each in arrangement.open.get(image, ())]
+        notes += [_left_out([each], FOREIGN) for each in arrangement.foreign.get(image, ())]
     else:
         times = Counter(each[0].plane for each in readings if each[0].named)
         views = [each[0] for each in readings if len(each) == 1 and each[0].named and times[each[0].plane] == 1]
-        notes += [_open(each) for each in readings if len(each) > 1 or not each[0].named]
+        notes = [_left_out(each) for each in readings if len(each) > 1 or not each[0].named]
     labels = [label for view in views for label in view.labels]
     rows = np.concatenate([view.rows for view in views]) if views else np.zeros(0, int)
     order = np.argsort(rows, kind="stable")
+    notes = [*detection.notes, *_repeated(detection), *notes]
     return labelled_image(name, group, [labels[k] for k in order], detection.centres.select(rows[order]), notes)
 
 
@@ -424,37 +423,35 @@ def _repeated(detection: ImageDetection) -> list[str]:
     return [f"{what} found more than once; left out, one may be a reflection" for what in detection.repeated]
 
 
-def _contradiction(views: Readings) -> str:
-    view = views[0]
+FOREIGN = "foreign"
+
+
+def _left_out(views: Readings, why: str = "") -> str:
+    """Returns the note on a pattern without labels; ``why`` : ELSEWHERE or FOREIGN; else several numberings fit."""
+    view, dots = views[0], f"board of {len(views[0].rows)} dots"
+    if why == FOREIGN:
+        return Note(
+            f"a pattern like face {view.plane}: not where other groups see that face against the others, or turned "
+            f"from its rough_pose by more than {FAR_DEG:.0f}°; left out, it is a reflection or another object, "
+            "the image is mirrored, or rough_pose is wrong",
+            ELSEWHERE,
+            view.plane,
+        )
     if not view.named:
-        return _open(views)
-    is_board = view.plane == BOARD
-    name = f"a board of {len(view.rows)} dots" if is_board else f"a pattern like face {view.plane}"
+        return open_face_note(len(view.rows), (view.plane for view in views))
+    if why == ELSEWHERE:
+        is_board = view.plane == BOARD
+        name = f"a {dots}" if is_board else f"a pattern like face {view.plane}"
+        return Note(
+            f"{name}: not where the group's other images see it; left out, it is a reflection or another object, or "
+            "the photograph is of another group or of a body that was moved",
+            BOARD_LEFT_OUT if is_board else ELSEWHERE,
+            view.plane,
+        )
     return Note(
-        f"{name}: not where the group's other images see it; left out, it is a reflection or another object, or the "
-        "photograph is of another group or of a body that was moved",
-        BOARD_LEFT_OUT if is_board else ELSEWHERE,
-        view.plane,
-    )
-
-
-def _open(views: Readings) -> str:
-    if not views[0].named:
-        return open_face_note(len(views[0].rows), (view.plane for view in views))
-    return Note(
-        f"board of {len(views[0].rows)} dots left out: {len(views)} numberings fit, none keeps it where the group's "
-        "other images see it; show a face that they show, or check that nothing was moved",
+        f"{dots} left out: {len(views)} numberings fit, none keeps it where the group's other images see it; show a "
+        "face that they show, or check that nothing was moved",
         BOARD_LEFT_OUT,
-    )
-
-
-def _foreign(view: PlaneView) -> str:
-    return Note(
-        f"a pattern like face {view.plane}: not where other groups see that face against the others, or turned from "
-        f"its rough_pose by more than {FAR_DEG:.0f}°; left out, it is a reflection or another object, "
-        "the image is mirrored, or rough_pose is wrong",
-        ELSEWHERE,
-        view.plane,
     )
 
 
@@ -477,29 +474,26 @@ def is_board_alone(detection: DetectionResult) -> bool:
 def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
     """Returns the labelled dots of all images, in the order of their groups."""
     labelled = []
-    for images, named in _groups(detection):
-        chosen, reasons = _numbered([_views(image, target, board) for image in images])
-        for i, (name, group, found) in enumerate(named):
+    for images in _groups(detection):
+        chosen, reasons = _numbered([_views(image, target, board) for _, _, image in images])
+        for i, (name, group, found) in enumerate(images):
             notes = [*found.notes, *([reasons[i]] if i in reasons else [])]
             labels, rows = (chosen[i].labels, chosen[i].rows) if i in chosen else ((), np.zeros(0, int))
             labelled.append(labelled_image(name, group, labels, found.centres.select(rows), notes))
     return without_defocus(labelled, detection.camera, patterns_of(target, board))
 
 
-def _views(image: DetectedImage, target: TargetDesign, board: BoardDesign) -> list[PlaneView] | str:
+def _views(detection: ImageDetection, target: TargetDesign, board: BoardDesign) -> list[PlaneView] | str:
     """Returns the symmetric numberings of the only board of an image, or why there are none."""
-    if not image.detection.boards:
-        return ""
-    if image.detection.board is None:
-        return "board found more than once; left out"
-    readings = likely_views(readings_of(image.detection, target, board))
-    boards = [each for each in readings if each and each[0].plane == BOARD]
+    if detection.board is None:
+        return "board found more than once; left out" if detection.boards else ""
+    boards = [each for each in likely_views(readings_of(detection, target, board)) if each and each[0].plane == BOARD]
     views = max(boards, key=lambda v: len(v[0].rows), default=[])
     if not views:
         return f"a board without a pose; {UNNUMBERED}"
     if not all(_is_symmetry(views[0].camera_from_plane.inverse() @ v.camera_from_plane, board) for v in views):
         return Note(f"board of {len(views[0].rows)} dots: {len(views)} numberings fit; {UNNUMBERED}", BOARD_LEFT_OUT)
-    return list(views)
+    return views
 
 
 def _is_symmetry(difference: Rigid, board: BoardDesign) -> bool:

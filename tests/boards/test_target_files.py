@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stcal.boards.board_file import board_toml, load_dots
+from stcal.boards.target_file import load_target, target_toml
 from stcal.design import MIN_SINE, BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
-from stcal.io.design import board_toml, load_board, load_target, target_toml
 from tests.outcome import fails_with
 
 ROUNDED_MM = 1e-9
@@ -50,7 +51,7 @@ def target_of(tmp_path, content: str | bytes) -> TargetDesign:
 def board_of(tmp_path, content: str | bytes) -> BoardDesign:
     path = tmp_path / "board.toml"
     path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return load_board(path)
+    return load_dots(path)
 
 
 def changed(old: str, new: str, text: str = TARGET) -> str:
@@ -272,7 +273,7 @@ def test_a_wrong_board_is_named_in_one_line(tmp_path, case):
     assert_refused(lambda content: board_of(tmp_path, content), *WRONG_BOARDS[case])
 
 
-@pytest.mark.parametrize("load", [load_target, load_board])
+@pytest.mark.parametrize("load", [load_target, load_dots])
 @pytest.mark.parametrize(
     ("name", "message"), [(".", "E-FILE-UNREADABLE … Is a directory"), ("missing.toml", "E-FILE-UNREADABLE")]
 )
@@ -290,4 +291,4 @@ def test_corner_radii_at_the_bounds_are_taken(tmp_path, radius_mm):
 def test_another_kind_of_board_is_named(tmp_path, text):
     (tmp_path / "board").write_text(text)
     with fails_with("E-BOARD-TYPE … board of dots needed … calibrate-camera"):
-        load_board(tmp_path / "board")
+        load_dots(tmp_path / "board")

@@ -10,17 +10,15 @@ from stcal.boards.chessboard import find_charuco, find_chessboard, why_no_chessb
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
 from stcal.boards.tags import APART_PX, find_aprilgrid, find_tags, seen_otherwise, view_of_tags
-from stcal.boards.target import tags_on
+from stcal.boards.target_file import tags_on
 from stcal.design import FaceDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.images import ImageFile, decode, grey_of
 from stcal.labels import BOARD
 
-MOST_READ = 12
-"""Largest number of images in which tags of no face are looked for."""
-LOOKED_AT = 5
-"""Number of images in which other tags are looked for."""
+MOST_READ, LOOKED_AT = 12, 5
+"""Largest numbers of images in which tags of no face, and tags of other kinds, are looked for."""
 MOST_TILT_DEG = 70.0
 LEAST_COSINE = float(np.cos(np.radians(MOST_TILT_DEG)))
 """Largest tilt, and its cosine, beyond which the corners of a tag are left out, as its edges meet at sharp angles:
@@ -30,36 +28,39 @@ drawn tags had errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px 
 def find_on_faces(
     image: np.ndarray, name: str, boards: Mapping[str, FlatBoard], camera: Camera
 ) -> tuple[dict[str, BoardView], list[str]]:
-    """Return the views of the boards and tags in a grey image by face, and notes on what was left out.
-
-    Each dictionary is searched once for all faces: a face of which no tag is read is not searched for corners.
-    """
+    """Return the views of the boards and tags in a grey image by face, and notes on what was left out. Each dictionary
+    is searched once for all faces: a face of which no tag is read is not searched for corners."""
     of_layouts = [d for board in boards.values() if isinstance(board, TagLayout) for d, _ in board.tags]
     of_charuco = [board.dictionary for board in boards.values() if isinstance(board, CharucoDesign)]
     tags = find_tags(image, (*of_layouts, *of_charuco), windows_px=APART_PX)
     read = {*tags.tags, *tags.repeated}
+
+    def charuco(board: CharucoDesign) -> tuple[BoardView | None, str]:
+        if not any((board.dictionary, tag) in read for tag in board.tag_ids()):
+            return None, f"no tag of {board.dictionary}"
+        return find_charuco(image, name, board), ""
+
+    def chessboard(board: ChessboardDesign) -> tuple[BoardView | None, str]:
+        view = find_chessboard(image, name, board, with_sigma=True)
+        return view, "" if view else why_no_chessboard(image, board)
+
+    finders = {
+        TagLayout: lambda board: (view_of_tags(name, tags, board), ""),
+        CharucoDesign: charuco,
+        ChessboardDesign: chessboard,
+        AprilGridDesign: lambda board: find_aprilgrid(image, name, board, camera),
+    }
     views: dict[str, BoardView] = {}
     notes: list[str] = []
     for face, board in boards.items():
         view, why, oblique = None, "", ""
         try:
-            if isinstance(board, TagLayout):
-                view, oblique = _not_oblique(view_of_tags(name, tags, board))
-                view = straightened(view, camera)
-            elif isinstance(board, CharucoDesign):
-                if any((board.dictionary, tag) in read for tag in board.tag_ids()):
-                    view = find_charuco(image, name, board)
-                elif face == BOARD:
-                    why = f"no tag of {board.dictionary}"
-            elif isinstance(board, ChessboardDesign):
-                view = find_chessboard(image, name, board, with_sigma=True)
-                why = "" if view else why_no_chessboard(image, board)
-            elif isinstance(board, AprilGridDesign):
-                found, why = find_aprilgrid(image, name, board, camera)
-                view, oblique = _not_oblique(found)
+            view, why = finders[type(board)](board)
+            if isinstance(board, TagLayout | AprilGridDesign):
+                view, oblique = _not_oblique(view)
                 view = straightened(view, camera)
         except StcalError as error:  # corners on a line, say
-            why = f"left out, {error}"
+            view, why = None, f"left out, {error}"
         where = BOARD if face == BOARD else f"face {face}"
         notes += [f"{where}: {oblique}"] if oblique else []
         if view is not None:
@@ -97,9 +98,7 @@ def straightened(view: BoardView | None, camera: Camera) -> BoardView | None:
 
 def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
     """Returns how far the lens moves the measured corners (n, 4, 2) of tags: straight lines are laid along its curves.
-
-    A line along an edge of 100 px near the border of an image is off its ends by 0.1 px with usual lenses.
-    """
+    A line along an edge of 100 px near the border of an image is off its ends by 0.1 px with usual lenses."""
     ideal = camera.normalised_from_pixel(corners_px)
     step = (np.roll(ideal, -1, axis=1) - ideal)[:, :, None]
     edge = camera.pixel_from_normalised(ideal[:, :, None] + np.linspace(*ALONG, POINTS)[:, None] * step)

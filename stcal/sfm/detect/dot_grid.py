@@ -40,7 +40,6 @@ class BoardReading:
 
     candidates: np.ndarray  # (n,) the dots found
     numberings: np.ndarray  # (k, n, 2) row and column, by numbering that the image admits, the likeliest first
-    homographies: np.ndarray  # (k, 3, 3) from the board plane (mm) into normalised coordinates
     unlikely: np.ndarray  # (u, n, 2) further numberings, that hold where dots are covered
 
 
@@ -68,23 +67,21 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
 def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
     """Returns the largest grid grown from any of the seeds; a complete one ends the search."""
     best: dict[int, tuple[int, int]] = {}
-    inside, nearly_all = np.zeros(len(candidates), int), NEARLY_ALL * len(board.cells())
+    inside = np.zeros(len(candidates), int)
     for seed in seeds:
         # A dot that has been in two grids is not likely to start a better third one.
         if not free[seed] or inside[seed] >= 2:
             continue
         cells = _grow(candidates, links, steps, seed, free, board)
         inside[list(cells)] += 1
-        if len(cells) > len(best):
-            best = cells
-        if len(best) >= nearly_all:
+        best = max(best, cells, key=len)
+        if len(best) >= NEARLY_ALL * len(board.cells()):
             break
     return best
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (n, 4 or 6) neighbours one pitch away, −1 for none, in the directions on which most agree, and (n, 2, 2)
-    steps. Distances are taken in coordinates that map the candidate to a circle of the board's radius."""
+    """Returns (n, 4 or 6) neighbours one pitch away, −1 for none, by direction, and the steps (n, 2, 2) to them."""
     n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
     neighbours = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
@@ -186,26 +183,35 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
         uv, homography = uv[:, ::-1], homography @ mirror
     if len(uv) < max(MIN_SHARE * len(board.cells()), MIN_SIDE**2):
         return None
-    placements: list[_Placement] = []
-    for turn in range(directions(board)):
-        placements += _place(candidates, uv, index, turn, board, homography, image_corners)
-    placements.sort(key=lambda p: p.unexplained)
-    return _reading(placements, index, candidates, board) if placements else None
+    placements = _placements(candidates, uv, index, board, homography, image_corners)
+    if not placements:
+        return None
+    most = placements[0][0] + MAX_UNEXPLAINED
+    likely = [(inside, cells) for unexplained, inside, cells in placements if unexplained <= most]
+    common = np.logical_and.reduce([inside for inside, _ in likely])
+    index = index[common]
+    numberings = np.stack([cells[common] for _, cells in likely])
+    further = [cells[common] for count, inside, cells in placements if count > most and inside[common].all()]
+    return BoardReading(index, numberings, np.array(further, int).reshape(-1, len(index), 2))
 
 
-def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
-    """Reading with the numberings that put the board's dots with a hole where the 8-bit image shows holes."""
+def by_rings(
+    reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera, xy: np.ndarray
+) -> BoardReading:
+    """Reading with the numberings that put dots with a hole where the 8-bit image shows one; ``xy``: all candidates."""
     angle = np.arange(0, 2 * np.pi, np.pi / 8)
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     cells = board.cells()
     rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
     middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
     wrong = []
-    for homography in reading.homographies:
+    for numbering in reading.numberings:
+        xy_mm = board.pitch_mm * board.flat(numbering[:, ::-1].astype(float))
+        homography = fit_homography(xy_mm, xy[reading.candidates])
         values = []
         for share in RING_SHARES:
-            xy = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
-            px = camera.project(np.column_stack([xy, np.ones(len(xy))]))
+            rim = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
+            px = camera.project(np.column_stack([rim, np.ones(len(rim))]))
             sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
             values.append(sampled.reshape(len(cells), -1).mean(1))
         inside = ((px > 0) & (px < np.array(grey.shape[::-1]) - 1)).all(1).reshape(len(cells), -1).all(1)
@@ -215,7 +221,7 @@ def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera
     kept = [i for i, count in enumerate(wrong) if count == min(wrong)]
     if min(wrong) > MOST_WRONG:
         return reading
-    return replace(reading, numberings=reading.numberings[kept], homographies=reading.homographies[kept])
+    return replace(reading, numberings=reading.numberings[kept])
 
 
 RING_SHARES = (0.15, 0.75, 1.25)
@@ -246,46 +252,36 @@ def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
     return homography
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placement:
-    """One placement of the board over n dots."""
-
-    unexplained: int  # number of dots outside of it, or expected and missing
-    inside: np.ndarray  # (n,) those on it
-    cells: np.ndarray  # (n, 2) their row and column
-
-
-def _place(
-    candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners
-) -> list[_Placement]:
-    """Returns the placements of the grid turned by ``turn`` of the board's directions."""
-    turned = uv @ _turn(board, turn).T
-    size = np.array([board.columns, board.rows])
-    all_cells = board.cells()[:, ::-1]
+def _placements(
+    candidates: Candidates, uv, index, board: BoardDesign, homography, image_corners
+) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Returns the placements of the board over the grid, the likeliest first: number of dots that are outside of it, or
+    expected and missing; mask of the dots on it; their row and column."""
+    size, all_cells = np.array([board.columns, board.rows]), board.cells()[:, ::-1]
     has_dot = np.zeros(size[::-1], bool)
     has_dot[tuple(all_cells[:, ::-1].T)] = True
-    large = _large_dots(candidates, uv, index, board, homography)
+    large = np.zeros(len(uv), bool)
+    if board.corner is not None and board.corner_radius_mm is not None:
+        ratio = candidates.radius[index] / _step(homography, board.flat(uv))
+        large = ratio / np.median(ratio) > 1 + CORNER_MARGIN * (board.corner_radius_mm / board.radius_mm - 1)
     placements = []
-    for offset in _offsets(turned, size):
-        column_row = turned + offset
-        inside = ((column_row >= 0) & (column_row < size)).all(1)
-        inside[inside] = has_dot[tuple(column_row[inside, ::-1].T)]
-        outside_count = (~inside).sum()
-        if outside_count > MAX_UNEXPLAINED:
-            continue
-        if board.corner is not None:
-            at_corner = (column_row == board.corner[::-1]).all(1)
-            if (large != at_corner)[inside].any():
+    for turn in range(directions(board)):
+        turned = uv @ _turn(board, turn).T
+        for offset in _offsets(turned, size):
+            column_row = turned + offset
+            inside = ((column_row >= 0) & (column_row < size)).all(1)
+            inside[inside] = has_dot[tuple(column_row[inside, ::-1].T)]
+            outside_count = (~inside).sum()
+            at_corner = np.zeros(len(uv), bool) if board.corner is None else (column_row == board.corner[::-1]).all(1)
+            if outside_count > MAX_UNEXPLAINED or (large != at_corner)[inside].any():
                 continue
-        grid_cells = (all_cells - offset) @ _turn(board, -turn).T
-        occupied = np.zeros_like(has_dot)
-        occupied[tuple(column_row[inside, ::-1].T)] = True
-        missing = ~occupied[tuple(all_cells[:, ::-1].T)]
-        absent = board.flat(grid_cells[missing])
-        expected = _inside_image(homography, absent, image_corners)
-        unexplained = int(expected.sum() + outside_count)
-        placements.append(_Placement(unexplained, inside, column_row[:, ::-1]))
-    return placements
+            occupied = np.zeros_like(has_dot)
+            occupied[tuple(column_row[inside, ::-1].T)] = True
+            missing = ~occupied[tuple(all_cells[:, ::-1].T)]
+            absent = board.flat((all_cells - offset)[missing] @ _turn(board, -turn).T)
+            expected = _inside_image(homography, absent, image_corners)
+            placements.append((int(expected.sum() + outside_count), inside, column_row[:, ::-1]))
+    return sorted(placements, key=lambda each: each[0])
 
 
 def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -297,36 +293,16 @@ def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), -1).reshape(-1, 2)
 
 
-def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homography) -> np.ndarray:
-    """Returns the mask of the dots that are as large as the larger corner dot."""
-    if board.corner is None or board.corner_radius_mm is None:
-        return np.zeros(len(uv), bool)
-    local = np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, board.flat(uv)))))
-    size = candidates.radius[index] / local
-    return size / np.median(size) > 1 + CORNER_MARGIN * (board.corner_radius_mm / board.radius_mm - 1)
+def _step(homography: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Returns the mean length of a step at the places ``uv``, in normalised coordinates."""
+    return np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
 
 
 def _inside_image(homography: np.ndarray, uv: np.ndarray, image_corners: np.ndarray) -> np.ndarray:
     """Returns the mask of the predicted dots that lie in the image with their whole rim and some margin."""
     xy = apply_homography(homography, uv)
-    margin = 0.35 * np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
     edge = np.roll(image_corners, -1, axis=0) - image_corners
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.linalg.norm(edge, axis=1)[:, None]
     normal *= np.sign((image_corners.mean(0) - image_corners[0]) @ normal[0])
     distance = np.einsum("ned,ed->ne", xy[:, None] - image_corners, normal)
-    return (distance > margin[:, None]).all(1)
-
-
-def _reading(
-    placements: list[_Placement], index: np.ndarray, candidates: Candidates, board: BoardDesign
-) -> BoardReading:
-    """Returns the dots that all likely placements number, their numberings, homographies and unlikely numberings."""
-    most = placements[0].unexplained + MAX_UNEXPLAINED
-    likely = [p for p in placements if p.unexplained <= most]
-    common = np.logical_and.reduce([p.inside for p in likely])
-    index = index[common]
-    numberings = np.stack([p.cells[common] for p in likely])
-    places = [board.pitch_mm * board.flat(n[:, ::-1].astype(float)) for n in numberings]
-    homographies = [fit_homography(xy_mm, candidates.xy[index]) for xy_mm in places]
-    further = [p.cells[common] for p in placements if p.unexplained > most and p.inside[common].all()]
-    return BoardReading(index, numberings, np.stack(homographies), np.array(further, int).reshape(-1, len(index), 2))
+    return (distance > 0.35 * _step(homography, uv)[:, None]).all(1)
