@@ -42,7 +42,7 @@ def timed_advice() -> float:
     from stcal.sfm.adjust.joint import covariance_of
     from stcal.sfm.planning.advise import Known, advise
     from stcal.sfm.planning.forecast import CentreNoise, Setup, observe, true_models
-    from stcal.sfm.planning.views import known_scene
+    from stcal.sfm.planning.planned_views import known_scene
     from stcal.synthetic.scene import SceneOptions, make_scene
 
     scene = make_scene(SceneOptions(images_per_group=ADVISED // GROUPS))

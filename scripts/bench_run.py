@@ -178,7 +178,7 @@ def timed_following(film: Path, scene) -> tuple[float, float]:
     from stcal.io.images import decode
     from stcal.sfm import MeasureOptions, Tracker
     from stcal.sfm import measure as measure_images
-    from stcal.sfm.measurement.target import TargetCircles
+    from stcal.sfm.measurement.known_target import TargetCircles
 
     labels, radius = tuple(scene.circles_target), scene.target.radius_of()
     xyz = np.array([scene.circles_target[label] for label in labels])

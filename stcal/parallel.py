@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, cached_property
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TypeVar
@@ -119,7 +119,7 @@ def run_parallel(
             yield i, function(*job)
         return
     with contextlib.nullcontext(kept) if kept else _Processes(workers) as processes:
-        yield from processes.run(function, jobs)
+        yield from hand_over(processes.pool, function, jobs, AT_ONCE * processes.workers)
 
 
 def run_in_order(
@@ -170,27 +170,25 @@ class _Processes:
 
     def __init__(self, workers: int):
         self.workers = workers
-        self._pool: ProcessPoolExecutor | None = None
         self._others = multiprocessing.active_children()
 
-    def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
-        if self._pool is None:
-            with _starting():
-                self._pool = ProcessPoolExecutor(self.workers, _context(), _follow_parent, (_sockets(),))
-        return hand_over(self._pool, function, jobs, AT_ONCE * self.workers)
+    @cached_property
+    def pool(self) -> ProcessPoolExecutor:
+        with _starting():
+            return ProcessPoolExecutor(self.workers, _context(), _follow_parent, (_sockets(),))
 
     def __enter__(self) -> "_Processes":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
-        if self._pool is None:
+        if "pool" not in vars(self):
             return
         if kind is not None and not issubclass(kind, Exception):  # asked to end: half-done work is of no use
             for process in multiprocessing.active_children():
                 if process not in self._others:
                     process.terminate()
         # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self.pool.shutdown(wait=True, cancel_futures=True)
 
 
 _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from stcal.boards.faces import shift_by_curves, straightened
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
@@ -32,31 +32,22 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.image_jobs import run_on_images
-from stcal.io.images import (
-    MAJORITY,
-    TOP_GROUP,
-    ImageFile,
-    Skipped,
-    common_size,
-    decode,
-    find_images,
-    grey_8bit,
-    size_fault,
-)
+from stcal.io.images import TOP_GROUP, ImageFile, Skipped, find_images, grey_8bit
 from stcal.labels import DotLabel
 from stcal.locate.calibration import CalibrationImages
 from stcal.parallel import Progress
-from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
 from stcal.sfm.detect.defocus import correct_defocus
+from stcal.sfm.detect.files import load_image, sized_by
 from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.labels import labelled_image
 
 CENTRING_ROUNDS = 3
 """Rounds of the correction for the ellipses' centres. The error of the pose from these centres is less than a
 thousandth of the correction; two rounds would be enough."""
 CORNER_SIGMA_PX = 0.1
-"""σ of corners whose detector states none, where they are used with boards whose detector does."""
+"""σ of corners whose detector states none."""
 NEAREST = 6
 """Number of outlines about a circle, one of which is its neighbour."""
 MIN_SHARE = 0.35
@@ -74,7 +65,6 @@ KINDS = {
 
 
 def kind_of(board: Board) -> str:
-    """Returns the name of the board's kind in messages."""
     return f"{len(board.boards)} boards" if isinstance(board, BoardSet) else KINDS[type(board)]
 
 
@@ -106,24 +96,23 @@ def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tu
         views.append(replace(view, ids=view.ids + first, xyz_board=xyz, normal=normal, unused=unused))
     if not views:
         return None, "; ".join(reasons)
-    # A board whose detector states no covariances gets the default, since the other boards have theirs.
-    covariances = [
-        np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
-        if view.covariance_px2 is None
-        else view.covariance_px2
-        for view in views
-    ]
     ids, xyz, xy, normals = (
         np.concatenate([getattr(view, part) for view in views]) for part in ("ids", "xyz_board", "xy_px", "normal")
     )
     unused = (*(reason for view in views for reason in view.unused), *reasons)
-    return BoardView(name, ids, xyz, xy, np.concatenate(covariances), normals, unused), ""
+    return BoardView(name, ids, xyz, xy, np.concatenate([*map(covariance_px2, views)]), normals, unused), ""
+
+
+def covariance_px2(view: BoardView) -> np.ndarray:
+    """Returns the covariances (k, 2, 2) of a view's points, or that of corners if their detector states none."""
+    if view.covariance_px2 is None:
+        return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
+    return view.covariance_px2
 
 
 def _find_flat(
     image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
 ) -> tuple[BoardView | None, str]:
-    """Returns the view of a single board, or the reason why there is none."""
     if isinstance(board, BoardDesign):
         place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
         return _find_circles(image, name, camera, board, board, place)
@@ -143,7 +132,6 @@ def _find_flat(
 
 
 def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
-    """Returns the reason why there are no corners, as far as the tags show it."""
     ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
     few, board_ids = "fewer than 4 corners of the ChArUco board", board.tag_ids()
     if not ids:
@@ -153,17 +141,25 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
         return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}" + (
             f" from {board_ids[0]}" if board_ids[0] else ""
         )
-    turned = replace(board, rows=board.columns, columns=board.rows)
-    others = [replace(own, legacy=legacy) for own in (board, turned) for legacy in (False, True)]
-    found = [(len(view), other) for other in others if (view := find_charuco(image, "", other)) is not None]
-    if not found:
-        return f"{few}, but {len(ids)} of its tags, not where rows and columns of its file put them; correct them"
-    _, fits = max(found, key=itemgetter(0))
-    legacy = f", legacy = {str(fits.legacy).lower()}" if fits.legacy != board.legacy else ""
-    return (
-        f"{few}, but {len(ids)} of its tags, as on a board of rows = {fits.rows}, columns = {fits.columns}{legacy}; "
-        "correct its file"
-    )
+    turned, few = replace(board, rows=board.columns, columns=board.rows), f"{few}, but {len(ids)} of its tags"
+    candidates = [
+        Candidate(
+            f"rows = {own.rows}, columns = {own.columns}"
+            + (f", legacy = {str(legacy).lower()}" if legacy != board.legacy else ""),
+            partial(replace, own, legacy=legacy),
+        )
+        for own in (board, turned)
+        for legacy in (False, True)
+    ]
+
+    def missing(other: CharucoDesign) -> float:
+        view = find_charuco(image, "", other)
+        return np.inf if view is None else 1 / len(view)
+
+    fits = explain(candidates, missing, np.inf, alike=1)
+    if not fits:
+        return f"{few}, not where rows and columns of its file put them; correct them"
+    return f"{few}, as on a board of {' or '.join(each.words for each, _ in fits)}; correct its file"
 
 
 def _find_asymmetric(
@@ -199,8 +195,7 @@ def _find_circles(
     grid: BoardDesign,
     place: np.ndarray,
 ) -> tuple[BoardView | None, str]:
-    """Returns the view of a board of circles, or why there is none. ``grid`` : lattice in which they are found;
-    ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
+    """``grid`` : lattice in which circles are found; ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
     pattern = "board of dots" if grid is board else f"grid of {kind_of(board)}"
     detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
     if detected.repeated:
@@ -211,17 +206,8 @@ def _find_circles(
     if not _turned_only(ids, board):
         return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
     centres, xy = detected.centres.select(detected.board.rows), board.xy_mm()[ids[0]]
-    labels = tuple(DotLabel(*cell) for cell in detected.board.numberings[0].tolist())
-    seen = ImageObservations(
-        name,
-        TOP_GROUP,
-        labels,
-        centres.centre_px,
-        centres.centre,
-        centres.shape,
-        centres.covariance_px2,
-        blur_px=centres.blur_px,
-    )
+    labels = [DotLabel(*cell) for cell in detected.board.numberings[0].tolist()]
+    seen = labelled_image(name, TOP_GROUP, labels, centres, ()).observations
     (sharp,), _ = correct_defocus([seen], camera, pattern_of_board(grid))
     xyz = np.column_stack([xy, np.zeros(len(xy))])
     centre_px = images_of_centres(sharp.centre_px, xyz, board.radii_mm()[ids[0]], camera)
@@ -257,7 +243,6 @@ class BoardDetection:
     """One readable image: ``view``, or None with the reason ``why``; ``tags`` of the requested dictionaries."""
 
     name: str
-    size: tuple[int, int]
     view: BoardView | None
     why: str = ""
     tags: Tags | None = None
@@ -274,7 +259,6 @@ class BoardDetections:
     symmetries: tuple[Rigid, ...]
 
     def views(self) -> dict[str, BoardView]:
-        """Returns the views by image, for the images that show the board."""
         return {detection.name: detection.view for detection in self.images if detection.view is not None}
 
     def unused(self) -> list[str]:
@@ -299,51 +283,35 @@ def detect_boards(
     images done, and all. Raises InputError: no image is readable, or the camera is not that of the images."""
     if not files:
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")
-    size, stated_by = None, MAJORITY
     if model.width and model.height:
-        size, stated_by = (model.width, model.height), "the camera file"
-        model.require_inside(*size, "the image")
-    elif (found := common_size(files)) is not None:
-        size, name = found
-        model.require_inside(*size, name)
-    jobs = [(file, model, size, stated_by, board, tuple(dictionaries)) for file in files]
-    by_job: dict[int, BoardDetection | Skipped] = {}
-    for i, detection in run_on_images(_detect_board, jobs, workers):
-        by_job[i] = detection
+        model.require_inside(model.width, model.height, "the image")
+    camera, size_from = sized_by(model, list(files))
+    outcomes: dict[int, BoardDetection | Skipped] = {}
+    jobs = [(file, camera, size_from, board, tuple(dictionaries)) for file in files]
+    for i, outcome in run_on_images(_detect_board, jobs, workers):
+        outcomes[i] = outcome
         if progress:
-            progress(len(by_job), len(jobs))
-    outcomes = [by_job[i] for i in range(len(jobs))]
-    detections = tuple(outcome for outcome in outcomes if isinstance(outcome, BoardDetection))
-    if size is None or not detections:
-        first = next(outcome for outcome in outcomes if isinstance(outcome, Skipped))
-        raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
-    without = (Skipped(s.name, s.why, "board") for s in detections if s.view is None)
-    skipped = (*(outcome for outcome in outcomes if isinstance(outcome, Skipped)), *without)
-    return BoardDetections(model.sized(*size), detections, skipped, tuple(symmetries(board)))
+            progress(len(outcomes), len(jobs))
+    every = [outcomes[i] for i in range(len(jobs))]
+    detections = tuple(each for each in every if isinstance(each, BoardDetection))
+    unusable = tuple(each for each in every if isinstance(each, Skipped))
+    if not detections:
+        reason = f"{unusable[0].name}: {unusable[0].reason}"
+        raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {reason}")
+    without = (Skipped(each.name, each.why, "board") for each in detections if each.view is None)
+    return BoardDetections(camera, detections, (*unusable, *without), tuple(symmetries(board)))
 
 
 def _detect_board(
-    file: ImageFile,
-    model: CameraModel,
-    size: tuple[int, int] | None,
-    stated_by: str,
-    board: Board,
-    dictionaries: tuple[str, ...],
+    file: ImageFile, camera: Camera, size_from: str, board: Board, dictionaries: tuple[str, ...]
 ) -> BoardDetection | Skipped:
-    try:
-        data = file.read()
-    except OSError as error:
-        return Skipped(file.name, f"cannot be read: {error.strerror or error}")
-    try:
-        image = decode(data, file.name, size)
-    except InputError as error:
-        return Skipped(file.name, str(error).removeprefix(f"{file.name}: "))
-    height, width = image.shape
-    if size is not None and size != (width, height):
-        return size_fault(file.name, (width, height), size, stated_by)
+    loaded = load_image(file, camera, size_from)
+    if isinstance(loaded, Skipped):
+        return loaded
+    image = loaded[1]
     tags = find_tags(image, dictionaries) if dictionaries else None
-    view, why = find_board(image, file.name, model.sized(width, height), board)
-    return BoardDetection(file.name, (width, height), view, why, tags)
+    view, why = find_board(image, file.name, camera, board)
+    return BoardDetection(file.name, view, why, tags)
 
 
 @require_arguments

@@ -19,26 +19,24 @@ from stcal.boards.design import (
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_arguments
-from stcal.io.cameras.model import OF_IMAGES, CameraModel
-from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
+from stcal.geometry.camera import Camera
+from stcal.io.images import ImageFile, Skipped
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
     MAX_RESIDUAL_PX,
     CameraCalibration,
+    adjusted,
+    calibrated,
     judged,
-    of_chosen_model,
     require_determined,
-    require_model,
-    require_views,
+    unsized,
 )
-from stcal.sfm.camera.checks import AUTO, foretold
-from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form, start_camera
+from stcal.sfm.camera.intrinsics import Intrinsics
+from stcal.sfm.camera.lens_checks import foretold
 from stcal.sfm.data.model import ImageObservations
-from stcal.workflows.board_views import detect_boards, kind_of
+from stcal.workflows.board_views import covariance_px2, detect_boards, kind_of
 
-CORNER_SIGMA_PX = 0.1
-"""σ of corners whose detector states none. Only their equality matters, since the factor is estimated."""
 GROSS_SIGMAS = 10.0
 """Smallest deviation of a gross error from camera and board, in σ; it is more than :data:`MAX_RESIDUAL_PX`, too."""
 LEAST_CORNERS = 6
@@ -82,29 +80,34 @@ def calibrate_camera_by_corners(
         One of its subclasses, with a one-line message that says what to do.
     """
     grid = corner_grid(board)
-    if colmap_model == AUTO:
-        return of_chosen_model(
-            lambda model: calibrate_camera_by_corners(images, board, model, workers, progress), grid, workers
-        )
-    require_model(colmap_model)
-    progress = progress or (lambda *_: None)
-    files, skipped_files = find_images(images)
-    camera = start_camera(*require_common_size(files)[0], colmap_model)
+    one = partial(_of_model, board, grid, workers, progress or (lambda *_: None))
+    return calibrated(one, images, grid, colmap_model, workers)
+
+
+def _of_model(
+    board: FlatBoard,
+    grid: CornerBoard,
+    workers: int | None,
+    progress: Progress,
+    files: list[ImageFile],
+    not_images: Sequence[Skipped],
+    camera: Camera,
+    colmap_model: str,
+) -> CameraCalibration:
     rounds = ROUNDS.get(type(board), 1)
     for done in range(1, rounds + 1):
-        model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
-        detections = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
+        step = partial(progress, f"detect {done}")
+        detections = detect_boards(files, unsized(camera, colmap_model), board, (), workers, step)
         views = _observations(files, detections.views(), grid, camera)
-        skipped = (*skipped_files, *detections.skipped)
-        require_views(views, files, skipped)
-        result = adjust_intrinsics(views, grid, camera if done > 1 else closed_form(views, grid, camera), colmap_model)
+        skipped = (*not_images, *detections.skipped)
+        result = adjusted(views, files, skipped, grid, camera, colmap_model, done == 1)
         camera = result.camera
     kept, without, warnings = without_gross_errors(views, grid, result)
     if without or warnings:
         views, skipped = kept, (*skipped, *without)
-        require_views(views, files, skipped)
-        result = replace(adjust_intrinsics(views, grid, result.camera, colmap_model), restarted=result.restarted)
-    require_determined(result, views)
+        again = adjusted(views, files, skipped, grid, camera, colmap_model, False)
+        result = replace(again, restarted=result.restarted)
+    require_determined(result, views, grid)
     calibration = judged(result, views, skipped, rounds, True, grid)
     return replace(calibration, warnings=(*calibration.warnings, *warnings))
 
@@ -171,23 +174,13 @@ def corner_grid(board: FlatBoard) -> CornerBoard:
     return CornerBoard.of(board)
 
 
-def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: CornerBoard, camera):
+def _observations(
+    files: Sequence[ImageFile], views: dict[str, BoardView], grid: CornerBoard, camera: Camera
+) -> list[ImageObservations]:
     group = {file.name: file.group for file in files}
     observations = []
     for name, view in views.items():
         labels = tuple(DotLabel(*cell) for cell in grid.cells()[view.ids].tolist())
-        covariance = view.covariance_px2
-        if covariance is None:
-            covariance = np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
-        observations.append(
-            ImageObservations(
-                name=name,
-                group=group[name],
-                labels=labels,
-                centre_px=view.xy_px,
-                centre=camera.normalised_from_pixel(view.xy_px),
-                shape=np.zeros((len(view), 2, 2)),
-                covariance_px2=covariance,
-            )
-        )
+        rays, shape = camera.normalised_from_pixel(view.xy_px), np.zeros((len(view), 2, 2))
+        observations.append(ImageObservations(name, group[name], labels, view.xy_px, rays, shape, covariance_px2(view)))
     return observations

@@ -16,7 +16,17 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Arg, Opt
-from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, verbose, write, write_if, write_out
+from stcal.cli.terminal import (
+    STANDARD_OUTPUT,
+    StageProgress,
+    print_each,
+    printed_last,
+    say,
+    verbose,
+    write,
+    write_if,
+    write_out,
+)
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -61,8 +71,7 @@ def calibrate_camera(
     from stcal.io.design import board_of, target_of
     from stcal.io.video import images_or_frames
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
-    from stcal.sfm.camera.file import CalibrationFile
-    from stcal.sfm.camera.report import calibration_report
+    from stcal.sfm.camera.camera_report import calibration_file, calibration_report
     from stcal.workflows.calibrate_camera import calibrate_camera_by_corners
 
     json_file = json_file or out.with_suffix(".json")
@@ -78,13 +87,14 @@ def calibrate_camera(
             result = calibrate_camera_by_corners(folder, board_design, model, workers, progress)
     intrinsics = result.intrinsics
     save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance), "colmap")
-    summary = CalibrationFile.of(result)
+    summary = calibration_file(result)
     document = calibration_report(result, summary, str(images))
-    say(document.text())
-    print_each("warning", result.warnings)
-    say(f"camera file: {out}")
-    write(json_file, summary, "figures and checks")
-    write_if(report, document.page, "report")
+    with printed_last():
+        say(document.text())
+        print_each("warning", result.warnings)
+        say(f"camera file: {out}")
+        write(json_file, summary, "figures and checks")
+        write_if(report, document.page, "report")
     shared.require_passed(strict, [] if intrinsics.settled else ["σ of centres and dots"], report)
 
 
@@ -198,10 +208,10 @@ def measure(
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
     from stcal.io.table import read_table
-    from stcal.sfm.measurement import images as work
-    from stcal.sfm.measurement import report as output
+    from stcal.sfm.measurement import measure_images as work
+    from stcal.sfm.measurement import pose_report as output
+    from stcal.sfm.measurement.known_target import read_target
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
-    from stcal.sfm.measurement.target import read_target
 
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
@@ -228,12 +238,13 @@ def measure(
         )
     text, apart = output.poses_csv(result, table)
     document = output.measure_report(result, str(images), every=verbose())
-    say(document.text())
-    print_each("not joined", apart)
-    write(out, text, "poses")
-    output.require_table_written(out, result, table)
-    write_if(json_file, lambda: output.poses_file(result), "as JSON")
-    write_if(report, document.page, "report")
+    with printed_last():
+        say(document.text())
+        print_each("not joined", apart)
+        write(out, text, "poses")
+        output.require_table_written(out, result, table)
+        write_if(json_file, lambda: output.poses_file(result), "as JSON")
+        write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     shared.require_passed(strict, [f"χ² of {name}" for name in failed], report)
 

@@ -7,7 +7,7 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import Opt
-from stcal.cli.terminal import StageProgress, print_each, say, write_if
+from stcal.cli.terminal import StageProgress, print_each, printed_last, say, write_if
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -43,10 +43,10 @@ def plan(
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
     from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run
-    from stcal.sfm.planning.bodies import plan as planned
-    from stcal.sfm.planning.file import PlanFile, plan_text
     from stcal.sfm.planning.forecast import CentreNoise
+    from stcal.sfm.planning.plan_report import PlanFile, plan_text
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
+    from stcal.sfm.planning.session import plan as planned
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
@@ -81,8 +81,9 @@ def plan(
     )
     with shared.designs_told(target, board):
         result = planned(options, design, load_board(board) if board else None, faces)
-    say(plan_text(result, source))
-    write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
+    with printed_last():
+        say(plan_text(result, source))
+        write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
 
 
 @app.command()
@@ -95,7 +96,7 @@ def advise(
     shared.load_ahead(None)
     from stcal.sfm.planning.advise import advise as advice_for
     from stcal.sfm.planning.advise import doubts, known_of
-    from stcal.sfm.planning.file import AdviceFile, advice_text
+    from stcal.sfm.planning.plan_report import AdviceFile, advice_text
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
@@ -104,5 +105,6 @@ def advise(
     geometry = known_of(saved)
     with StageProgress() as progress:
         advice = advice_for(geometry, count, progress)
-    say(advice_text(advice))
-    write_if(out, lambda: AdviceFile.of_advice(advice), "as JSON")
+    with printed_last():
+        say(advice_text(advice))
+        write_if(out, lambda: AdviceFile.of_advice(advice), "as JSON")

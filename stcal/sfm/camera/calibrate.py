@@ -2,31 +2,20 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
+from stcal.explain import explain
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera
 from stcal.io.cameras.model import OF_IMAGES, CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import DotLabel, unseen_lines
 from stcal.parallel import Progress, counted, one_thread, scratch_folder
-from stcal.sfm.camera.checks import (
-    AUTO,
-    MIN_REACH,
-    Candidate,
-    HeldOut,
-    ProjectionSigma,
-    choose_model,
-    held_out,
-    image_grid,
-    of_lens_model,
-    projection_jacobian,
-    projection_sigma,
-)
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
     adjust_intrinsics,
@@ -34,6 +23,20 @@ from stcal.sfm.camera.intrinsics import (
     closed_form,
     model_parameters,
     start_camera,
+)
+from stcal.sfm.camera.lens_checks import (
+    AUTO,
+    MIN_REACH,
+    HeldOut,
+    ProjectionSigma,
+    TriedModel,
+    choose_model,
+    held_out,
+    image_grid,
+    larger_models,
+    of_lens_model,
+    projection_jacobian,
+    projection_sigma,
 )
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import MIN_DOTS, pattern_of_board
@@ -67,7 +70,7 @@ class CameraCalibration(Brief):
     projection: ProjectionSigma
     held_out: HeldOut | None  # None with fewer than four
     warnings: tuple[str, ...]  # problems that the σ may not show, and what to do about them
-    candidates: tuple[Candidate, ...] = ()  # lens models that were tried, empty if a model was given
+    candidates: tuple[TriedModel, ...] = ()  # lens models that were tried, empty if a model was given
 
 
 @require_arguments
@@ -115,23 +118,52 @@ def calibrate_camera(
     StcalError
         A stage failed. The one-line message says what to do.
     """
+    one = partial(_of_model, target, board, ellipses or EllipseOptions(), workers, progress or (lambda *_: None))
+    return calibrated(one, images, board, colmap_model, workers)
+
+
+def calibrated(
+    of_model: Callable[[list[ImageFile], list[Skipped], Camera, str], CameraCalibration],
+    images: str | Path,
+    board: BoardDesign,
+    colmap_model: str,
+    workers: int | None,
+) -> CameraCalibration:
+    """Returns the calibration ``of_model`` by the photographs of a folder, from a camera of their size; with ``auto``,
+    of the lens model that held-out views choose."""
     if colmap_model == AUTO:
-        return of_chosen_model(
-            lambda model: calibrate_camera(images, target, board, model, ellipses, workers, progress), board, workers
+        return of_chosen_model(lambda model: calibrated(of_model, images, board, model, workers), board, workers)
+    if colmap_model not in COLMAP_MODELS:
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
         )
-    require_model(colmap_model)
-    progress = progress or (lambda *_: None)
     files, not_images = find_images(images)
-    camera = start_camera(*require_common_size(files)[0], colmap_model)
+    return of_model(files, not_images, start_camera(*require_common_size(files)[0], colmap_model), colmap_model)
+
+
+def unsized(camera: Camera, colmap_model: str) -> CameraModel:
+    """Returns a camera without its size, which then comes from most of the images, and messages say so."""
+    return CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
+
+
+def _of_model(
+    target: TargetDesign,
+    board: BoardDesign,
+    ellipses: EllipseOptions,
+    workers: int | None,
+    progress: Progress,
+    files: list[ImageFile],
+    not_images: Sequence[Skipped],
+    camera: Camera,
+    colmap_model: str,
+) -> CameraCalibration:
     before: Intrinsics | None = None
     settled = of_perspective = False
     with scratch_folder("camera") as cache:
         for rounds in range(1, MAX_ROUNDS + 1):
-            # No size is given: it comes from most of the images, and messages should say so.
-            lens = camera.focal, camera.centre, camera.distortion
-            model = CameraModel(*lens, colmap_model, None, None, OF_IMAGES)
-            step, options = counted(progress, f"detect {rounds}", len(files)), ellipses or EllipseOptions()
-            detection = detect_files(files, model, target, board, options, Path(cache), workers, step, pictures=False)
+            step, lens = counted(progress, f"detect {rounds}", len(files)), unsized(camera, colmap_model)
+            detection = detect_files(files, lens, target, board, ellipses, Path(cache), workers, step, pictures=False)
             try:
                 views, skipped, result = _of_one_round(
                     files, not_images, detection, board, camera, colmap_model, before is None
@@ -140,7 +172,8 @@ def calibrate_camera(
                 if before is not None or of_perspective or not camera.fisheye:
                     raise
                 # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds it.
-                rough = calibrate_camera(images, target, board, PERSPECTIVE, ellipses, workers, progress)
+                start = start_camera(camera.width, camera.height, PERSPECTIVE)
+                rough = _of_model(target, board, ellipses, workers, progress, files, not_images, start, PERSPECTIVE)
                 camera, of_perspective = replace(camera, focal=rough.intrinsics.camera.focal), True
                 continue
             result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
@@ -170,7 +203,7 @@ def camera_of_labelled(
     model = camera.colmap_model
     start = closed_form(views, board, start_camera(camera.width, camera.height, model))
     found = adjust_intrinsics(views, board, start, model)
-    require_determined(found, views)
+    require_determined(found, views, board)
     return found, adjust_intrinsics(views, board, camera, model, held=True)
 
 
@@ -194,20 +227,23 @@ def _of_one_round(
         if each.file.name not in shown
     )
     skipped = (*not_images, *detection.skipped, *without)
-    require_views(views, files, skipped)
-    start = closed_form(views, board, camera) if first else camera
-    result = adjust_intrinsics(views, board, start, colmap_model)
-    require_determined(result, views)
+    result = adjusted(views, files, skipped, board, camera, colmap_model, first)
+    require_determined(result, views, board)
     return views, skipped, result
 
 
-def require_model(colmap_model: str) -> None:
-    """Checks that a lens model is supported."""
-    if colmap_model not in COLMAP_MODELS:
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera model {colmap_model}: not supported; use one of {', '.join(COLMAP_MODELS)} or {AUTO}",
-        )
+def adjusted(
+    views: Sequence[ImageObservations],
+    files: Sequence[ImageFile],
+    skipped: Sequence[Skipped],
+    board: BoardDesign,
+    camera: Camera,
+    colmap_model: str,
+    first: bool,
+) -> Intrinsics:
+    """Returns the intrinsics by these views, from ``camera``, or, at ``first``, from the closed form."""
+    require_views(views, files, skipped)
+    return adjust_intrinsics(views, board, closed_form(views, board, camera) if first else camera, colmap_model)
 
 
 def of_chosen_model(
@@ -251,7 +287,6 @@ def judged(
 
 
 def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile], skipped: Sequence[Skipped]) -> None:
-    """Checks that there are enough views of the board."""
     if len(views) >= MIN_VIEWS:
         return
     images = {file.name for file in files}  # other files are skipped too, and explain nothing
@@ -269,14 +304,17 @@ def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile]
     )
 
 
-def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -> None:
+def require_determined(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> None:
     """Checks that the views determine the focal length and that the lens model fits them."""
     rms = weighted_rms_px(result)
     if rms > MAX_RESIDUAL_PX:
+        found = explain(larger_models(result, views, board), weighted_rms_px, MAX_RESIDUAL_PX)
+        other = "choose a --model with more parameters, check the board file, use images of one focus and zoom"
+        remedy = found[0][0].words if found else other
         raise DegenerateError(
             "E-CALIBRATE-MISFIT",
             f"camera: dots are {rms:.1f} px RMS from where {result.colmap_model} puts them, {MAX_RESIDUAL_PX:g} px "
-            "allowed; choose a --model with more parameters, check the board file, use images of one focus and zoom",
+            f"allowed; {remedy}",
         )
     relative = float(result.sigma()[0] / result.camera.focal[0])
     if relative > MAX_FOCAL_SIGMA:
@@ -291,7 +329,6 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
 
 
 def residual_rms_px(result: Intrinsics) -> float:
-    """Returns the RMS of the residuals per coordinate, px."""
     return float(np.sqrt((result.residuals_px() ** 2).mean()))
 
 
@@ -311,38 +348,23 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
 
 
 def _warnings(result: Intrinsics, projection: ProjectionSigma, board: BoardDesign) -> list[str]:
-    """Returns warnings, and what the user should do about them."""
     centres, dots, differ = result.factors.centres, result.factors.dots, result.differ
-    corners = zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
-    told = [
-        (
-            result.restarted,
-            "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
-            "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model",
-        ),
-        *(
-            (
-                reach < MIN_REACH,
-                f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, "
-                f"the distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in "
-                "it",
-            )
-            for corner, reach, sigma in corners
-        ),
-        (
-            centres > SUSPICIOUS_FACTOR,
-            f"residuals exceed the σ of the centres {centres:.1f} times: σ are scaled by it, but images are blurred or "
-            "moved",
-        ),
-        (
-            dots > SUSPICIOUS_FACTOR,
-            f"dots deviate from the grid {dots:.1f} times as much as the board file says: sigma_mm = "
-            f"{dots * board.sigma_mm:.3g} fits, {board.sigma_mm:g} is stated",
-        ),
-        (
-            differ > SUSPICIOUS_FACTOR,
-            f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that; keep "
-            "focus and zoom fixed, and the light even",
-        ),
+    restarted = (
+        "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
+        "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model"
+    )
+    corners = [
+        f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, the "
+        f"distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
+        for corner, reach, sigma in zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)
+        if reach < MIN_REACH
     ]
-    return [warning for applies, warning in told if applies]
+    suspicious = {
+        f"residuals exceed the σ of the centres {centres:.1f} times: σ are scaled by it, but images are blurred or "
+        "moved": centres,
+        f"dots deviate from the grid {dots:.1f} times as much as the board file says: sigma_mm = "
+        f"{dots * board.sigma_mm:.3g} fits, {board.sigma_mm:g} is stated": dots,
+        f"photographs differ {differ:.1f} times more than their pixels explain, and σ are larger by that; keep "
+        "focus and zoom fixed, and the light even": differ,
+    }
+    return [restarted] * result.restarted + corners + [said for said, v in suspicious.items() if v > SUSPICIOUS_FACTOR]

@@ -16,9 +16,10 @@ from stcal.geometry.variances import sigma_factor
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import normalised, robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.equations import Board, Normal, Setting, State, dots_costs, minimum
+from stcal.sfm.camera.camera_equations import Board, Normal, Setting, State, minimum
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectedImage
+from stcal.sfm.detect.labels import labelled_image
 
 START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
 """Approximate focal lengths over the longer image side: between wide-angle and portrait; equidistant lens of 127°."""
@@ -119,24 +120,15 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
         if sighting is not None and len(sighting.rows):
             dots = image.detection.centres.select(sighting.rows)
             numberings[image.file.name] = sighting.numberings
-            views.append(
-                ImageObservations(
-                    name=image.file.name,
-                    group=image.file.group,
-                    labels=tuple(DotLabel(0, i) for i in range(len(dots))),
-                    centre_px=dots.centre_px,
-                    centre=dots.centre,
-                    shape=dots.shape,
-                    covariance_px2=dots.covariance_px2,
-                    blur_px=dots.blur_px,
-                )
-            )
-    labels: dict[str, tuple[DotLabel, ...]] = {}
+            labels = [DotLabel(0, i) for i in range(len(dots))]
+            views.append(labelled_image(image.file.name, image.file.group, labels, dots, ()).observations)
+    numbered: dict[str, ImageObservations] = {}
     for members in by_group(views).values():
         fields = [_deviations(numberings[v.name], camera.normalised_from_pixel(v.centre_px), board) for v in members]
         for view, choice in zip(members, _choose_alike(fields), strict=True):
-            labels[view.name] = tuple(DotLabel(*cell) for cell in numberings[view.name][choice].tolist())
-    return [replace(view, labels=labels[view.name]) for view in views]
+            cells = numberings[view.name][choice].tolist()
+            numbered[view.name] = replace(view, labels=tuple(DotLabel(*cell) for cell in cells))
+    return [numbered[view.name] for view in views]
 
 
 def _deviations(numberings: np.ndarray, xy_normalised: np.ndarray, board: BoardDesign) -> np.ndarray:
@@ -190,8 +182,6 @@ class SigmaFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intrinsics:
-    """Intrinsics of a camera after the adjustment."""
-
     camera: Camera
     colmap_model: str
     covariance: np.ndarray  # (q, q) of the parameters of ``colmap_model``, by how the photographs differ
@@ -207,11 +197,9 @@ class Intrinsics:
     restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
 
     def sigma(self) -> np.ndarray:
-        """Returns the standard deviations of the parameters, (q,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def residuals_px(self) -> np.ndarray:
-        """Returns the residuals of all observations, (n, 2)."""
         return np.concatenate([model.residuals_px(self.camera) for model in self.models])
 
     def prints(self) -> dict[str, tuple[float, float]]:
@@ -220,7 +208,6 @@ class Intrinsics:
         return {m.group: boards[m.group].modes.stretch(m.xyz_model - boards[m.group].places) for m in self.models}
 
     def weights(self) -> list[np.ndarray]:
-        """Returns the Huber weights of each model."""
         return [robust_weights(model, self.camera, self.huber) for model in self.models]
 
 
@@ -269,13 +256,15 @@ def adjust_intrinsics(
     except ConvergenceError:
         if held:
             raise
-    # A focal length far off makes the rest of the lens wander: it comes first, alone.
-    result = _adjusted(_with_focal_length(state, setting), setting, board, colmap_model)
-    return replace(result, restarted=True)
+    # A focal length far off makes the rest of the lens wander: it comes first, alone, and one for both axes.
+    focal, weight = intrinsic_basis("SIMPLE_PINHOLE")[:, :1], np.full((1, 1), start.focal[0] ** -2.0)
+    alone = replace(setting, basis=focal, weight=weight)
+    for _ in range(FOCAL_ROUNDS):
+        state, alone = _robust_minimum(state, alone)
+    return replace(_adjusted(state, setting, board, colmap_model), restarted=True)
 
 
 def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
-    """Returns the intrinsics of an adjustment, from its ``last`` normal equations."""
     state, setting, by_photographs = last.state, last.setting, last.by_photographs()
     return Intrinsics(
         camera=state.camera,
@@ -302,24 +291,17 @@ they end, in σ²: no parameter is then off by more than a third of its σ."""
 def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
     """Returns the intrinsics from some of the views of ``result``: by steps from the solution of all, with its weights,
     and the factors of σ by one step of their own; by :func:`adjust_intrinsics` where the steps do not settle."""
-    state, setting = result.solution
-    last = _stepped(state.only({view.name for view in views}), setting)
-    if last is None:
-        return adjust_intrinsics(views, board, result.camera, result.colmap_model)
-    return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
-
-
-def _stepped(state: State, setting: Setting) -> Normal | None:
-    """Returns the normal equations where steps from ``state`` settle, or None if they do not."""
+    whole, setting = result.solution
+    state = whole.only({view.name for view in views})
     for _ in range(MOST_STEPS):
-        normal = Normal.of(state, setting)
-        step, gain = normal.step(0.0)
+        last = Normal.of(state, setting)
+        step, gain = last.step(0.0)
         if gain < NO_GAIN:
-            return normal
-        state = normal.moved(step)
+            return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
+        state = last.moved(step)
         if not np.isfinite(state.cost(setting.huber)):
-            return None
-    return None
+            break
+    return adjust_intrinsics(views, board, result.camera, result.colmap_model)
 
 
 def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: str) -> Intrinsics:
@@ -344,20 +326,11 @@ def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: 
     return _intrinsics(last, colmap_model, factors, settled)
 
 
-def _with_focal_length(state: State, setting: Setting) -> State:
-    """Returns the state of least cost over the focal lengths alone, each of all of a camera, with robust weights."""
-    basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
-    setting = replace(setting, basis=basis, weight=np.full((1, 1), setting.start.focal[0] ** -2.0))
-    for _ in range(FOCAL_ROUNDS):
-        state, setting = _robust_minimum(state, setting)
-    return state
-
-
 def _robust_minimum(state: State, setting: Setting) -> tuple[State, Setting]:
     """Returns the state of least cost, and the setting with Huber's limit by its residuals."""
     state = minimum(state, setting)
-    robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
-    return state, replace(setting, huber=HUBER * robust)
+    length = np.linalg.norm(np.concatenate([normalised(model, state.camera) for model in state.models]), axis=1)
+    return state, replace(setting, huber=HUBER * max(robust_sigma(length, 2), LEAST_ROBUST))
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
@@ -413,5 +386,5 @@ def _updated_factors(last: Normal, factors: SigmaFactors) -> tuple[SigmaFactors,
     dots_left, boards = last.with_found_prints()
     dots, image_redundancy = factors.dots, state.redundancy(setting.kept) - dots_left
     if dots_left > MIN_BOARD_REDUNDANCY:
-        dots = max(LEAST_DOTS, dots * sigma_factor(dots_costs(state, setting)[0], dots_left))
+        dots = max(LEAST_DOTS, dots * sigma_factor(setting.dots_cost(state), dots_left))
     return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards

@@ -17,14 +17,14 @@ from ipaddress import ip_address
 import cv2
 import numpy as np
 
-from stcal.errors import InputError, StcalError
-from stcal.io.images import Skipped, decode, stated_size
+from stcal.errors import InputError
+from stcal.io.images import decode, stated_size
 from stcal.parallel import one_thread
 from stcal.report.document import environment
 from stcal.report.svg import AXIS_COLOURS, COLOURS
-from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
+from stcal.sfm.measurement.measure_images import measured_by
 from stcal.sfm.measurement.pose import TargetPose
-from stcal.sfm.measurement.report import poses_file
+from stcal.sfm.measurement.pose_report import poses_file
 from stcal.sfm.measurement.tracker import Tracker
 
 try:
@@ -74,17 +74,17 @@ class LiveService:
         for number, frame in enumerate(frames, 1):
             began = time.monotonic()
             with self._measuring, one_thread():
-                centres, measured, poses = observed(tracker, frame, f"picture {number}")
+                result, centres = measured_by(tracker, frame, f"picture {number}")
             times.append(time.monotonic())
-            pose = None if isinstance(measured, Skipped) else measured.pose
+            pose = result.images[0].pose if result.images else None
             content = {
                 "picture": number,
                 "status": pose.status if pose else "no pose",
-                "reason": measured.reason if isinstance(measured, Skipped) else "",
+                "reason": "" if pose else result.left_out[0].reason,
                 "rate": (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0,
                 "measured_in_s": times[-1] - began,
                 "shown": rows_of(pose) if pose else [],
-                "poses": poses,
+                "poses": poses_file(result).content(),
             }
             picture = drawn(frame, centres, pose, tracker)
             jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
@@ -97,10 +97,10 @@ class LiveService:
         try:
             stated_size(data, name)  # refuses a small file of a huge image
             with self._measuring, one_thread():
-                _, measured, poses = observed(copy(self.tracker), decode(data, name), name)
+                result, _ = measured_by(copy(self.tracker), decode(data, name), name)
         except InputError as error:
             return 400, {"error": str(error), "code": error.code}
-        return 422 if isinstance(measured, Skipped) else 200, poses
+        return 200 if result.images else 422, poses_file(result).content()
 
     async def _pose(self, request: Request) -> JSONResponse:
         self._require_allowed(request)
@@ -174,19 +174,6 @@ def served(service: LiveService, host: str = "127.0.0.1", port: int = 8765) -> I
             thread.join()
 
 
-def observed(tracker: Tracker, image: np.ndarray, name: str):
-    """Returns the centres (n, 2) in an image, px, the measured image or why it has no pose, and its poses file."""
-    try:
-        labelled, pose = tracker.observe(image, name)
-        centres, measured = labelled.observations.centre_px, outcome(name, pose, labelled.notes)
-    except InputError:
-        raise
-    except StcalError as error:  # such as a distortion that cannot be inverted: the next image may do
-        centres, measured = np.zeros((0, 2)), outcome(name, error, ())
-    result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
-    return centres, measured, poses_file(result).content()
-
-
 def rows_of(pose: TargetPose) -> list[list[str]]:
     """Returns the rows of the page for a pose: names and values with their σ, camera_from_target in mm and degrees."""
     pose_sigma = pose.camera_from_target.log_sigma(pose.covariance)
@@ -248,5 +235,4 @@ def drawn(frame: np.ndarray, centres_px: np.ndarray, pose: TargetPose | None, tr
 
 
 def _bgr(colour: str) -> tuple[int, ...]:
-    """Returns blue, green and red of a colour like ``#0b5394``."""
     return tuple(bytes.fromhex(colour[1:]))[::-1]

@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.patterns import CircleImages, project_circles
-from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.measurement.known_target import TargetCircles
 
 SETTLED = 1e-4
 """Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and two
@@ -44,7 +44,6 @@ class PoseProblem:
         return self.centre - image.centre, image
 
     def in_px(self, residual: np.ndarray) -> np.ndarray:
-        """Returns residuals (n, 2) in the distorted image, px."""
         return (self.px_by_centre @ residual[..., None])[..., 0]
 
     def without(self, bad: np.ndarray, outliers: list[Outlier]) -> "PoseProblem":
@@ -115,27 +114,25 @@ def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple
     reasons = []
     for face in by_size:
         if len(faces[face]) >= MIN_CIRCLES:
-            pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
-            if isinstance(pose, Rigid):
-                return PoseStack.of(pose), target.target_from_plane[face]
-            reasons.append(pose)
+            try:
+                pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
+            except DegenerateError as error:
+                reasons.append(error)
+                continue
+            return PoseStack.of(pose), target.target_from_plane[face]
     raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
 
 
-def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int]) -> Rigid | str:
-    """Returns the pose from the homography of one face's circles, or the reason why there is none."""
+def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int]) -> Rigid:
     plane_from_target = target_from_plane.inverse()
     xy = (plane_from_target @ problem.xyz[rows])[:, :2]
     long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
     if broad < MIN_BREADTH * long:
-        return f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line"
-    try:
-        homography = fit_homography(xy, problem.centre[rows])
-    except DegenerateError as error:
-        return str(error)
-    pose = camera_from_plane(homography) @ plane_from_target
+        reason = f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line"
+        raise DegenerateError("E-MEASURE-AMBIGUOUS", reason)
+    pose = camera_from_plane(fit_homography(xy, problem.centre[rows])) @ plane_from_target
     if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
-        return "its circles would be behind the camera; check their labels"
+        raise DegenerateError("E-MEASURE-AMBIGUOUS", "its circles would be behind the camera; check their labels")
     return pose
 
 

@@ -25,6 +25,7 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import ImageObservations, Outlier
+from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.minima import (
     HOPELESS,
     MIN_CIRCLES,
@@ -33,7 +34,6 @@ from stcal.sfm.measurement.minima import (
     minima_without_outliers,
     start_pose,
 )
-from stcal.sfm.measurement.target import TargetCircles
 
 CURVED = 0.2
 """Relative deviation of χ² from its parabola, two σ away, beyond which the covariance is taken from samples."""
@@ -58,11 +58,12 @@ def covariance_of_likelihood(
     plausible: float,
 ) -> tuple[np.ndarray, float]:
     """Returns the covariance of a pose (6, 6), and the excess in χ² of its mirror image, infinite if that does not
-    matter. If the likelihood is not Gaussian, it is the second moment, by importance sampling with fixed numbers
+    matter: it does if its excess is below ``plausible``, and it is some σ away and far more probable than these say.
+
+    If the likelihood is not Gaussian, the covariance is its second moment, by importance sampling with fixed numbers
     (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4), without poses nearer to the ``second``
     solution. ``full``: (2n, 2n) of the centres; ``least``: χ² of the pose; ``covariance``: (6, 6), linearised.
-    ``plane``: merged into a valley, of which the linearised problem sees one side. The mirror image matters if its
-    excess is below ``plausible``, it is some σ away, and it is far more probable than these σ say."""
+    """
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
     def excess(step: np.ndarray) -> np.ndarray:
@@ -115,7 +116,6 @@ def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, seco
 
 
 def _principal(covariance: np.ndarray) -> np.ndarray:
-    """Returns the principal axes in units of σ, as rows. The sum of their outer products is the covariance."""
     sigma = np.sqrt(np.diag(covariance))
     value, vector = np.linalg.eigh(covariance / sigma / sigma[:, None])
     return (vector * np.sqrt(np.maximum(value, 0))).T * sigma
@@ -134,8 +134,6 @@ Status = Literal["certain", "resolved", "ambiguous"]
 
 @dataclass(frozen=True, slots=True)
 class PoseOptions:
-    """Options of the measurement of a pose."""
-
     flip_odds: float = 1e-6  # largest odds of the second solution for a pose to be certain, for Gaussian errors
     sigma_margin: float = 1.5  # factor by which the stated σ may be too small while this holds
     sigma_factor: float | None = None  # on the centres' own σ; None: that of the target's run
@@ -151,7 +149,6 @@ class PoseOptions:
             )
 
     def needed(self, chi2_per_dof: float) -> float:
-        """Returns the Δχ² that makes a pose certain."""
         return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
 
 
@@ -208,8 +205,7 @@ def pose_from_circles(
     of the largest face, and from its reflection, Huber's loss of single centres is minimised. The minima are then
     weighed by the whole covariance of the centres: noise, target and intrinsics."""
     options = options or PoseOptions()
-    labels = parse_labels(labels)
-    problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
+    problem = _problem(parse_labels(labels), centre_px, covariance_px2, target, camera, options, prior, where)
     start, plane = start_pose(problem, target, where)
     minima, problem = minima_without_outliers(problem, start, plane, where)
     if len(problem.labels) < MIN_CIRCLES:
@@ -240,7 +236,6 @@ def pose_from_circles(
 
 
 def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where) -> PoseProblem:
-    """Returns the data of the pose: the target's circles among the labels."""
     n = len(labels)
     centre, noise = frozen(centre_px, (n, 2), "centres"), frozen(covariance_px2, (n, 2, 2), "centres' covariance")
     used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
@@ -277,7 +272,6 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
 
 
 def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOptions) -> TargetPose:
-    """Decides between the two minima, or the two sides of a valley, and returns the pose."""
     excess, second = _second_solution(problem, found)
     alone = second is None and len({label.face for label in problem.labels}) == 1
     first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
@@ -381,7 +375,7 @@ def measured_pose(
 
 
 def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
-    """Pose with its two-fold ambiguity decided by the image before, if one solution is clearly nearer to it."""
+    """Returns the pose with its ambiguity decided by the image before, if one solution is clearly nearer to it."""
     if pose.status == "certain" or pose.second is None:
         return pose
     turn, turn_of_second = (
@@ -430,6 +424,5 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Returns a square root (n, n) of the covariance. Its product with its transpose is the covariance."""
     value, vector = np.linalg.eigh(covariance)
     return vector * np.sqrt(np.maximum(value, 0))

@@ -31,8 +31,8 @@ from stcal.sfm.detect.predict import (
     missed_notes,
     predict_circles,
 )
+from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, fit_verdict, measured_pose, resolved
-from stcal.sfm.measurement.target import TargetCircles
 
 MIN_SHARE = 0.5
 """Least share of the expected circles that must be found near their predicted places. With fewer, the whole image is
@@ -150,7 +150,14 @@ class Tracker:
 
     def observe(self, image: np.ndarray, name: str = "image") -> tuple[LabelledImage, TargetPose | StcalError]:
         """Returns the labelled circles of the next image, and its pose or the error; see :meth:`locate`."""
-        camera = self._camera_of(image, name)
+        require_grey(image, None, name)
+        if self.camera is None:
+            height, width = image.shape
+            if not (self.model.width and self.model.height):
+                self.model.require_inside(width, height, name)
+            self.camera = self.model.sized(width, height)
+        camera = self.camera
+        require_grey(image, (camera.width, camera.height), name)
         followed = self._follow(image, camera, name) if self.recent and not self.design.has_printed else None
         self.searched = followed is None
         if followed is None:
@@ -166,16 +173,6 @@ class Tracker:
         one_before = () if self.searched else self.recent[-1:]  # no motion is known across a search
         self.recent = (*one_before, pose.camera_from_target) if pose.status != "ambiguous" else ()
         return labelled, pose
-
-    def _camera_of(self, image: np.ndarray, name: str) -> Camera:
-        require_grey(image, None, name)
-        height, width = image.shape
-        if self.camera is None:
-            if not (self.model.width and self.model.height):
-                self.model.require_inside(width, height, name)
-            self.camera = self.model.sized(width, height)
-        require_grey(image, (self.camera.width, self.camera.height), name)
-        return self.camera
 
     def _follow(
         self, image: np.ndarray, camera: Camera, name: str
@@ -210,9 +207,10 @@ class Tracker:
         if not predicted.wanted.any():
             return seen
         measured = measure_predicted(image, camera, predicted, self.ellipses)
+        missed = missed_notes(measured.missed)
         if not measured.labels:
-            return replace(seen, notes=(*seen.notes, *missed_notes(measured.missed)))
-        return seen.plus(measured.labels, measured.centres, missed_notes(measured.missed))
+            return replace(seen, notes=(*seen.notes, *missed))
+        return seen.plus(measured.labels, measured.centres, missed)
 
     def _predicted(self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float) -> PredictedCircles:
         arrangement = Arrangement(self._planes, {0: pose}, {})

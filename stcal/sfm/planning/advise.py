@@ -13,7 +13,6 @@ from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import result_of
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.planning.bodies import body_views
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,
@@ -29,7 +28,7 @@ from stcal.sfm.planning.forecast import (
     variance_shares,
     worst_of,
 )
-from stcal.sfm.planning.views import PlannedView, candidates, known_scene
+from stcal.sfm.planning.planned_views import PlannedView, body_views, candidates, known_scene
 from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
@@ -57,8 +56,6 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class NewGroup:
-    """A pair of faces to photograph together for the first time."""
-
     faces: tuple[str, str]
     images: int  # number of views
     face: str  # the worst one with these views, and its σ
@@ -204,7 +201,6 @@ def _positions(positions: PositionsWith, views: Sequence[PlannedView]) -> list[d
 
 
 def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
-    """Returns the pairs of faces that no group shows together but one view can, the best first."""
     together = [model.points_by_face().keys() for model in known.models]
     new_groups = []
     for pair in combinations(sorted(face.id for face in known.scene.target.faces), 2):

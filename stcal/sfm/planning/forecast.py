@@ -182,7 +182,6 @@ class CentreNoise:
         return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)), corner_px=corner_px)
 
     def scaled(self, factor: float) -> "CentreNoise":
-        """Returns the same noise with all σ multiplied by a factor."""
         return CentreNoise(factor * self.edge, self.narrow_px, factor * self.floor_px, factor * self.corner_px)
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
@@ -249,7 +248,6 @@ class Setup:
         return self.sigma0**2 * adjusted_mm2 + (0.0 if self.rims_mm2 is None else self.rims_mm2)
 
     def radius_mm(self) -> dict[Label, float]:
-        """Radius by label, mm."""
         return self.target.radius_of() | self.board.radius_of()
 
     def better_board(self, factor: float) -> "Setup":
@@ -274,16 +272,13 @@ class Forecast:
     derivatives: Derivatives  # reusable for other views of the same circles
 
     def position_sigma_mm(self) -> dict[str, float]:
-        """Returns the σ of each face's position, see :func:`position_sigma_mm`."""
         return {face: position_sigma_mm(c) for face, c in self.face_covariance.items()}
 
     def worst(self) -> tuple[str, float]:
-        """Returns the face with the largest σ of position, and this σ in mm."""
         return worst_of(self.position_sigma_mm())
 
 
 def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
-    """Returns the face with the largest σ, and this σ."""
     face = max(sigma, key=sigma.__getitem__)
     return face, sigma[face]
 
@@ -334,7 +329,6 @@ class PositionsWith:
 
 
 def position_sigma_mm(face_covariance: np.ndarray) -> float:
-    """Returns the root of the trace of a face's position covariance, which is the RMS length of the error."""
     return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 

@@ -16,7 +16,7 @@ from stcal.boards.design import (
     TagLayout,
 )
 from stcal.labels import DotLabel
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from stcal.workflows.calibrate_camera import corner_grid
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph
 from tests.outcome import fails_with
 
@@ -118,11 +118,6 @@ def test_corners_are_dots_without_extent():
     assert (grid.rows, grid.columns, grid.pitch_mm, grid.sigma_mm) == (4, 6, 25.0, 0.02)
     with fails_with("E-BOARD-TYPE … tags"):
         corner_grid(TagLayout((("DICT_4X4_50", 1),), np.zeros((1, 4, 2))))
-
-
-def test_a_folder_without_the_board(tmp_path):
-    with fails_with("E-IMAGES-FOLDER … does not exist"):
-        calibrate_camera_by_corners(tmp_path / "none", ChessboardDesign(7, 10, 12.0))
 
 
 @pytest.mark.slow

@@ -17,9 +17,9 @@ from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
 from stcal.io.device import pictures_of
 from stcal.sfm import MeasureOptions, measure
+from stcal.sfm.measurement.known_target import read_target
 from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of
-from stcal.sfm.measurement.report import poses_file
-from stcal.sfm.measurement.target import read_target
+from stcal.sfm.measurement.pose_report import poses_file
 from stcal.sfm.measurement.tracker import Tracker
 from tests.outcome import fails_with
 from tests.sfm.truth import true_poses

@@ -19,10 +19,11 @@ from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
-from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
+from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.measurement.known_target import TargetCircles, read_target
+from stcal.sfm.measurement.measure_images import MeasureOptions, measure, measure_labelled
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
-from stcal.sfm.measurement.report import poses_file
-from stcal.sfm.measurement.target import TargetCircles, read_target
+from stcal.sfm.measurement.pose_report import poses_file
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses
@@ -51,6 +52,10 @@ def one_view(scene, rng, faces, noise_px, tilt_deg, distance_mm):
         image = see(scene, truth, faces, noise_px, rng)
         if len(image) >= 8 * len(faces):
             return truth, towards, image
+
+
+def measured_from(images, *more):
+    return measure_labelled([LabelledImage(image, ()) for image in images], *more)
 
 
 def pose_of(image, target, camera, **more):
@@ -132,7 +137,7 @@ def test_images_are_resolved_in_order_of_their_names(scene, known):
         replace(see(scene, truth, ("1", "2", "4") if i == 0 else ("1",), 0.5, rng), name=f"a/{i}", group="a")
         for i in range(3)
     ]
-    asked = measure_labelled(images[::-1], scene.camera, known.truth, MeasureOptions(previous=True))
+    asked = measured_from(images[::-1], scene.camera, known.truth, MeasureOptions(previous=True))
     assert [(i.name, i.pose.status) for i in asked.images] == [
         ("a/0", "certain"),
         ("a/1", "resolved"),
@@ -140,7 +145,7 @@ def test_images_are_resolved_in_order_of_their_names(scene, known):
     ]
     for each in asked.images:
         assert np.linalg.norm(pose_error(each.pose.camera_from_target, truth)[:3]) < 0.1
-    plain = measure_labelled(images, scene.camera, known.truth)
+    plain = measured_from(images, scene.camera, known.truth)
     assert [i.pose.status for i in plain.images] == ["certain", "ambiguous", "ambiguous"]
     content = poses_file(plain).content()
     assert content["images"][0]["alternative"] is None
@@ -399,7 +404,7 @@ def test_what_the_covariance_lacks_is_said(small_run, tmp_path):
 )
 def test_other_joints_are_refused(stcal_sfm, small_dataset, small_run, tmp_path, measured, monkeypatch, text, message):
     """Of images that were measured already."""
-    monkeypatch.setattr(import_module("stcal.sfm.measurement.images"), "measure", lambda *_, **__: measured)
+    monkeypatch.setattr(import_module("stcal.sfm.measurement.measure_images"), "measure", lambda *_, **__: measured)
     joints = tmp_path / "joints.csv"
     joints.write_text(text)
     code, _, err = stcal_sfm(*command(small_dataset, small_run, tmp_path, "--joints", joints))
@@ -428,13 +433,34 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
     part = TargetCircles(
         tuple(truth.labels[i] for i in keep), truth.xyz[keep], truth.radius[keep], truth.covariance[np.ix_(rows, rows)]
     )
-    result = measure_labelled([image], scene.camera, part)
+    result = measured_from([image], scene.camera, part)
     assert result.images == ()
     assert result.left_out[0].reason == "face 2 is not calibrated"
     empty = ImageObservations(
         "a", ".", (), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2))
     )
-    assert measure_labelled([empty], scene.camera, truth).left_out[0].reason == NO_FACE
+    assert measured_from([empty], scene.camera, truth).left_out[0].reason == NO_FACE
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda camera: replace(camera, focal=camera.focal / 2, centre=(camera.centre + 0.5) / 2 - 0.5), "half"),
+        (lambda camera: replace(camera, centre=camera.centre + 150), "cut out"),
+        (lambda camera: replace(camera, focal=1.1 * camera.focal), None),
+    ],
+)
+def test_what_is_mistaken_in_the_camera_file(scene, known, change, said):
+    rng = np.random.default_rng(2)
+    images = [
+        replace(see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name)
+        for name in "abc"
+    ]
+    true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
+    shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
+    assert measured_from(shifted, true, known.truth).mistakes == ()
+    found = measured_from(shifted, change(true), known.truth).mistakes
+    assert found == () if said is None else said in found[0].replace("0.5 times", "half")
 
 
 def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):

@@ -18,7 +18,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
-from stcal.sfm.planning import bodies, session, views
+from stcal.sfm.planning import planned_views, session
 from stcal.sfm.planning.advise import Known, advise, known_of
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
@@ -36,9 +36,9 @@ from stcal.sfm.planning.forecast import (
     true_models,
     variance_shares,
 )
+from stcal.sfm.planning.planned_views import PlannedView, candidates, known_scene
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
-from stcal.sfm.planning.session import plan_with_board as make_plan
-from stcal.sfm.planning.views import PlannedView, candidates, known_scene
+from stcal.sfm.planning.session import plan as make_plan
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
@@ -253,7 +253,7 @@ def test_an_advised_view_beats_a_random_one(known, advice):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    monkeypatch.setattr(views, "GRID_DEG", 50.0)
+    monkeypatch.setattr(planned_views, "GRID_DEG", 50.0)
 
 
 @pytest.mark.slow
@@ -283,7 +283,7 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
 @pytest.mark.parametrize(("grid_deg", "least"), [(25.0, 4), pytest.param(10.0, 20, marks=SLOW)])
 def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch, grid_deg, least):
     """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
-    monkeypatch.setattr(views, "GRID_DEG", grid_deg)
+    monkeypatch.setattr(planned_views, "GRID_DEG", grid_deg)
     for model, own in offered(known):
         assert len(own) > least
         for view in own:
@@ -315,7 +315,7 @@ def test_a_plan_takes_a_camera_as_its_file():
     for given in (camera, model_of(camera)):
         assert session._scene(PlanOptions(images=2, camera=given), target, board, None).camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
-        assert bodies.planned_photographs(near, cube)[0].camera.same_as(camera)
+        assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
 
 
 def test_advice_holds_the_sigma_of_estimated_rims(small_run):
@@ -435,9 +435,8 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
         nominal_poses(target, path if faces else None)
 
 
-@pytest.mark.parametrize("size", [(None, None), (2592, None)])
-def test_plan_needs_the_size_of_the_camera(size):
-    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", *size, "f")
+def test_plan_needs_the_size_of_the_camera():
+    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
     with fails_with("E-CAMERA-SIZE"):
         PlanOptions(camera=camera)
 

@@ -1,6 +1,7 @@
 """Candidates for further photographs: what they would show, and where the photographer has to stand."""
 
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,14 +44,11 @@ class PlannedView:
 
     @property
     def labels(self) -> list[Label]:
-        """The labels in view."""
         return [self.model.labels[i] for i in self.model.point_index]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stand:
-    """Arrangement of a group's views, target frame."""
-
     centre: np.ndarray  # (3,) middle of board and faces
     axes: np.ndarray  # (3, 3) rows right, up, towards the cameras
     distance_mm: float  # median, of the cameras from the centre
@@ -69,7 +67,6 @@ class _Stand:
         return cls(centre, axes, float(np.median(distance)), directions, model.images[middle])
 
     def pose(self, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> Rigid:
-        """Returns camera_from_target of a camera that looks at the centre."""
         azimuth, elevation, roll = np.radians([azimuth_deg, elevation_deg, roll_deg])
         local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
         return looking_at(self.centre, np.array(local) @ self.axes, self.axes[1], self.distance_mm, roll)
@@ -173,7 +170,7 @@ def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]
 
 
 def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
-    """Returns whether rectangles, (m, 4, 3) corners in turn, are between the camera and points (n, 3); (m, n)."""
+    """Returns whether rectangles (m, 4, 3) are between the camera and points (n, 3); (m, n)."""
     origin, a, b = corners_camera[:, 0], corners_camera[:, 1], corners_camera[:, 3]
     a, b = a - origin, b - origin
     normal = np.cross(a, b)
@@ -185,16 +182,15 @@ def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
 
 
 def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
-    """Returns the angles between normal and line of sight, by ``board`` and face in view."""
-    board = scene.groups[group].target_from_board.rotation[:, 2]
-    plates = {"board": (-board, scene.board_outline(group).mean(0))}
-    for face_id in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
-        plates[face_id] = scene.target_from_face[face_id].rotation[:, 2], scene.face_outline(face_id).mean(0)
-    return {key: tilt_deg(normal, middle, position) for key, (normal, middle) in plates.items()}
+    normal, middle = scene.groups[group].target_from_board.rotation[:, 2], scene.board_outline(group).mean(0)
+    tilts = {"board": tilt_deg(-normal, middle, position)}
+    for face in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
+        outward, middle = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
+        tilts[face] = tilt_deg(outward, middle, position)
+    return tilts
 
 
 def tilt_deg(normal: np.ndarray, middle: np.ndarray, position: np.ndarray) -> float:
-    """Returns the angle between the normal of a plate and the line of sight from its middle to a position."""
     ray = position - middle
     return angle_deg(normal @ ray / np.linalg.norm(ray))
 
@@ -220,3 +216,53 @@ def single(
         covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
     )
     return noise.applied(image, setup.camera, setup.radius_mm())
+
+
+LEAST_COSINE = -0.2
+"""Smallest cosine of the angle between two faces that one view is to show."""
+MAX_TILT_DEG = 60.0
+"""Largest tilt of a face whose corners count as seen."""
+SHARES = (0.35, 0.5, 0.65)
+"""Where candidates stand between the normals of two faces."""
+
+
+def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+    """Returns candidates, each with two faces that one view can show, as a motion from the nearest photograph."""
+    target_from_face = setup.start.target_from_face
+    faces = [face for face in setup.target.faces if face.id in target_from_face]
+    normals = {face.id: face.outward * target_from_face[face.id].rotation[:, 2] for face in faces}
+    middles = {face.id: target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
+    centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
+    towards = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
+    away = np.linalg.norm(towards, axis=1)
+    distance = float(np.median(away))
+    views = []
+    for (one, two), share, roll in product(combinations(normals, 2), SHARES, ROLLS_DEG):
+        if normals[one] @ normals[two] < LEAST_COSINE:
+            continue
+        direction = share * normals[one] + (1 - share) * normals[two]
+        direction /= np.linalg.norm(direction)
+        cosine = towards @ direction / away
+        near = int(cosine.argmax())
+        axes = axes_of(model.camera_from_model[near], towards[near])
+        right, up, ahead = (axes @ direction).tolist()
+        pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
+        tilts = {face: tilt_deg(normals[face], middles[face], centre + distance * direction) for face in normals}
+        shown = {face: tilt for face, tilt in sorted(tilts.items()) if tilt < MAX_TILT_DEG}
+        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in shown]
+        name = f"{model.group}/view {one} {two} {share} {roll}"
+        views.append(
+            PlannedView(
+                model.group,
+                single(model, name, pose, labels, setup, noise),
+                float(np.degrees(np.arctan2(right, ahead)).round()),
+                float(np.degrees(np.arcsin(np.clip(up, -1, 1))).round()),
+                roll,
+                distance,
+                shown,
+                model.images[near],
+                model.images[near],
+                angle_deg(cosine[near]),
+            )
+        )
+    return views

@@ -3,14 +3,17 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.special import chdtri
 
 from stcal.boards.faces import why_unseen
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import ConvergenceError, DetectionError, StcalError
+from stcal.errors import DetectionError, InputError, StcalError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
@@ -23,10 +26,22 @@ from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.image import detect_target
-from stcal.sfm.detect.labels import label_single, without_defocus
-from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
-from stcal.sfm.measurement.target import TargetCircles, read_target
+from stcal.sfm.detect.labels import LabelledImage, label_single, without_defocus
+from stcal.sfm.measurement.known_target import TargetCircles, read_target
+from stcal.sfm.measurement.minima import MIN_CIRCLES
+from stcal.sfm.measurement.pose import (
+    FAILED,
+    PoseOptions,
+    TargetPose,
+    common_errors,
+    fit_verdict,
+    measured_pose,
+    resolved,
+)
 from stcal.sfm.measurement.tracker import Tracker
+
+MOST_TRIED = 5
+"""Largest number of images, those of most circles, in which mistakes in the camera file are looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +94,7 @@ class MeasureResult(Brief):
     intrinsics_held: bool  # whether the intrinsics were taken as exact
     common: np.ndarray  # (m, 6, r) of the poses, see :func:`stcal.sfm.measurement.pose.common_errors`
     searched: int | None = None  # number of images of a sequence that were searched as a whole
+    mistakes: tuple[str, ...] = ()  # in the camera file, each of which explains why poses do not fit
 
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
@@ -144,35 +160,32 @@ def measure(
     shown = True
     if options.sequence:
         outcomes, searched = _followed(files, camera, replace(target, design=design), board, options, step)
-        result = replace(result_of(outcomes, target, options, prior), searched=searched)
+        result = replace(_result_of(outcomes, target, options, prior), searched=searched)
+        skipped, shown = (), True
     else:
         with scratch_folder("measure") as cache:
             inputs = files, camera, design, board, options.ellipses, cache, options.workers, step, detect_target
             detection = detect_files(*inputs, forms=False, pictures=False)
         labelled = [label_single(i.file.name, i.file.group, i.detection, design) for i in detection.images]
         labelled = without_defocus(labelled, detection.camera, patterns_of(design, None))
-        shown = any(len(image.observations) for image in labelled)
-        notes = {image.observations.name: image.notes for image in labelled}
-        observations = [image.observations for image in labelled]
-        result = measure_labelled(observations, detection.camera, target, options, prior)
-        measured = tuple(replace(image, notes=notes[image.name]) for image in result.images)
-        result = replace(result, images=measured, left_out=(*detection.skipped, *result.left_out))
-    result = replace(result, left_out=(*unreadable, *result.left_out))
+        result = measure_labelled(labelled, detection.camera, target, options, prior)
+        skipped, shown = detection.skipped, any(len(image.observations) for image in labelled)
+    result = replace(result, left_out=(*unreadable, *skipped, *result.left_out))
     if not result.images:
         last = result.left_out[-1]
         printed = design.with_faces(printed=True).faces
         if printed and not shown:
             raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
+        remedy = " or ".join(result.mistakes) or "check target.toml (radii, polarity), faces.json and the exposure"
         raise DetectionError(
             "E-MEASURE-NONE",
-            f"no face of the target measured in {len(files)} images, first {last.name}: "
-            f"{last.reason}; check target.toml (radii, polarity), faces.json and the exposure",
+            f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; {remedy}",
         )
     return result
 
 
 def measure_labelled(
-    observations: Sequence[ImageObservations],
+    images: Sequence[LabelledImage],
     camera: Camera,
     target: TargetCircles,
     options: MeasureOptions | None = None,
@@ -181,22 +194,57 @@ def measure_labelled(
     """Returns the poses from labelled centres, without pixels."""
     options = options or MeasureOptions()
     outcomes: list[MeasuredImage | Skipped] = []
-    for group in by_group(observations).values():
+    notes = {image.observations.name: image.notes for image in images}
+    for group in by_group([image.observations for image in images]).values():
         before: TargetPose | None = None
         for image in sorted(group, key=lambda observation: observation.name):
             pose = measured_pose(image, camera, target, options.pose, prior)
             if options.previous and before is not None and isinstance(pose, TargetPose):
                 pose = resolved(pose, before.camera_from_target)
-            outcomes.append(outcome(image.name, pose, ()))
+            outcomes.append(_outcome(image.name, pose, notes[image.name]))
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
-    return result_of(outcomes, target, options, prior)
+    result = _result_of(outcomes, target, options, prior)
+    shown = [image.observations for image in images if len(image.observations) >= MIN_CIRCLES]
+    if 2 * sum(fit_verdict(image.pose) != "failed" for image in result.images) < len(shown):
+        result = replace(result, mistakes=_mistakes(sorted(shown, key=len)[-MOST_TRIED:], camera, target, options.pose))
+    return result
+
+
+def _mistakes(
+    images: Sequence[ImageObservations], camera: Camera, target: TargetCircles, options: PoseOptions
+) -> tuple[str, ...]:
+    """Returns the mistakes in the camera file without which most of the images pass the test of their fit."""
+
+    def misfit(own: Camera) -> float:
+        poses = [measured_pose(image, own, target, options) for image in images]
+        passed = [p.chi2 / chdtri(p.redundancy, FAILED) if isinstance(p, TargetPose) else np.inf for p in poses]
+        return float(np.median(passed))
+
+    def times(k: float) -> Camera:
+        return replace(camera, focal=k * camera.focal, centre=k * (camera.centre + 0.5) - 0.5)
+
+    middle, other = np.array([camera.width - 1, camera.height - 1]) / 2, "perspective" if camera.fisheye else "fisheye"
+    file = "the camera file is"
+    candidates = [
+        Candidate(f"{file} of whole images, and these are cut out of them", lambda: replace(camera, centre=middle)),
+        Candidate(f"{file} of a {other} lens", lambda: replace(camera, fisheye=not camera.fisheye), 1),
+        Candidate(f"{file} right but for its distortion", lambda: replace(camera, distortion=0 * camera.distortion), 1),
+        *(Candidate(f"{file} of images {1 / k:g} times as wide", partial(times, k), 2) for k in (0.5, 2.0)),
+    ]
+    return tuple(each.words for each, _ in explain(candidates, misfit, 1.0))
+
+
+def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[MeasureResult, np.ndarray]:
+    """Returns the result of one image, and the centres (n, 2) in it, px."""
+    outcome, centre_px = _observed(tracker, image, name)
+    return _result_of([outcome], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior), centre_px
 
 
 def _followed(
     files: Sequence[ImageFile], camera_model: CameraModel, target, board, options, step: Callable[[object], None]
 ) -> tuple[list[MeasuredImage | Skipped], int]:
-    """Returns the outcomes of files, each folder of which is a sequence in order of name, and the number of images that
-    were searched as a whole. Folders run in parallel; ``step`` is called once for each file."""
+    """Returns the outcomes of all folders, each a sequence in order of name, and the number of images searched as a
+    whole. Folders run in parallel; ``step`` is called once for each file."""
     camera, size_from = sized_by(camera_model, list(files))
     folders: dict[str, list[ImageFile]] = {}
     for file in sorted(files, key=lambda each: each.name):
@@ -208,14 +256,12 @@ def _followed(
         followed[i] = found
         for file in jobs[i][0]:
             step(file.name)
-    outcomes = [each for i in range(len(jobs)) for each in followed[i][0]]
-    return outcomes, sum(searched for _, searched in followed.values())
+    return [each for i in range(len(jobs)) for each in followed[i][0]], sum(own for _, own in followed.values())
 
 
 def _follow_folder(
     files: Sequence[ImageFile], model: CameraModel, camera: Camera, size_from: str, target, board, options
 ) -> tuple[list[MeasuredImage | Skipped], int]:
-    """Returns the outcome of each image of a folder, and the number of images that were searched as a whole."""
     tracker = Tracker(target, model, board, options.pose, options.ellipses)
     outcomes: list[MeasuredImage | Skipped] = []
     name_of_digest: dict[str, str] = {}
@@ -226,28 +272,34 @@ def _follow_folder(
             outcomes.append(loaded)
             continue
         data, image = loaded
-        digest = hashlib.sha256(data).hexdigest()
-        if digest in name_of_digest:
-            outcomes.append(copy_of(file, name_of_digest[digest]))
+        first = name_of_digest.setdefault(hashlib.sha256(data).hexdigest(), file.name)
+        if first != file.name:
+            outcomes.append(copy_of(file, first))
             continue
-        name_of_digest[digest] = file.name
-        try:
-            labelled, pose = tracker.observe(image, file.name)
-        except ConvergenceError as error:
-            outcomes.append(Skipped(file.name, str(error), "distortion"))
-            continue
+        outcome, _ = _observed(tracker, image, file.name)
         searched += tracker.searched
-        outcomes.append(outcome(file.name, pose, labelled.notes))
+        outcomes.append(outcome)
     return outcomes, searched
 
 
-def outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) -> MeasuredImage | Skipped:
+def _observed(tracker: Tracker, image: np.ndarray, name: str) -> tuple[MeasuredImage | Skipped, np.ndarray]:
+    """Returns the outcome of one image, and the centres (n, 2) in it, px."""
+    try:
+        labelled, pose = tracker.observe(image, name)
+    except InputError:
+        raise
+    except StcalError as error:  # such as a distortion that cannot be inverted: the next image may do
+        return Skipped(name, str(error), "distortion"), np.zeros((0, 2))
+    return _outcome(name, pose, labelled.notes), labelled.observations.centre_px
+
+
+def _outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) -> MeasuredImage | Skipped:
     if isinstance(pose, StcalError):
         return Skipped(name, str(pose).removeprefix(f"{name}: "), "pose")
     return MeasuredImage(name, pose, notes)
 
 
-def result_of(found: Sequence[MeasuredImage | Skipped], target: TargetCircles, options, prior) -> MeasureResult:
+def _result_of(found: Sequence[MeasuredImage | Skipped], target: TargetCircles, options, prior) -> MeasureResult:
     measured = tuple(image for image in found if isinstance(image, MeasuredImage))
     left_out = tuple(image for image in found if isinstance(image, Skipped))
     factor = target.sigma_factor if options.pose.sigma_factor is None else options.pose.sigma_factor

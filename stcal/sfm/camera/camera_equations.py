@@ -3,18 +3,19 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from typing import Any
 
 import numpy as np
 
-from stcal.adjust.blocks import Block, Huber, Vector
+from stcal.adjust.blocks import Huber, Vector
 from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import Camera
 from stcal.geometry.clusters import ByClusters
 from stcal.geometry.least_squares import PoseStack, minimise
 from stcal.geometry.print_modes import PrintModes
-from stcal.sfm.adjust.equations import image_cost, normalised
+from stcal.sfm.adjust.equations import image_cost
 from stcal.sfm.adjust.refine import placed, reproject
 from stcal.sfm.data.model import MetricModel
 
@@ -32,23 +33,15 @@ START_DAMPING = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Unknowns of a calibration."""
-
     models: tuple[MetricModel, ...]  # of one folder's board each
     camera: Camera
 
     def only(self, names: set[str]) -> "State":
-        """Returns the state with the images of these ``names`` alone."""
         parts = [_of_images(model, names) for model in self.models]
         return replace(self, models=tuple(part for part in parts if part.images))
 
     def cost(self, huber: float) -> float:
-        """Returns the χ² of the images, with Huber's loss beyond ``huber``."""
         return sum(image_cost(model, self.camera, huber) for model in self.models)
-
-    def normalised(self) -> np.ndarray:
-        """Returns the normalised residuals of all observations, (n, 2)."""
-        return np.concatenate([normalised(model, self.camera) for model in self.models])
 
     def redundancy(self, kept: int) -> int:
         """Observed coordinates minus unknowns of poses minus ``kept``; dots are observed as often as unknown."""
@@ -58,17 +51,13 @@ class State:
 def _of_images(model: MetricModel, names: set[str]) -> MetricModel:
     """Returns the model with the images of these names alone, and with all its points."""
     keep = np.array([name in names for name in model.images])
-    rows = np.flatnonzero(keep[model.image_index])
+    seen = model.observed(np.flatnonzero(keep[model.image_index]))
     return replace(
-        model,
-        images=tuple(name for name in model.images if name in names),
-        camera_from_model=tuple(pose for pose, own in zip(model.camera_from_model, keep, strict=True) if own),
-        image_index=(np.cumsum(keep) - 1)[model.image_index[rows]],
-        **{name: getattr(model, name)[rows] for name in OF_OBSERVATIONS},
+        seen,
+        images=tuple(compress(model.images, keep)),
+        camera_from_model=tuple(compress(model.camera_from_model, keep)),
+        image_index=(np.cumsum(keep) - 1)[seen.image_index],
     )
-
-
-OF_OBSERVATIONS = ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +70,6 @@ class Board:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """Constants of one minimisation."""
-
     basis: np.ndarray  # (16, q)
     weight: np.ndarray  # (q, q) of the vague prior about ``start``
     start: Camera
@@ -96,22 +83,19 @@ class Setting:
 
     def camera(self, away: Vector) -> Camera:
         """Returns the camera with these parameters of the COLMAP model minus those at the start, (1, q)."""
-        return self.start.with_parameters(_positive(self.start.parameters() + self.basis @ away.array[0]))
+        parameters = self.start.parameters() + self.basis @ away.array[0]
+        if not ((parameters[:2] > 0).all() and np.isfinite(parameters).all()):  # of no camera: no image agrees with it
+            parameters = np.r_[TINY_PX, TINY_PX, np.zeros(len(parameters) - 2)]
+        return self.start.with_parameters(parameters)
 
     @property
     def kept(self) -> int:
-        """Number of kept unknowns."""
         return self.basis.shape[1]
 
-
-def dots_costs(state: State, setting: Setting) -> np.ndarray:
-    """Returns the χ² of the dots' places: of dots by themselves, and of the modes of the prints."""
-    boards = [setting.boards[model.group] for model in state.models]
-    each = [
-        board.modes.costs(model.xyz_model - board.places, setting.sigma_mm)
-        for model, board in zip(state.models, boards, strict=True)
-    ]
-    return np.sum(each, axis=0)
+    def dots_cost(self, state: State) -> float:
+        """Returns the χ² of the places of dots by themselves, without the modes of the prints."""
+        off = [(self.boards[model.group], model.xyz_model) for model in state.models]
+        return float(sum(own.modes.costs(xyz - own.places, self.sigma_mm)[0] for own, xyz in off))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,30 +108,22 @@ class Normal:
 
     @classmethod
     def of(cls, state: State, setting: Setting) -> "Normal":
-        """Returns the equations at a state."""
         joined, values = _problem(state, setting)
         return cls(state.models, setting, joined.at(values))
 
     @cached_property
     def state(self) -> State:
-        """The state."""
         return self._state(self.solution.values)
 
     @property
     def cost(self) -> float:
-        """Cost of the state, in σ²."""
         return float(self.solution.cost)
-
-    @property
-    def lens(self) -> Block:
-        """The parameters of the lens model, minus those at the start."""
-        return self.solution.problem.parts[0].blocks[LENS]
 
     def by_photographs(self) -> ByClusters:
         """Returns the covariance of the lens model's parameters by how the photographs differ."""
         if not self.setting.kept:
             return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
-        return self.solution.by_clusters(self.lens)
+        return self.solution.by_clusters(self.solution.problem.parts[0].blocks[LENS])
 
     def with_found_prints(self) -> tuple[float, dict[str, Board]]:
         """Returns the redundancy of the observations of the dots by themselves, and the boards with the amplitudes of
@@ -168,15 +144,12 @@ class Normal:
         return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
 
     def largest_move(self, step: np.ndarray) -> float:
-        """Returns the largest move of a projection by a step, px."""
         new = self.moved(step)
-        before, after = (
-            np.concatenate([model.residuals_px(state.camera) for model in state.models]) for state in (self.state, new)
-        )
-        return float(np.abs(after - before).max())
+        pairs = zip(self.state.models, new.models, strict=True)
+        moves = (b.residuals_px(new.camera) - a.residuals_px(self.state.camera) for a, b in pairs)
+        return max(float(np.abs(move).max()) for move in moves)
 
     def moved(self, step: np.ndarray) -> State:
-        """Returns the state after a step of all unknowns."""
         return self._state(self.solution.problem.moved(self.solution.values, step))
 
     def _state(self, values: Mapping[str, Any]) -> State:
@@ -211,7 +184,6 @@ def _problem(state: State, setting: Setting) -> tuple[Joined, dict[str, Any]]:
 
 
 def minimum(state: State, setting: Setting) -> State:
-    """Returns the state of least cost."""
     joined, values = _problem(state, setting)
     solution = minimise(
         values,
@@ -231,10 +203,3 @@ def minimum(state: State, setting: Setting) -> State:
                 "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
             )
     return solution.linear.state
-
-
-def _positive(parameters: np.ndarray) -> np.ndarray:
-    """Returns the parameters if they are those of a camera, else parameters that no image agrees with."""
-    if (parameters[:2] > 0).all() and np.isfinite(parameters).all():
-        return parameters
-    return np.concatenate([[TINY_PX, TINY_PX], np.zeros(len(parameters) - 2)])

@@ -1,7 +1,8 @@
 """Checks of calibrated intrinsics: σ of projections over the image, cross-validation of lens models."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -9,6 +10,7 @@ from scipy.optimize import least_squares
 from stcal.adjust.blocks import Vector
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
+from stcal.explain import Candidate, explain
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.least_squares import PoseStack
 from stcal.labels import Label
@@ -25,6 +27,7 @@ from stcal.sfm.camera.intrinsics import (
 )
 from stcal.sfm.data.model import ImageObservations, by_group
 
+R = TypeVar("R")
 GRID = (13, 9)
 MIN_REACH = 0.75
 """Smallest advised reach of dots from the middle towards a corner. Beyond it little distortion is extrapolated."""
@@ -32,8 +35,6 @@ MIN_REACH = 0.75
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectionSigma:
-    """σ of projections over the image."""
-
     sigma_px: np.ndarray  # (n,) per axis at :func:`image_grid`, up to a rotation of the camera, which poses absorb
     reach: np.ndarray  # (4,) of dots towards the corners (top left, top right, bottom left, bottom right), 1 there
     corner_sigma_px: np.ndarray  # (4,)
@@ -117,17 +118,21 @@ def agreement(result: Intrinsics) -> tuple[float, float]:
     return (both / most, 1 / np.sqrt(pairs)) if most > 0 and pairs else (0.0, 1.0)
 
 
+def larger_models(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> list[Candidate]:
+    """Returns the lens model to try if that of ``result`` is too small."""
+    larger = LARGER.get(result.colmap_model)
+    return [Candidate(f"use --model {larger}", lambda: _fitted(views, board, result.camera, larger))] if larger else []
+
+
 def of_lens_model(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> list[str]:
     """Returns a warning where residuals agree between photographs, with the larger lens model if that explains it."""
     found, chance = agreement(result)
     if found < max(AGREEING, AGREEING_SIGMAS * chance):
         return []
-    said = f"residuals at one place of the image agree between photographs, correlation {found:.2f}"
-    larger = LARGER.get(result.colmap_model)
-    other = _fitted(views, board, result.camera, larger) if larger else None
-    if isinstance(other, Intrinsics) and (left := agreement(other)[0]) < found / 2:
-        return [f"{said}, {left:.2f} with {larger}: the lens model is too small; use --model {larger}"]
-    return [f"{said}, which is in no σ: look at the mean residuals, and at light that is alike in all photographs"]
+    why = ", which is in no σ: look at the mean residuals, and at light that is alike in all photographs"
+    for model, left in explain(larger_models(result, views, board), lambda fit: agreement(fit)[0], found / 2):
+        why = f", {left:.2f} with a larger lens model; {model.words}"
+    return [f"residuals at one place of the image agree between photographs, correlation {found:.2f}{why}"]
 
 
 FOLDS = 5
@@ -159,9 +164,9 @@ class HeldOut:
     factor: float  # median, by which residuals of the calibrations exceed these σ
     folds: int  # number of parts
 
-    def rms_px(self, factor: float | None = None) -> float:
-        """Returns the RMS per coordinate without gross errors; ``factor`` replaces the factor of this object."""
-        most = CLIP_SIGMAS * (factor or self.factor)
+    def rms_px(self) -> float:
+        """Returns the RMS per coordinate without gross errors."""
+        most = CLIP_SIGMAS * self.factor
         kept = [px[np.abs(own).max(axis=1) < most] for px, own in zip(self.residuals_px, self.in_sigma, strict=True)]
         return float(np.sqrt((np.concatenate(kept) ** 2).mean()))
 
@@ -171,9 +176,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
-    """A lens model that was compared with others."""
-
+class TriedModel:
     model: str
     parameters: int  # their number
     rms_px: float | None  # of held-out views
@@ -197,37 +200,33 @@ def held_out(
     residuals_of_view: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     factors = []
     for fold in range(folds):
-        excluded = [view for i, view in enumerate(views) if i % folds == fold]
-        training = [view for i, view in enumerate(views) if i % folds != fold]
-        without = of_some_views(result, training, board)
+        without = of_some_views(result, [view for i, view in enumerate(views) if i % folds != fold], board)
         factors.append(without.factors.centres)
-        residuals_of_view |= {view.name: foretold(view, board, without) for view in excluded}
+        residuals_of_view |= {view.name: foretold(view, board, without) for view in views[fold::folds]}
     residuals_px, in_sigma = zip(*(residuals_of_view[view.name] for view in views), strict=True)
     return HeldOut(residuals_px, in_sigma, float(np.median(factors)), folds)
 
 
 def choose_model(
     views: Sequence[ImageObservations], board: BoardDesign, known: Intrinsics, workers: int | None = None
-) -> tuple[str, tuple[Candidate, ...]]:
+) -> tuple[str, tuple[TriedModel, ...]]:
     """Returns the simplest lens model that predicts held-out views as well as the best one, and all candidates.
     ``known``: intrinsics of any model that fits, at which models of the same projection start."""
-    fits = run_in_order(_fitted, [(views, board, known.camera, model) for model in CANDIDATES], workers)
-    fitted = {model: fit for model, fit in zip(CANDIDATES, fits, strict=True) if isinstance(fit, Intrinsics)}
-    why = {model: str(fit) for model, fit in zip(CANDIDATES, fits, strict=True) if isinstance(fit, StcalError)}
+    jobs = [(_fitted, views, board, known.camera, model) for model in CANDIDATES]
+    fits = dict(zip(CANDIDATES, run_in_order(_or_error, jobs, workers), strict=True))
+    fitted = {model: fit for model, fit in fits.items() if isinstance(fit, Intrinsics)}
+    why = {model: str(fit) for model, fit in fits.items() if isinstance(fit, StcalError)}
     least = min(fitted, key=lambda model: fitted[model].factors.centres, default="")
     for model, fit in fitted.items():
         if (ratio := fit.factors.centres / fitted[least].factors.centres) > HOPELESS:
             why[model] = f"residuals {ratio:.3g} times those of {least}"
     tried = [model for model in fitted if model not in why]
-    outcomes = run_in_order(_tried, [(views, board, fitted[model]) for model in tried], workers)
-    fared: dict[str, HeldOut] = {}
-    for model, outcome in zip(tried, outcomes, strict=True):
-        if isinstance(outcome, HeldOut):
-            fared[model] = outcome
-        else:
-            why[model] = str(outcome or "too few views")
+    outcomes = run_in_order(_or_error, [(held_out, fitted[model], views, board) for model in tried], workers)
+    both = dict(zip(tried, outcomes, strict=True))
+    fared = {model: outcome for model, outcome in both.items() if isinstance(outcome, HeldOut)}
+    why |= {model: str(outcome or "too few views") for model, outcome in both.items() if model not in fared}
     if not fared:
-        for fit in fits:
+        for fit in fits.values():
             if isinstance(fit, StcalError) and not tried:
                 raise fit
         raise DegenerateError(
@@ -237,32 +236,28 @@ def choose_model(
     factor = min(entry.factor for entry in fared.values())  # one σ for all models: that of the model that fits best
     squares = {model: entry.squares(factor) for model, entry in fared.items()}
     best = min(squares, key=lambda model: squares[model].mean())
-    rows = {}
+    rows = []
     for model in CANDIDATES:
-        row = Candidate(model, len(parameter_names(model)), None, None, None, why.get(model, ""))
+        row = TriedModel(model, len(parameter_names(model)), None, None, None, why.get(model, ""))
         if model in fared:
             apart = squares[model] - squares[best]
             sigma = float(apart.std(ddof=1) / np.sqrt(len(apart)))
             row = replace(row, rms_px=fared[model].rms_px(), worse=float(apart.mean()), worse_sigma=sigma)
-        rows[model] = row
-    as_good = [row for row in rows.values() if row.worse is not None and row.worse <= LIKELY * (row.worse_sigma or 0.0)]
-    chosen = min(as_good, key=lambda row: (row.parameters, row.worse or 0.0))
-    return chosen.model, tuple(rows.values())
+        rows.append(row)
+    as_good = [row for row in rows if row.worse is not None and row.worse <= LIKELY * (row.worse_sigma or 0.0)]
+    return min(as_good, key=lambda row: (row.parameters, row.worse or 0.0)).model, tuple(rows)
 
 
-def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics | StcalError:
+def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics:
     start = known.with_parameters(intrinsic_basis(model) @ model_parameters(known, model))
     if known.fisheye != (FISHEYE in model):
         start = closed_form(views, board, start_camera(known.width, known.height, model))
-    try:
-        return adjust_intrinsics(views, board, start, model)
-    except StcalError as error:
-        return error
+    return adjust_intrinsics(views, board, start, model)
 
 
-def _tried(views, board: BoardDesign, result: Intrinsics) -> HeldOut | StcalError | None:
+def _or_error(function: Callable[..., R], *arguments) -> R | StcalError:
     try:
-        return held_out(result, views, board)
+        return function(*arguments)
     except StcalError as error:
         return error
 
