@@ -40,9 +40,8 @@ def timed_advice() -> float:
     from stcal.geometry.rigid import Rigid
     from stcal.sfm.adjust.chain import CalibratedTarget
     from stcal.sfm.adjust.joint import covariance_of
-    from stcal.sfm.planning.advise import Known, advise
+    from stcal.sfm.planning.advise import KnownRun, advise, known_scene
     from stcal.sfm.planning.forecast import CentreNoise, Setup, observe, true_models
-    from stcal.sfm.planning.planned_views import known_scene
     from stcal.synthetic.scene import SceneOptions, make_scene
 
     scene = make_scene(SceneOptions(images_per_group=ADVISED // GROUPS))
@@ -53,7 +52,7 @@ def timed_advice() -> float:
     start = CalibratedTarget(scene.reference_face, poses, scene.circles_target, groups)
     setup = Setup(scene.target, scene.board, scene.camera, start, "plane", 0.02, None, 0.0)
     joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm)
-    known = Known(tuple(models), joint, setup, noise, known_scene(models, joint, setup, "OPENCV"))
+    known = KnownRun(tuple(models), joint, setup, noise, known_scene(models, joint, setup, "OPENCV"))
     begin = time.perf_counter()
     advise(known)
     return time.perf_counter() - begin

@@ -15,9 +15,9 @@ from .make import design_tag_body as design_tag_body
 from .make import design_target as design_target
 from .measurement.known_target import read_target as read_target
 from .measurement.measure_images import MeasureOptions as MeasureOptions
+from .measurement.measure_images import Tracker as Tracker
 from .measurement.measure_images import measure as measure
 from .measurement.pose_report import poses_csv as poses_csv
-from .measurement.tracker import Tracker as Tracker
 from .pipeline import detect_images as detect_images
 from .pipeline import run as run
 from .planning.advise import advise as advise

@@ -26,13 +26,13 @@ from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
     MAX_RESIDUAL_PX,
     CameraCalibration,
-    adjusted,
     calibrated,
     judged,
     require_determined,
+    require_views,
     unsized,
 )
-from stcal.sfm.camera.intrinsics import Intrinsics
+from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form
 from stcal.sfm.camera.lens_checks import foretold
 from stcal.sfm.data.model import ImageObservations
 from stcal.workflows.board_views import covariance_px2, detect_boards, kind_of
@@ -80,36 +80,30 @@ def calibrate_camera_by_corners(
         One of its subclasses, with a one-line message that says what to do.
     """
     grid = corner_grid(board)
-    one = partial(_of_model, board, grid, workers, progress or (lambda *_: None))
-    return calibrated(one, images, grid, colmap_model, workers)
+    told, rounds = progress or (lambda *_: None), ROUNDS.get(type(board), 1)
 
+    def of_model(
+        files: list[ImageFile], not_images: Sequence[Skipped], camera: Camera, colmap_model: str
+    ) -> CameraCalibration:
+        for done in range(1, rounds + 1):
+            step = partial(told, f"detect {done}")
+            detections = detect_boards(files, unsized(camera, colmap_model), board, (), workers, step)
+            views = _observations(files, detections.views(), grid, camera)
+            skipped = (*not_images, *detections.skipped)
+            require_views(views, files, skipped)
+            start = camera if done > 1 else closed_form(views, grid, camera)
+            result = adjust_intrinsics(views, grid, start, colmap_model)
+            camera = result.camera
+        kept, without, warnings = without_gross_errors(views, grid, result)
+        if without or warnings:
+            views, skipped = kept, (*skipped, *without)
+            require_views(views, files, skipped)
+            result = replace(adjust_intrinsics(views, grid, camera, colmap_model), restarted=result.restarted)
+        require_determined(result, views, grid)
+        calibration = judged(result, views, skipped, rounds, True, grid)
+        return replace(calibration, warnings=(*calibration.warnings, *warnings))
 
-def _of_model(
-    board: FlatBoard,
-    grid: CornerBoard,
-    workers: int | None,
-    progress: Progress,
-    files: list[ImageFile],
-    not_images: Sequence[Skipped],
-    camera: Camera,
-    colmap_model: str,
-) -> CameraCalibration:
-    rounds = ROUNDS.get(type(board), 1)
-    for done in range(1, rounds + 1):
-        step = partial(progress, f"detect {done}")
-        detections = detect_boards(files, unsized(camera, colmap_model), board, (), workers, step)
-        views = _observations(files, detections.views(), grid, camera)
-        skipped = (*not_images, *detections.skipped)
-        result = adjusted(views, files, skipped, grid, camera, colmap_model, done == 1)
-        camera = result.camera
-    kept, without, warnings = without_gross_errors(views, grid, result)
-    if without or warnings:
-        views, skipped = kept, (*skipped, *without)
-        again = adjusted(views, files, skipped, grid, camera, colmap_model, False)
-        result = replace(again, restarted=result.restarted)
-    require_determined(result, views, grid)
-    calibration = judged(result, views, skipped, rounds, True, grid)
-    return replace(calibration, warnings=(*calibration.warnings, *warnings))
+    return calibrated(of_model, images, grid, colmap_model, workers)
 
 
 def without_gross_errors(

@@ -264,7 +264,7 @@ def _serve(setting: tuple, source: int | str | None, host: str, port: int, limit
     """Answers images until Ctrl-C, or shows the pictures of a source as long as there are any."""
     from stcal.io.device import pictures_of
     from stcal.sfm.measurement.live import LiveService, line_of, served
-    from stcal.sfm.measurement.tracker import Tracker
+    from stcal.sfm.measurement.measure_images import Tracker
 
     service = LiveService(Tracker(*setting), source is not None, **limits)
     shown = nullcontext(iter(())) if source is None else pictures_of(source)

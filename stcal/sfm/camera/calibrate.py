@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -118,8 +117,38 @@ def calibrate_camera(
     StcalError
         A stage failed. The one-line message says what to do.
     """
-    one = partial(_of_model, target, board, ellipses or EllipseOptions(), workers, progress or (lambda *_: None))
-    return calibrated(one, images, board, colmap_model, workers)
+    ellipses, progress = ellipses or EllipseOptions(), progress or (lambda *_: None)
+
+    def of_model(
+        files: list[ImageFile], not_images: Sequence[Skipped], camera: Camera, colmap_model: str
+    ) -> CameraCalibration:
+        before: Intrinsics | None = None
+        settled = of_perspective = False
+        with scratch_folder("camera") as cache:
+            for rounds in range(1, MAX_ROUNDS + 1):
+                step, lens = counted(progress, f"detect {rounds}", len(files)), unsized(camera, colmap_model)
+                inputs = files, lens, target, board, ellipses, Path(cache), workers, step
+                found = files, not_images, detect_files(*inputs, pictures=False)
+                try:
+                    views, skipped, result = _of_one_round(*found, board, camera, colmap_model, before is None)
+                except (DetectionError, DegenerateError):
+                    if before is not None or of_perspective or not camera.fisheye:
+                        raise
+                    # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds
+                    # it.
+                    start = start_camera(camera.width, camera.height, PERSPECTIVE)
+                    rough = of_model(files, not_images, start, PERSPECTIVE)
+                    camera, of_perspective = replace(camera, focal=rough.intrinsics.camera.focal), True
+                    continue
+                result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
+                camera = result.camera
+                settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
+                if settled:
+                    break
+                before = result
+        return judged(result, views, skipped, rounds, settled, board)
+
+    return calibrated(of_model, images, board, colmap_model, workers)
 
 
 def calibrated(
@@ -129,8 +158,8 @@ def calibrated(
     colmap_model: str,
     workers: int | None,
 ) -> CameraCalibration:
-    """Returns the calibration ``of_model`` by the photographs of a folder, from a camera of their size; with ``auto``,
-    of the lens model that held-out views choose."""
+    """Returns the calibration ``of_model`` by a folder's photographs, from a camera of their size; with ``auto``, of
+    the lens model that held-out views choose."""
     if colmap_model == AUTO:
         return of_chosen_model(lambda model: calibrated(of_model, images, board, model, workers), board, workers)
     if colmap_model not in COLMAP_MODELS:
@@ -145,44 +174,6 @@ def calibrated(
 def unsized(camera: Camera, colmap_model: str) -> CameraModel:
     """Returns a camera without its size, which then comes from most of the images, and messages say so."""
     return CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, OF_IMAGES)
-
-
-def _of_model(
-    target: TargetDesign,
-    board: BoardDesign,
-    ellipses: EllipseOptions,
-    workers: int | None,
-    progress: Progress,
-    files: list[ImageFile],
-    not_images: Sequence[Skipped],
-    camera: Camera,
-    colmap_model: str,
-) -> CameraCalibration:
-    before: Intrinsics | None = None
-    settled = of_perspective = False
-    with scratch_folder("camera") as cache:
-        for rounds in range(1, MAX_ROUNDS + 1):
-            step, lens = counted(progress, f"detect {rounds}", len(files)), unsized(camera, colmap_model)
-            detection = detect_files(files, lens, target, board, ellipses, Path(cache), workers, step, pictures=False)
-            try:
-                views, skipped, result = _of_one_round(
-                    files, not_images, detection, board, camera, colmap_model, before is None
-                )
-            except (DetectionError, DegenerateError):
-                if before is not None or of_perspective or not camera.fisheye:
-                    raise
-                # With the focal length of a wide lens, boards of a longer one look bent. A perspective model finds it.
-                start = start_camera(camera.width, camera.height, PERSPECTIVE)
-                rough = _of_model(target, board, ellipses, workers, progress, files, not_images, start, PERSPECTIVE)
-                camera, of_perspective = replace(camera, focal=rough.intrinsics.camera.focal), True
-                continue
-            result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
-            camera = result.camera
-            settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
-            if settled:
-                break
-            before = result
-    return judged(result, views, skipped, rounds, settled, board)
 
 
 def camera_of_dots(
@@ -227,23 +218,10 @@ def _of_one_round(
         if each.file.name not in shown
     )
     skipped = (*not_images, *detection.skipped, *without)
-    result = adjusted(views, files, skipped, board, camera, colmap_model, first)
+    require_views(views, files, skipped)
+    result = adjust_intrinsics(views, board, closed_form(views, board, camera) if first else camera, colmap_model)
     require_determined(result, views, board)
     return views, skipped, result
-
-
-def adjusted(
-    views: Sequence[ImageObservations],
-    files: Sequence[ImageFile],
-    skipped: Sequence[Skipped],
-    board: BoardDesign,
-    camera: Camera,
-    colmap_model: str,
-    first: bool,
-) -> Intrinsics:
-    """Returns the intrinsics by these views, from ``camera``, or, at ``first``, from the closed form."""
-    require_views(views, files, skipped)
-    return adjust_intrinsics(views, board, closed_form(views, board, camera) if first else camera, colmap_model)
 
 
 def of_chosen_model(

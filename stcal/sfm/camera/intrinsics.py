@@ -1,25 +1,217 @@
-"""Intrinsics from views of the dot board: start, and one adjustment over intrinsics and board poses."""
+"""Intrinsics from views of the dot board: start, and one adjustment over intrinsics, board poses and places of dots."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import compress
+from typing import Any
 
 import numpy as np
 
+from stcal.adjust.blocks import Huber, Vector
+from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
+from stcal.geometry.clusters import ByClusters
+from stcal.geometry.least_squares import PoseStack, minimise
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.geometry.variances import sigma_factor
 from stcal.labels import DotLabel, Label
-from stcal.sfm.adjust.equations import normalised, robust_weights
-from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.camera_equations import Board, Normal, Setting, State, minimum
+from stcal.sfm.adjust.equations import image_cost, normalised, robust_weights
+from stcal.sfm.adjust.refine import eccentricity_px, placed, reproject
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectedImage
 from stcal.sfm.detect.labels import labelled_image
+
+MAX_STEPS = 200
+EXACTLY = 1e-15
+"""Largest relative decrease of χ² that is predicted for a step at convergence."""
+SETTLED_PX = 1e-5
+"""Largest move of a projection at convergence, px. Along a valley, χ² may decrease forever without a visible change."""
+TINY_PX = 1e-3
+"""Focal length that stands for invalid parameters."""
+CREEPING_PX = 1e-3
+"""Largest move of a projection accepted after all steps: a direction that hardly changes the images has a large σ."""
+START_DAMPING = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensState:
+    models: tuple[MetricModel, ...]  # of one folder's board each
+    camera: Camera
+
+    def only(self, names: set[str]) -> "LensState":
+        parts = [_of_images(model, names) for model in self.models]
+        return replace(self, models=tuple(part for part in parts if part.images))
+
+    def cost(self, huber: float) -> float:
+        return sum(image_cost(model, self.camera, huber) for model in self.models)
+
+    def redundancy(self, kept: int) -> int:
+        """Observed coordinates minus unknowns of poses minus ``kept``; dots are observed as often as unknown."""
+        return sum(2 * len(m.image_index) - 6 * len(m.images) for m in self.models) - kept
+
+
+def _of_images(model: MetricModel, names: set[str]) -> MetricModel:
+    """Returns the model with the images of these names alone, and with all its points."""
+    keep = np.array([name in names for name in model.images])
+    seen = model.observed(np.flatnonzero(keep[model.image_index]))
+    return replace(
+        seen,
+        images=tuple(compress(model.images, keep)),
+        camera_from_model=tuple(compress(model.camera_from_model, keep)),
+        image_index=(np.cumsum(keep) - 1)[seen.image_index],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Board:
+    """The board of one folder as drawn: ``places`` (n, 3) of its dots, mm, and how its print may deviate."""
+
+    places: np.ndarray
+    modes: PrintModes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensSetting:
+    basis: np.ndarray  # (16, q)
+    weight: np.ndarray  # (q, q) of the vague prior about ``start``
+    start: Camera
+    boards: dict[str, Board]
+    sigma_mm: float
+    huber: float
+
+    def away(self, camera: Camera) -> np.ndarray:
+        """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
+        return np.linalg.pinv(self.basis) @ (camera.parameters() - self.start.parameters())
+
+    def camera(self, away: Vector) -> Camera:
+        """Returns the camera with these parameters of the COLMAP model minus those at the start, (1, q)."""
+        parameters = self.start.parameters() + self.basis @ away.array[0]
+        if not ((parameters[:2] > 0).all() and np.isfinite(parameters).all()):  # of no camera: no image agrees with it
+            parameters = np.r_[TINY_PX, TINY_PX, np.zeros(len(parameters) - 2)]
+        return self.start.with_parameters(parameters)
+
+    @property
+    def kept(self) -> int:
+        return self.basis.shape[1]
+
+    def dots_cost(self, state: LensState) -> float:
+        """Returns the χ² of the places of dots by themselves, without the modes of the prints."""
+        off = [(self.boards[model.group], model.xyz_model) for model in state.models]
+        return float(sum(own.modes.costs(xyz - own.places, self.sigma_mm)[0] for own, xyz in off))
+
+
+@dataclass(frozen=True, eq=False)
+class LensNormal:
+    """The adjustment linearised about a state; only the lens is damped, as dots and poses are optimal for each step."""
+
+    models: tuple[MetricModel, ...]  # at any state
+    setting: LensSetting
+    solution: JoinedSolution
+
+    @classmethod
+    def of(cls, state: LensState, setting: LensSetting) -> "LensNormal":
+        joined, values = _problem(state, setting)
+        return cls(state.models, setting, joined.at(values))
+
+    @cached_property
+    def state(self) -> LensState:
+        return self._state(self.solution.values)
+
+    @property
+    def cost(self) -> float:
+        return float(self.solution.cost)
+
+    def by_photographs(self) -> ByClusters:
+        """Returns the covariance of the lens model's parameters by how the photographs differ."""
+        if not self.setting.kept:
+            return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
+        return self.solution.by_clusters(self.solution.problem.parts[0].blocks[LENS])
+
+    def with_found_prints(self) -> tuple[float, dict[str, Board]]:
+        """Returns the redundancy of the observations of the dots by themselves, and the boards with the amplitudes of
+        their modes that explain the dots best."""
+        boards, left, sigma_mm = {}, 0.0, self.setting.sigma_mm
+        for model, part in zip(self.state.models, self.solution.whole, strict=True):
+            board, covariance = self.setting.boards[model.group], part.covariance(part.problem.blocks[DOTS])
+            modes = board.modes.modes
+            of_modes = modes.T @ covariance @ modes
+            left += len(covariance) - len(of_modes) - float(np.trace(covariance) - np.trace(of_modes)) / sigma_mm**2
+            found = board.modes.as_found(model.xyz_model - board.places, of_modes, sigma_mm)
+            boards[model.group] = replace(board, modes=found)
+        return left, boards
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Returns the step of all unknowns, and the predicted gain: none where no projection moves visibly."""
+        step, gain = self.solution.step(damping)
+        return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
+
+    def largest_move(self, step: np.ndarray) -> float:
+        new = self.moved(step)
+        pairs = zip(self.state.models, new.models, strict=True)
+        moves = (b.residuals_px(new.camera) - a.residuals_px(self.state.camera) for a, b in pairs)
+        return max(float(np.abs(move).max()) for move in moves)
+
+    def moved(self, step: np.ndarray) -> LensState:
+        return self._state(self.solution.problem.moved(self.solution.values, step))
+
+    def _state(self, values: Mapping[str, Any]) -> LensState:
+        names = [model.group for model in self.models]
+        moved = [placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
+        return LensState(tuple(moved), self.setting.camera(values["lens"]))
+
+
+POSES, DOTS_OF = "poses of ", "dots of "
+LENS, DOTS = 0, 1
+
+
+def _problem(state: LensState, setting: LensSetting) -> tuple[Joined, dict[str, Any]]:
+    """Returns the adjustment of all boards from a state, and its unknowns there."""
+    parts, first = [], 0
+    values: dict[str, Any] = {"lens": Vector(setting.away(state.camera)[None])}
+    for model in state.models:
+        a, board = Adjustment(), setting.boards[model.group]
+        values[POSES + model.group] = PoseStack.of(*model.camera_from_model)
+        values[DOTS_OF + model.group] = Vector(model.xyz_model)
+        lens = a.block("lens", values["lens"])
+        dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
+        poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
+        cluster, loss = first + model.image_index, Huber(setting.huber)
+        reproject(a, model, (dots, poses, lens), setting.camera, setting.basis, cluster=cluster, loss=loss)
+        a.prior(dots, board.places, board.modes.weight(setting.sigma_mm))
+        if not parts:
+            a.prior(lens, np.zeros((1, setting.kept)), setting.weight)
+        parts.append(a)
+        first += len(model.images)
+    return Joined(parts, ("lens",)), values
+
+
+def minimum(state: LensState, setting: LensSetting) -> LensState:
+    joined, values = _problem(state, setting)
+    solution = minimise(
+        values,
+        lambda at: LensNormal(state.models, setting, joined.at(at)),
+        joined.moved,
+        cost=joined.cost,
+        damping=START_DAMPING,
+        settled=EXACTLY,
+        max_steps=MAX_STEPS,
+    )
+    if not solution.converged:  # a direction that hardly changes the images has a large σ
+        move = solution.linear.largest_move(solution.linear.step(START_DAMPING)[0])
+        if not move < CREEPING_PX:
+            raise ConvergenceError(
+                "E-NO-MINIMUM",
+                f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
+                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
+            )
+    return solution.linear.state
+
 
 START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
 """Approximate focal lengths over the longer image side: between wide-angle and portrait; equidistant lens of 127°."""
@@ -173,7 +365,7 @@ MIN_BOARD_REDUNDANCY = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class SigmaFactors:
+class BoardSigmaFactors:
     """Ratios of residuals to the detected centres' σ (``centres``), and to the board file's σ of dots (``dots``)."""
 
     centres: float = 1.0
@@ -189,11 +381,11 @@ class Intrinsics:
     differ: float  # by how much photographs differ more than their pixels explain, as a ratio of σ
     freedom: np.ndarray  # (q,) effective degrees of freedom of what the photographs tell
     models: tuple[MetricModel, ...]  # of one folder's board each, mm, board frame
-    factors: SigmaFactors
+    factors: BoardSigmaFactors
     huber: float  # length of a normalised residual beyond which its weight decreases
     redundancy: int
     settled: bool  # whether σ and eccentricities converged within :data:`MAX_ROUNDS`
-    solution: tuple[State, Setting]  # from which solutions of some of the views start
+    solution: tuple[LensState, LensSetting]  # from which solutions of some of the views start
     restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
 
     def sigma(self) -> np.ndarray:
@@ -242,8 +434,8 @@ def adjust_intrinsics(
     for folder, members in by_group(views).items():
         labels = tuple(sorted({label for view in members for label in view.labels}))
         models.append(model_of_views(folder, labels, members, board, start))
-    state = State(tuple(models), start)
-    setting = Setting(
+    state = LensState(tuple(models), start)
+    setting = LensSetting(
         basis=basis,
         weight=np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),
         start=start,
@@ -264,7 +456,7 @@ def adjust_intrinsics(
     return replace(_adjusted(state, setting, board, colmap_model), restarted=True)
 
 
-def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
+def _intrinsics(last: LensNormal, colmap_model: str, factors: BoardSigmaFactors, settled: bool) -> Intrinsics:
     state, setting, by_photographs = last.state, last.setting, last.by_photographs()
     return Intrinsics(
         camera=state.camera,
@@ -294,7 +486,7 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
     whole, setting = result.solution
     state = whole.only({view.name for view in views})
     for _ in range(MOST_STEPS):
-        last = Normal.of(state, setting)
+        last = LensNormal.of(state, setting)
         step, gain = last.step(0.0)
         if gain < NO_GAIN:
             return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
@@ -304,16 +496,16 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
     return adjust_intrinsics(views, board, result.camera, result.colmap_model)
 
 
-def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: str) -> Intrinsics:
+def _adjusted(state: LensState, setting: LensSetting, board: BoardDesign, colmap_model: str) -> Intrinsics:
     """Alternates minimisation and estimation of σ, amplitudes of the prints, and eccentricity."""
-    detected_covariance, factors = [m.covariance_px2 for m in state.models], SigmaFactors()
+    detected_covariance, factors = [m.covariance_px2 for m in state.models], BoardSigmaFactors()
     for round_index in range(MAX_ROUNDS):
         before = state
         state = _weighted(state, detected_covariance, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
         setting = replace(setting, sigma_mm=factors.dots * board.sigma_mm)
         state, setting = _robust_minimum(state, setting)
-        last = Normal.of(state, setting)
+        last = LensNormal.of(state, setting)
         updated, boards = _updated_factors(last, factors)
         changes = [updated.centres / factors.centres, updated.dots / factors.dots] + [
             boards[folder].modes.amplitude / old.modes.amplitude for folder, old in setting.boards.items()
@@ -326,7 +518,7 @@ def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: 
     return _intrinsics(last, colmap_model, factors, settled)
 
 
-def _robust_minimum(state: State, setting: Setting) -> tuple[State, Setting]:
+def _robust_minimum(state: LensState, setting: LensSetting) -> tuple[LensState, LensSetting]:
     """Returns the state of least cost, and the setting with Huber's limit by its residuals."""
     state = minimum(state, setting)
     length = np.linalg.norm(np.concatenate([normalised(model, state.camera) for model in state.models]), axis=1)
@@ -353,7 +545,7 @@ def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDe
     )
 
 
-def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board: BoardDesign) -> State:
+def _weighted(state: LensState, own: list[np.ndarray], factors: BoardSigmaFactors, board: BoardDesign) -> LensState:
     """Returns the state with scaled σ of the centres, larger ones in loud photographs, and updated eccentricity."""
     radius: dict[Label, float] = {**board.radius_of()}
     equal = [replace(m, covariance_px2=factors.centres**2 * each) for m, each in zip(state.models, own, strict=True)]
@@ -369,7 +561,7 @@ def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board:
     return replace(state, models=models)
 
 
-def _loudness(state: State) -> list[np.ndarray]:
+def _loudness(state: LensState) -> list[np.ndarray]:
     """Returns by model the factor on σ of each photograph: above 1 where its residuals exceed those of most by far."""
     sizes = []
     for model in state.models:
@@ -379,7 +571,7 @@ def _loudness(state: State) -> list[np.ndarray]:
     return [np.maximum(own / usual, 1.0) for own in sizes]
 
 
-def _updated_factors(last: Normal, factors: SigmaFactors) -> tuple[SigmaFactors, dict[str, Board]]:
+def _updated_factors(last: LensNormal, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, Board]]:
     """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy, and
     the boards with the amplitudes of their prints."""
     state, setting = last.state, last.setting
@@ -387,4 +579,4 @@ def _updated_factors(last: Normal, factors: SigmaFactors) -> tuple[SigmaFactors,
     dots, image_redundancy = factors.dots, state.redundancy(setting.kept) - dots_left
     if dots_left > MIN_BOARD_REDUNDANCY:
         dots = max(LEAST_DOTS, dots * sigma_factor(setting.dots_cost(state), dots_left))
-    return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards
+    return BoardSigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards

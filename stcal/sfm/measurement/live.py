@@ -22,10 +22,9 @@ from stcal.io.images import decode, stated_size
 from stcal.parallel import one_thread
 from stcal.report.document import environment
 from stcal.report.svg import AXIS_COLOURS, COLOURS
-from stcal.sfm.measurement.measure_images import measured_by
+from stcal.sfm.measurement.measure_images import Tracker, measured_by
 from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.measurement.pose_report import poses_file
-from stcal.sfm.measurement.tracker import Tracker
 
 try:
     import uvicorn

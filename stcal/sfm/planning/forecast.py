@@ -171,7 +171,7 @@ class CentreNoise:
         sampled = [model.observed(np.flatnonzero(~own)) for model, own in zip(sampled, corner, strict=True)]
         if not any(len(model.point_index) for model in sampled):
             return replace(cls.expected(), corner_px=corner_px)
-        rims = [_Rims.of(model, camera, radius_mm) for model in sampled]
+        rims = [_RimImages.of(model, camera, radius_mm) for model in sampled]
         both = [rim.information @ model.covariance_px2 for rim, model in zip(rims, sampled, strict=True)]
         ratio = np.trace(np.concatenate(both), axis1=1, axis2=2) / 2
         narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
@@ -186,7 +186,7 @@ class CentreNoise:
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
         """Returns the metric model with the covariances that this noise gives its observations."""
-        rims = _Rims.of(model, camera, radius_mm)
+        rims = _RimImages.of(model, camera, radius_mm)
         size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
         covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
         covariance[_is_corner(model, radius_mm)] = self.corner_px**2 * np.eye(2)
@@ -199,14 +199,14 @@ def _is_corner(model: MetricModel, radius_mm: dict[Label, float]) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rims:
+class _RimImages:
     """Images of n circles: ``information`` : (n, 2, 2) ∮ n nᵀ ds, px; ``minor_px`` : (n,) minor semi-axis."""
 
     information: np.ndarray
     minor_px: np.ndarray
 
     @classmethod
-    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
+    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_RimImages":
         """Returns the rims as ellipses, to first order in radius over distance. The error is negligible for a σ."""
         radius = np.array([radius_mm[label] for label in model.labels])
         in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]

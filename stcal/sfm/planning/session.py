@@ -10,14 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from stcal.design import (
-    BoardDesign,
-    KnownDistance,
-    ScaleReference,
-    TargetDesign,
-    reference_board,
-    scale_reference,
-)
+from stcal.design import BoardDesign, KnownDistance, ScaleReference, TargetDesign, reference_board, scale_reference
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Brief, require_arguments, require_fields, rms
 from stcal.geometry.camera import Camera

@@ -18,8 +18,8 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
-from stcal.sfm.planning import planned_views, session
-from stcal.sfm.planning.advise import Known, advise, known_of
+from stcal.sfm.planning import session
+from stcal.sfm.planning.advise import KnownRun, PlannedView, advise, candidates, known_of, known_scene
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,
@@ -36,7 +36,6 @@ from stcal.sfm.planning.forecast import (
     true_models,
     variance_shares,
 )
-from stcal.sfm.planning.planned_views import PlannedView, candidates, known_scene
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
 from stcal.sfm.planning.session import plan as make_plan
 from stcal.sfm.runs.saved import load_run
@@ -176,14 +175,14 @@ def test_centre_noise_is_found_again(exact):
     assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
 
 
-def known_from(scene: Scene) -> Known:
+def known_from(scene: Scene) -> KnownRun:
     setup, models = setup_of(scene, 0.005), tuple(models_of(scene))
     joint = covariance_of(models, setup.board, setup.camera)
-    return Known(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
+    return KnownRun(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
 
 
 @pytest.fixture(scope="module")
-def known(exact) -> Known:
+def known(exact) -> KnownRun:
     return known_from(exact)
 
 
@@ -192,7 +191,7 @@ def advice(known):
     return advise(known, 2)
 
 
-def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
+def after(known: KnownRun, views: list[PlannedView], now: Forecast) -> Forecast:
     models = {model.group: model for model in known.models}
     for view in views:
         models[view.group] = models[view.group].plus(view.model)
@@ -253,7 +252,7 @@ def test_an_advised_view_beats_a_random_one(known, advice):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    monkeypatch.setattr(planned_views, "GRID_DEG", 50.0)
+    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 50.0)
 
 
 @pytest.mark.slow
@@ -283,7 +282,7 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
 @pytest.mark.parametrize(("grid_deg", "least"), [(25.0, 4), pytest.param(10.0, 20, marks=SLOW)])
 def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch, grid_deg, least):
     """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
-    monkeypatch.setattr(planned_views, "GRID_DEG", grid_deg)
+    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", grid_deg)
     for model, own in offered(known):
         assert len(own) > least
         for view in own:
