@@ -45,7 +45,7 @@ from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_ca
 from stcal.sfm.camera.lens_checks import FOLDS, foretold
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.runs.options import RunOptions
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])
 SIZE = 2592, 1728

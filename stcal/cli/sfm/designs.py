@@ -12,7 +12,7 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import MOST_SEED, WRITES, Arg, Opt
-from stcal.cli.terminal import StageProgress, print_each, say, write_if
+from stcal.cli.terminal import StageProgress, print_each, printed_last, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import COMPARISON, RUN_MARKER, json_text, real_place, save
 
@@ -226,8 +226,9 @@ def compare(
 
     if run.suffix.lower() == ".csv":
         of_poses = compare_poses(run, truth)
-        say(poses_table(of_poses))
-        write_if(out, lambda: of_poses, "as JSON")
+        with printed_last():
+            say(poses_table(of_poses))
+            write_if(out, lambda: of_poses, "as JSON")
         return
 
     into_run = run / COMPARISON
@@ -236,11 +237,12 @@ def compare(
         comparison = against(run, truth)
         if stage is not None:
             save(stage / COMPARISON, json_text(comparison))
-    say(comparison_table(comparison))
-    if is_added:
-        say(f"as JSON: {into_run}")
-    else:
-        write_if(out or (into_run if run.is_dir() else None), lambda: comparison, "as JSON")
+    with printed_last():
+        say(comparison_table(comparison))
+        if is_added:
+            say(f"as JSON: {into_run}")
+        else:
+            write_if(out or (into_run if run.is_dir() else None), lambda: comparison, "as JSON")
 
 
 @app.command()

@@ -159,88 +159,73 @@ def _outliers(result: Intrinsics) -> Iterator[OutlierDot]:
 
 
 def calibration_report(result: CameraCalibration, summary: CalibrationFile, where: str) -> Document:
-    lens, held_out = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model), result.held_out
+    lens, held = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model), summary.held_out_rms_px
     digits = {name: 4 if name[0] in "fc" else 7 for name in summary.parameters}
-    parameters = [
-        [name, number(each.value, digits[name]), number(each.sigma, digits[name])]
-        for name, each in summary.parameters.items()
-    ]
+    rows = [[n, number(own.value, digits[n]), number(own.sigma, digits[n])] for n, own in summary.parameters.items()]
     models = [
-        ["*" if each.model == summary.model else "", each.model, str(each.parameters)]
-        + [number(v, 4) for v in (each.rms_px, each.worse, each.worse_sigma)]
-        + [each.why]
-        for each in summary.models
+        ["*" if own.model == summary.model else "", own.model, str(own.parameters)]
+        + [number(v, 4) for v in (own.rms_px, own.worse, own.worse_sigma)]
+        + [own.why]
+        for own in summary.models
     ]
-    images = [[each.image, each.dots, number(each.tilt_deg, 1), number(each.rms_px, 4)] for each in summary.images]
+    images = [[own.image, own.dots, number(own.tilt_deg, 1), number(own.rms_px, 4)] for own in summary.images]
     outliers = [[o.image, o.label, number(o.residual_px, 3), number(o.weight, 2)] for o in summary.outliers]
+    left_out = [[own.name, own.reason] for own in summary.left_out]
     differ = f"{summary.photographs_differ:.1f} times more than their pixels explain; σ are larger by that"
-    blocks: list[Block] = [
+    parameters: list[Block] = [
         bullets(summary.warnings[1:]),
-        Table(["<parameter", "value, px", "σ"], parameters),
+        Table(["<parameter", "value, px", "σ"], rows),
         "the principal point counts from the centre of the top-left pixel; the camera file, as COLMAP's, counts from "
         f"that pixel's corner, so that cx, cy are {COLMAP_PIXEL_ORIGIN:g} px larger there",
         f"σ of a projection: {summary.projection_sigma_px:.4f} px median over the image, "
         f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner",
         f"photographs differ {differ if summary.photographs_differ > NOTED else 'no more than their pixels explain'}",
     ]
-    if held_out is not None:
-        blocks.append(
-            f"views held out, {held_out.folds} parts: residual RMS {held_out.rms_px():.4f} px after their poses were "
-            "fitted"
-        )
+    if result.held_out is not None:
+        parts = f"{result.held_out.folds} parts: residual RMS {held:.4f} px"
+        parameters.append(f"views held out, {parts} after their poses were fitted")
     for folder, own in summary.prints.items():
         board = "the board" if folder == "." else f"the board of {folder}"
-        blocks += stretch_in_words(board, own.stretch, own.shear)
-    chosen: list[Block] = [
+        parameters += stretch_in_words(board, own.stretch, own.shear)
+    parameters.append(plot(lambda: distortion_figure(lens), "What the lens moves"))
+    uncertainty = [
+        "How well it is known where the camera sees a known direction, up to a rotation of the camera, which poses "
+        "absorb. White: dots",
+        plots(plot(lambda: sigma_map(result), "σ of a projection over the image", "", "")),
+    ]
+    residuals = [
+        "Means over cells of the image. Arrows that are alike in neighbouring cells are what the lens model leaves",
+        plots(plot(lambda: residual_map(result), "Mean residuals, measured minus projected", css="")),
+    ]
+    chosen = [
         f"--model auto: {summary.model}, the simplest that foretells views held out as well as the best: not worse "
         "than it by more than two standard errors",
         Table(["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"], models),
     ]
+    out = [
+        Table(["<image or file", "<reason"], left_out, css="text"),
+        Table(["<image", "<dot", "residual px", "weight"], outliers),
+    ]
+    if summary.warnings:
+        answer = Answer("with care", summary.warnings[0])
+    else:
+        fit = "" if held is None else f"; views held out fit to {held:.3g} px"
+        answer = Answer("yes", f"no check found anything{fit}")
     return Document(
         "Calibration of a camera",
         f"{where}: {summary.model}, {summary.size_px[0]}×{summary.size_px[1]} px: {len(result.views)} views of the "
         f"board, {sum(len(view) for view in result.views)} dots, residual RMS {summary.residual_rms_px:.4f} px, "
         f"{result.rounds} rounds of detection",
         [
-            Section(
-                "Parameters", [*blocks, plot(lambda: distortion_figure(lens), "What the lens moves")], terminal=True
-            ),
-            Section(
-                "Uncertainty over the image",
-                [
-                    "How well it is known where the camera sees a known direction, up to a rotation of the camera, "
-                    "which poses absorb. White: dots",
-                    plots(plot(lambda: sigma_map(result), "σ of a projection over the image", "", "")),
-                ],
-            ),
-            Section(
-                "Residuals",
-                [
-                    "Means over cells of the image. Arrows that are alike in neighbouring cells are what the lens "
-                    "model leaves",
-                    plots(plot(lambda: residual_map(result), "Mean residuals, measured minus projected", css="")),
-                ],
-            ),
+            Section("Parameters", parameters, terminal=True),
+            Section("Uncertainty over the image", uncertainty),
+            Section("Residuals", residuals),
             Section("Lens models", chosen if models else [], terminal=True),
             Section("Views", [Table(["<image", "dots", "tilt °", "RMS px"], images)]),
-            Section(
-                "Left out",
-                [
-                    Table(["<image or file", "<reason"], [[e.name, e.reason] for e in summary.left_out], css="text"),
-                    Table(["<image", "<dot", "residual px", "weight"], outliers),
-                ],
-                terminal=True,
-            ),
+            Section("Left out", out, terminal=True),
         ],
-        [_verdict(summary)],
+        [answer],
     )
-
-
-def _verdict(summary: CalibrationFile) -> Answer:
-    if summary.warnings:
-        return Answer("with care", summary.warnings[0])
-    held = summary.held_out_rms_px
-    return Answer("yes", "no check found anything" + ("" if held is None else f"; views held out fit to {held:.3g} px"))
 
 
 def _image_axes(camera: Camera) -> Axes:

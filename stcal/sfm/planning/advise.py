@@ -154,18 +154,10 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
             continue
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
-        views.append(
-            PlannedView(
-                model.group,
-                single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup, noise),
-                *place,
-                stand.distance_mm,
-                _tilts_deg(scene, model.group, position, labels),
-                stand.middle,
-                model.images[int(np.argmax(cosine))],
-                angle_deg(cosine.max()),
-            )
-        )
+        seen = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup, noise)
+        tilts = _tilts_deg(scene, model.group, position, labels)
+        nearest = stand.middle, model.images[int(np.argmax(cosine))], angle_deg(cosine.max())
+        views.append(PlannedView(model.group, seen, *place, stand.distance_mm, tilts, *nearest))
     return views
 
 
@@ -267,25 +259,14 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
         near = int(cosine.argmax())
         axes = axes_of(model.camera_from_model[near], towards[near])
         right, up, ahead = (axes @ direction).tolist()
+        go_deg = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
         pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
         tilts = {face: tilt_deg(normals[face], middles[face], centre + distance * direction) for face in normals}
         shown = {face: tilt for face, tilt in sorted(tilts.items()) if tilt < MAX_TILT_DEG}
         labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in shown]
-        name = f"{model.group}/view {one} {two} {share} {roll}"
-        views.append(
-            PlannedView(
-                model.group,
-                single(model, name, pose, labels, setup, noise),
-                float(np.degrees(np.arctan2(right, ahead)).round()),
-                float(np.degrees(np.arcsin(np.clip(up, -1, 1))).round()),
-                roll,
-                distance,
-                shown,
-                model.images[near],
-                model.images[near],
-                angle_deg(cosine[near]),
-            )
-        )
+        seen = single(model, f"{model.group}/view {one} {two} {share} {roll}", pose, labels, setup, noise)
+        nearest = model.images[near], model.images[near], angle_deg(cosine[near])
+        views.append(PlannedView(model.group, seen, *go_deg, roll, distance, shown, *nearest))
     return views
 
 

@@ -16,7 +16,7 @@ from stcal.boards.design import (
     TagLayout,
 )
 from stcal.labels import DotLabel
-from stcal.workflows.calibrate_camera import corner_grid
+from stcal.workflows.board_views import corner_grid
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph
 from tests.outcome import fails_with
 

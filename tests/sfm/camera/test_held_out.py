@@ -23,7 +23,7 @@ from stcal.sfm.camera.calibrate import (
 from stcal.sfm.camera.camera_report import calibration_file, calibration_report
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
 from stcal.sfm.camera.lens_checks import choose_model, held_out, of_lens_model
-from stcal.workflows.calibrate_camera import without_gross_errors
+from stcal.workflows.board_views import without_gross_errors
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of, with_a_field

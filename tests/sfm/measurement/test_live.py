@@ -206,26 +206,24 @@ def test_pictures_of_a_folder_or_a_video_of_odd_size(small_run, small_dataset, t
 @pytest.mark.parametrize(
     ("words", "code"),
     [
-        ([], "E-LIVE-SOURCE … --camera-index 0"),
-        (["http://127.0.0.1:9/clip"], "E-LIVE-SOURCE … http://127.0.0.1:9/clip"),
-        (["--strict"], "E-OPTION-CONFLICT … --strict"),
-        (["--json", "poses.json"], "E-OPTION-CONFLICT … --json -"),
-        (["--out", "clip.csv"], "E-OPTION-CONFLICT … --out … --json -"),
+        (["--live"], "E-LIVE-SOURCE … --camera-index 0"),
+        (["--live", "http://127.0.0.1:9/clip"], "E-LIVE-SOURCE … http://127.0.0.1:9/clip"),
+        (["--live", "--strict"], "E-OPTION-CONFLICT … --strict"),
+        (["--live", "--json", "poses.json"], "E-OPTION-CONFLICT … --json -"),
+        (["--live", "--out", "clip.csv"], "E-OPTION-CONFLICT … --out … --json -"),
+        (["--serve", "images"], "E-OPTION-CONFLICT … IMAGES: images come"),
+        (["--serve", "--previous"], "E-OPTION-CONFLICT … --previous: images come"),
+        (["--serve", "--workers", "2"], "E-OPTION-CONFLICT … --workers: images come"),
+        (["--serve", "--live"], "E-OPTION-CONFLICT … --serve: images come"),
+        (["clip.avi"], "E-IMAGES-FOLDER … clip.avi: a file, and no image … --live --json -"),
     ],
 )
-def test_what_cannot_be_shown_ends_in_one_line(small_run, words, code):
-    faces = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
+def test_what_cannot_be_shown_ends_in_one_line(small_run, tmp_path, monkeypatch, words, code):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clip.avi").write_bytes(b"RIFF")
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json", "--port", "0"]
     with fails_with(code):
-        CliRunner().invoke(
-            app, ["sfm", "measure", "--live", *map(str, faces), "--port", "0", *words], catch_exceptions=False
-        )
-
-
-def test_a_video_without_live_is_told_how_it_is_measured(small_run, tmp_path):
-    (clip := tmp_path / "clip.avi").write_bytes(b"RIFF")
-    faces = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
-    with fails_with("E-IMAGES-FOLDER … clip.avi: a file, and no image … --live --json -"):
-        CliRunner().invoke(app, ["sfm", "measure", str(clip), *map(str, faces)], catch_exceptions=False)
+        CliRunner().invoke(app, ["sfm", "measure", *map(str, files), *words], catch_exceptions=False)
 
 
 PATIENCE_S = 60.0
@@ -289,19 +287,3 @@ def test_a_port_that_is_taken_and_other_machines_with_a_token():
         port = taken.getsockname()[1]
         with fails_with("E-SERVICE-ADDRESS … Address already in use"), served(LiveService(None), port=port):
             pass
-
-
-@pytest.mark.parametrize(
-    ("words", "other"),
-    [
-        (["images"], "IMAGES"),
-        (["--previous"], "--previous"),
-        (["--workers", "2"], "--workers"),
-        (["--live"], "--serve"),
-    ],
-)
-def test_what_belongs_to_a_folder_is_refused(small_run, stcal_sfm, words, other):
-    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
-    ended = stcal_sfm("measure", *words, *files, "--serve")
-    assert (ended[0], ended.error) == (2, "E-OPTION-CONFLICT")
-    assert f"{other}: images come" in ended[2]
