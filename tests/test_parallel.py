@@ -18,8 +18,7 @@ from stcal.parallel import ONE_THREAD, kept_processes, run_in_order, run_paralle
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
-CORES = str(len(os.sched_getaffinity(0)))
-"""OpenBLAS begins as many threads."""
+CORES = str(len(os.sched_getaffinity(0)))  # OpenBLAS begins as many threads
 
 
 def threads() -> set[int]:

@@ -56,15 +56,10 @@ from stcal.sfm.detect.files import load_image, sized_by
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import labelled_image
 
-CENTRING_ROUNDS = 3
-"""Rounds of the correction for the ellipses' centres. The error of the pose from these centres is less than a
-thousandth of the correction; two rounds would be enough."""
-CORNER_SIGMA_PX = 0.1
-"""σ of corners whose detector states none."""
-NEAREST = 6
-"""Number of outlines about a circle, one of which is its neighbour."""
-MIN_SHARE = 0.35
-"""Smallest share of a board's circles that must be seen."""
+CENTRING_ROUNDS = 3  # of the correction for the ellipses' centres; two would leave a thousandth of it
+CORNER_SIGMA_PX = 0.1  # σ of corners whose detector states none
+NEAREST = 6  # number of outlines about a circle, one of which is its neighbour
+MIN_SHARE = 0.35  # smallest share of a board's circles that must be seen
 Board = BoardDesign | FlatBoard | BoardSet
 KINDS = {
     BoardDesign: "dots",
@@ -372,12 +367,9 @@ def calibration_images(
     return CalibrationImages(names, views, tags, detections.camera, detections.symmetries, left_out)
 
 
-GROSS_SIGMAS = 10.0
-"""Smallest deviation of a gross error from camera and board, in σ; it is more than :data:`MAX_RESIDUAL_PX`, too."""
-LEAST_CORNERS = 6
-"""Smallest number of corners of a view of which others were left out: they still check one another."""
-LEAST_SHARE = 0.5
-"""Smallest share of the corners of a view that are no gross errors; with fewer of them the view is not used."""
+GROSS_SIGMAS = 10.0  # smallest deviation of a gross error from camera and board; it is above MAX_RESIDUAL_PX, too
+LEAST_CORNERS = 6  # smallest number of corners of a view of which others were left out: they still check one another
+LEAST_SHARE = 0.5  # of the corners of a view that are no gross errors; with fewer of them the view is not used
 
 
 @require_arguments
@@ -444,8 +436,7 @@ def calibrate_camera_by_corners(
 def without_gross_errors(
     views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics
 ) -> tuple[list[ImageObservations], list[Skipped], list[str]]:
-    """Returns the views without gross errors, whose weights in the adjustment would be small, but not zero; the views
-    that consist of them; and a warning about the others."""
+    """Returns the views without gross errors, those that consist of them, and a warning about the others."""
     suspects = {
         model.images[image]
         for model in result.models

@@ -271,8 +271,7 @@ def demo(
     say(comparison_table(comparison))
 
 
-CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
-"""Defaults of `design`."""
+CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"  # defaults of `design`
 
 
 @app.command()

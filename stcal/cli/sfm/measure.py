@@ -194,8 +194,7 @@ def calibrate_camera(
     shared.require_passed(strict, [] if intrinsics.settled else ["σ of centres and dots"], report)
 
 
-SAY_EVERY_S = 1.0
-"""Shortest time between two lines of --live, s."""
+SAY_EVERY_S = 1.0  # shortest time between two lines of --live, s
 
 
 TABLE = Path("poses.csv")

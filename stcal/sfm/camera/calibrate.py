@@ -46,13 +46,11 @@ from stcal.sfm.detect.files import DetectionResult, detect_files
 MIN_VIEWS = 3
 PERSPECTIVE, WIDE = "OPENCV", "OPENCV_FISHEYE"
 MAX_ROUNDS = 5
-SETTLED_SIGMAS = 0.1
-"""Largest move of a parameter by the next detection round, in its σ, at which the rounds end."""
+SETTLED_SIGMAS = 0.1  # largest move of a parameter by the next detection round, in its σ, at which the rounds end
 MAX_FOCAL_SIGMA = 0.02
 """Largest relative σ of the focal length. Beyond it the boards do not determine the focal length. Prints that may be
 stretched are in σ: ten views of a small board by a telephoto lens leave 1.1 %, those of an exact board 0.3 %."""
-MAX_RESIDUAL_PX = 1.0
-"""Largest weighted RMS residual. Beyond it the camera model or the board file does not fit the images."""
+MAX_RESIDUAL_PX = 1.0  # largest weighted RMS residual of a camera model and a board file that fit the images
 SUSPICIOUS_FACTOR = 3.0
 OUTLIER_WEIGHT = 0.5
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
@@ -158,8 +156,7 @@ def calibrated(
     colmap_model: str,
     workers: int | None,
 ) -> CameraCalibration:
-    """Returns the calibration ``of_model`` by a folder's photographs, from a camera of their size; with ``auto``, of
-    the lens model that held-out views choose."""
+    """Returns the calibration ``of_model`` by a folder's photographs; with ``auto``, of the best lens model."""
     if colmap_model == AUTO:
         return of_chosen_model(lambda model: calibrated(of_model, images, board, model, workers), board, workers)
     if colmap_model not in COLMAP_MODELS:
@@ -227,8 +224,7 @@ def _of_one_round(
 def of_chosen_model(
     calibrate: Callable[[str], CameraCalibration], board: BoardDesign, workers: int | None
 ) -> CameraCalibration:
-    """Returns a calibration with the lens model selected by held-out views, which a usual model finds. ``calibrate``:
-    calibrates with the model of the given name."""
+    """Returns the calibration with the lens model that held-out views select, which a usual model finds."""
     try:
         first = calibrate(PERSPECTIVE)
     except (DegenerateError, ConvergenceError, DetectionError) as error:

@@ -20,8 +20,7 @@ from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
 from stcal.sfm.camera.lens_checks import CELLS, GRID, TriedModel, mean_residuals
 
 MIN_IN_CELL = 3
-ARROW_SHARE = 0.7
-"""Largest length of a drawn mean residual, as a share of the cell."""
+ARROW_SHARE = 0.7  # largest length of a drawn mean residual, as a share of the cell
 ByCorner = Annotated[str, "corner"]
 
 

@@ -28,14 +28,10 @@ from stcal.sfm.detect.files import DetectedImage
 from stcal.sfm.detect.labels import labelled_image
 
 MAX_STEPS = 200
-EXACTLY = 1e-15
-"""Largest relative decrease of χ² that is predicted for a step at convergence."""
-SETTLED_PX = 1e-5
-"""Largest move of a projection at convergence, px. Along a valley, χ² may decrease forever without a visible change."""
-TINY_PX = 1e-3
-"""Focal length that stands for invalid parameters."""
-CREEPING_PX = 1e-3
-"""Largest move of a projection accepted after all steps: a direction that hardly changes the images has a large σ."""
+EXACTLY = 1e-15  # largest relative decrease of χ² that is predicted for a step at convergence
+SETTLED_PX = 1e-5  # largest move of a projection at convergence: along a valley, χ² may decrease forever, unseen
+TINY_PX = 1e-3  # focal length that stands for invalid parameters
+CREEPING_PX = 1e-3  # largest move accepted after all steps: what hardly changes the images has a large σ
 START_DAMPING = 1e-3
 
 
@@ -134,8 +130,7 @@ class LensNormal:
         return self.solution.by_clusters(self.solution.problem.parts[0].blocks[LENS])
 
     def with_found_prints(self) -> tuple[float, dict[str, Board]]:
-        """Returns the redundancy of the observations of the dots by themselves, and the boards with the amplitudes of
-        their modes that explain the dots best."""
+        """Returns the redundancy of the dots by themselves, and the boards with the amplitudes of their prints."""
         boards, left, sigma_mm = {}, 0.0, self.setting.sigma_mm
         for model, part in zip(self.state.models, self.solution.whole, strict=True):
             board, covariance = self.setting.boards[model.group], part.covariance(part.problem.blocks[DOTS])
@@ -213,10 +208,8 @@ def minimum(state: LensState, setting: LensSetting) -> LensState:
     return solution.linear.state
 
 
-START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
-"""Approximate focal lengths over the longer image side: between wide-angle and portrait; equidistant lens of 127°."""
-FOCAL_LIMITS = (0.2, 50.0)
-"""Limits of the focal length over the longer image side. Results of the closed form outside of them are noise."""
+START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45  # over the longer side: between wide-angle and portrait; equidistant, 127°
+FOCAL_LIMITS = (0.2, 50.0)  # of the focal length over the longer image side; closed forms outside of them are noise
 TRIED_FOCALS, TRIED_VIEWS = tuple(np.geomspace(0.4, 12.8, 11).tolist()), 12
 """Focal lengths over the longer side that are tried where the closed form gives none, a factor of √2 apart, and the
 number of views, those of most dots, by which they are judged."""
@@ -269,8 +262,7 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
 
 LEAST_FREE, FAR_BETTER = 3, 0.5
 """Fewest views for two focal lengths and the principal point, and most of the misfit that these may leave."""
-ALMOST_SQUARE = 0.05
-"""Relative difference of two focal lengths up to which pixels count as square at the start."""
+ALMOST_SQUARE = 0.05  # relative difference of two focal lengths up to which pixels count as square at the start
 
 
 def _conic(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -280,8 +272,7 @@ def _conic(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _of_any_pixels(rows: np.ndarray, camera: Camera, low: float, high: float) -> Camera | None:
-    """Returns ``camera`` with two focal lengths and a principal point by the rows of its views; None if there are none
-    within the limits of the ratio of a focal length and the assumed one."""
+    """Returns ``camera`` with two focal lengths and a principal point by its views; None outside of the limits."""
     b11, b22, b13, b23, b33 = np.linalg.svd(rows)[2][-1]
     with np.errstate(all="ignore"):
         scale = b33 - b13**2 / b11 - b23**2 / b22
@@ -349,19 +340,14 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
 
 MAX_ROUNDS = 20
 LEAST_ROUNDS = 2
-SETTLED_FACTOR = 0.005
-"""Largest relative change of a variance component in the last round."""
-SETTLED_SHIFT_PX = 1e-5
-"""Largest change of an eccentricity in the last round, px."""
-LEAST_ROBUST = 1e-6
-"""Smallest robust σ of normalised residuals, for exact data."""
+SETTLED_FACTOR = 0.005  # largest relative change of a variance component in the last round
+SETTLED_SHIFT_PX = 1e-5  # largest change of an eccentricity in the last round, px
+LEAST_ROBUST = 1e-6  # smallest robust σ of normalised residuals, for exact data
 LOUD = 1.5
 """Ratio of a photograph's residuals to those of most from which its σ grow with them: one that was moved or out of
 focus does not decide. Of 20 centres, chance exceeds it in one photograph of 600."""
-LEAST_DOTS = 0.1
-"""Smallest factor of the dots' σ: dots may be more accurate than the board file states, but never exact."""
-MIN_BOARD_REDUNDANCY = 20.0
-"""Smallest redundancy of the dots for estimating their σ. Below it the σ of the board file is kept."""
+LEAST_DOTS = 0.1  # smallest factor of the dots' σ: dots may be more accurate than stated, but never exact
+MIN_BOARD_REDUNDANCY = 20.0  # smallest redundancy of the dots that gives their σ; below it the board file's is kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -572,8 +558,7 @@ def _loudness(state: LensState) -> list[np.ndarray]:
 
 
 def _updated_factors(last: LensNormal, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, Board]]:
-    """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy, and
-    the boards with the amplitudes of their prints."""
+    """Returns variance components of centres and dots (Förstner 1979), and the boards with their amplitudes."""
     state, setting = last.state, last.setting
     dots_left, boards = last.with_found_prints()
     dots, image_redundancy = factors.dots, state.redundancy(setting.kept) - dots_left

@@ -29,8 +29,7 @@ from stcal.sfm.data.model import ImageObservations, by_group
 
 R = TypeVar("R")
 GRID = (13, 9)
-MIN_REACH = 0.75
-"""Smallest advised reach of dots from the middle towards a corner. Beyond it little distortion is extrapolated."""
+MIN_REACH = 0.75  # of dots from the middle towards a corner, as advised: beyond it little distortion is extrapolated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,8 +46,7 @@ def image_grid(camera: Camera) -> np.ndarray:
 
 
 def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Returns the derivative (n, 2, q) of the images of fixed directions at :func:`image_grid` by the parameters,
-    without the part that a rotation of the camera absorbs."""
+    """Returns derivatives (n, 2, q) of projections by the parameters, up to a rotation of the camera."""
     try:
         ideal = camera.normalised_from_pixel(image_grid(camera))
     except ConvergenceError as error:
@@ -81,10 +79,8 @@ def projection_sigma(result: Intrinsics) -> ProjectionSigma:
     return ProjectionSigma(sigma, np.maximum(reach, 0), sigma[corner_index])
 
 
-CELLS = (12, 8)
-"""Number of cells of the image, in x and y, within which residuals are compared."""
-AGREEING, AGREEING_SIGMAS = 0.03, 4.0
-"""Correlation of residuals between photographs that is worth a larger lens model, and beyond chance."""
+CELLS = (12, 8)  # number of cells of the image, in x and y, within which residuals are compared
+AGREEING, AGREEING_SIGMAS = 0.03, 4.0  # correlation between photographs that is worth a larger lens model
 LARGER = {
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "OPENCV"),
     **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"),
@@ -95,8 +91,7 @@ LARGER = {
 
 
 def mean_residuals(result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the weighted mean residual (v, cells, 2) of each photograph in each cell of the image, px, and the sum of
-    weights (v, cells)."""
+    """Returns the weighted mean residual (v, cells, 2) of each photograph in each cell, px, and weights (v, cells)."""
     camera, first = result.camera, np.cumsum([0, *(len(model.images) for model in result.models)])
     image = np.concatenate([k + model.image_index for k, model in zip(first[:-1], result.models, strict=True)])
     xy, weight = np.concatenate([model.measured_px for model in result.models]), np.concatenate(result.weights())
@@ -136,23 +131,18 @@ def of_lens_model(result: Intrinsics, views: Sequence[ImageObservations], board:
 
 
 FOLDS = 5
-MIN_TRAINING = 3
-"""Smallest number of views to calibrate with."""
+MIN_TRAINING = 3  # smallest number of views to calibrate with
 CANDIDATES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
-AUTO = "auto"
-"""Name of the option value for which :func:`choose_model` selects the model."""
+AUTO = "auto"  # name of the option value for which :func:`choose_model` selects the model
 LIKELY = 2.0
 """Number of standard errors by which a model with fewer parameters may be worse than the best and still be selected;
 after the one-standard-error rule, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""
-HOPELESS = 3.0
-"""Largest ratio of a model's residuals to those of the model that fits best. Models beyond it are not tried further."""
-POSE_PASSES = 2
-"""Number of passes of pose and eccentricity. Few suffice, as eccentricity hardly changes with the pose."""
-CLIP_SIGMAS = 5.0
-"""Limit of residuals in σ. Gross errors of dots carry no information about the lens."""
+HOPELESS = 3.0  # ratio of residuals to those of the best model from which on a model is not tried further
+POSE_PASSES = 2  # of pose and eccentricity; few suffice, as eccentricity hardly changes with the pose
+CLIP_SIGMAS = 5.0  # limit of residuals: gross errors of dots carry no information about the lens
 
 
 @dataclass(frozen=True, slots=True, eq=False)

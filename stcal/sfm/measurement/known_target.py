@@ -20,9 +20,7 @@ from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 
-SAME_DESIGN_MM = 0.5
-"""Largest RMS deviation of a face's circles from the design. Faces are made to a tenth of that; another design is off
-by far more."""
+SAME_DESIGN_MM = 0.5  # largest RMS deviation of a face from the design; another design is off by far more
 SAME_RADIUS_MM = 1e-6
 
 

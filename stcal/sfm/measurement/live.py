@@ -37,17 +37,12 @@ except ImportError as error:
     needed = "--live, --serve: need Starlette and uvicorn; install stereo-target-calibration[live]"
     raise InputError("E-EXTRA-MISSING", needed) from error
 
-WIDEST_PX = 1280
-"""Largest width of the picture that is sent."""
+WIDEST_PX = 1280  # largest width of the picture that is sent
 JPEG_QUALITY = 80
-RATE_OVER = 20
-"""Number of pictures over which the rate is taken."""
-LOOK_S = 0.01
-"""Interval at which a page's connection looks for a newer picture, s."""
-CONNECTIONS = 16
-"""Number of connections at a time; each may hold an image of the largest size."""
-END_S = 2
-"""Time in which pages receive the last picture at the end, s."""
+RATE_OVER = 20  # number of pictures over which the rate is taken
+LOOK_S = 0.01  # interval at which a page's connection looks for a newer picture, s
+CONNECTIONS = 16  # number of connections at a time; each may hold an image of the largest size
+END_S = 2  # time in which pages receive the last picture at the end, s
 OWN_HOST = re.compile(r"(localhost|127\.[\d.]+|\[::1\])(:\d+)?")
 """Host of a request to this machine. Without a token, any other name could be one that a page of another origin has
 pointed to this machine (DNS rebinding)."""

@@ -54,11 +54,8 @@ from stcal.sfm.measurement.pose import (
     resolved,
 )
 
-MIN_SHARE = 0.5
-"""Least share of the expected circles that must be found near their predicted places. With fewer, the whole image is
-searched."""
-MIN_FOUND = 6
-"""Least number of circles found: as many as identify a face."""
+MIN_SHARE = 0.5  # of the expected circles, near their predicted places; with fewer, the whole image is searched
+MIN_FOUND = 6  # least number of circles found: as many as identify a face
 MAX_TRIED_TILT_RAD = np.radians(80.0)
 """Largest predicted tilt of the circles that are looked for. Up to it, a face may be found by its pattern; circles
 beyond 70° are not reported as missed."""
@@ -243,8 +240,7 @@ class Tracker:
         return measured_pose(sharp, camera, self.target, self.pose_options, self.prior)
 
 
-MOST_TRIED = 5
-"""Largest number of images, those of most circles, in which mistakes in the camera file are looked for."""
+MOST_TRIED = 5  # largest number of images, those of most circles, in which mistakes in the camera file are looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -448,8 +444,7 @@ def measured_by(tracker: Tracker, image: np.ndarray, name: str) -> tuple[Measure
 def _followed(
     files: Sequence[ImageFile], camera_model: CameraModel, target, board, options, step: Callable[[object], None]
 ) -> tuple[list[MeasuredImage | Skipped], int]:
-    """Returns the outcomes of all folders, each a sequence in order of name, and the number of images searched as a
-    whole. Folders run in parallel; ``step`` is called once for each file."""
+    """Returns the outcomes of all folders, each a sequence in order of name, and the number of images searched."""
     camera, size_from = sized_by(camera_model, list(files))
     folders: dict[str, list[ImageFile]] = {}
     for file in sorted(files, key=lambda each: each.name):

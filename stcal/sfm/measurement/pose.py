@@ -38,8 +38,7 @@ from stcal.sfm.measurement.known_target import TargetCircles
 SETTLED = 1e-4
 """Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and two
 steps with new weights of the centres follow. A second solution with a large χ² needs no better accuracy."""
-HOPELESS = 500.0
-"""Excess in χ² that no weights can make up for."""
+HOPELESS = 500.0  # excess in χ² that no weights can make up for
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +88,7 @@ def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.n
 
 
 def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
-    """Returns the descent near a pose, with residuals whitened by the σ of each centre's noise and own circle, and
-    Huber's loss."""
+    """Returns the descent near a pose: residuals whitened by each centre's noise and own circle, Huber's loss."""
     by_circle = problem.seen(pose)[1].by_circle
     n = len(problem.xyz)
     own = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
@@ -110,12 +108,9 @@ def descent_near(problem: PoseProblem, pose: PoseStack) -> Descend:
     return descend
 
 
-MIN_CIRCLES = 4
-"""Least number of circles of one face. Fewer do not determine its homography."""
-WORST_SHARE = 0.5
-"""Share of the worst excess from which centres are removed with the worst one. The others may only be pulled along."""
-MIN_BREADTH = 0.05
-"""Least ratio of breadth to length of the visible circles. Circles in a row leave the rotation about the row open."""
+MIN_CIRCLES = 4  # least number of circles of one face that determine its homography
+WORST_SHARE = 0.5  # of the worst excess, from which centres are removed with it; others may only be pulled along
+MIN_BREADTH = 0.05  # ratio to the length of the visible circles: a row leaves the rotation about itself open
 
 
 def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[PoseStack, Rigid]:
@@ -183,16 +178,12 @@ def minima_without_outliers(
         start = best.poses
 
 
-CURVED = 0.2
-"""Relative deviation of χ² from its parabola, two σ away, beyond which the covariance is taken from samples."""
+CURVED = 0.2  # relative deviation of χ² from its parabola, two σ away, from which the covariance is sampled
 SAMPLES = 1000
-SAMPLED_WIDER = 1.5
-"""Factor on the σ with which samples are drawn. Else the tails would rest on a few samples."""
+SAMPLED_WIDER = 1.5  # factor on the σ with which samples are drawn; else the tails would rest on a few samples
 SAMPLE_ROUNDS = 2
-MIN_EFFECTIVE = 20
-"""Least effective number of samples (Kong 1992). With fewer, the distribution they are drawn from is the better one."""
-OTHER_SIDE = 3.0
-"""Distance in σ from which the pose mirrored at the line of sight is another solution. A nearer one is covered by σ."""
+MIN_EFFECTIVE = 20  # least effective number of samples (Kong 1992); with fewer, what they are drawn from is better
+OTHER_SIDE = 3.0  # distance in σ from which the pose mirrored at the line of sight is another solution
 
 
 def covariance_of_likelihood(
@@ -269,14 +260,10 @@ def _principal(covariance: np.ndarray) -> np.ndarray:
     return (vector * np.sqrt(np.maximum(value, 0))).T * sigma
 
 
-MISFIT = 0.03
-"""Largest RMS residual, as a share of the extent of the circles in the image; mirrored photographs of two faces leave 9
-to 18 %."""
-NEAR_PREVIOUS = 1 / 3
-"""Largest ratio of two rotations from the previous image's pose, of the nearer pose over the other, that decides."""
+MISFIT = 0.03  # largest RMS residual over the extent of the circles; mirrored photographs of two faces leave 9 to 18 %
+NEAR_PREVIOUS = 1 / 3  # largest ratio of two rotations from the previous pose, the nearer over the other, that decides
 NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
-SUSPICIOUS, FAILED = 1e-3, 1e-5
-"""Limits of the p-value of a fit's χ², the same as in the checks of a run."""
+SUSPICIOUS, FAILED = 1e-3, 1e-5  # limits of the p-value of a fit's χ², the same as in the checks of a run
 Status = Literal["certain", "resolved", "ambiguous"]
 
 
@@ -544,8 +531,7 @@ def fit_verdict(pose: TargetPose) -> str:
 FELT = 0.5
 """Variance, in units of their noise, that a common error may have in the direction in which all poses together feel it
 most, and still pass for independent: a result that feels nothing but this has a σ that is 20 % too small."""
-MOST = 24
-"""Largest number of directions."""
+MOST = 24  # largest number of directions
 LARGEST_SHARE = 0.999
 """Largest common share of a pose's variance in any direction. The remainder must stay positive definite, even after
 rounding or if the likelihood of a pose is narrower than its linearisation."""

@@ -87,10 +87,8 @@ class PosesFile(ResultFile):
 
 
 IMAGE = "image"
-COMMON_SHARE = 0.5
-"""Share of the variance from which on it is told that poses err in common."""
-MOST_LISTED = 20
-"""Largest number of images for which the terminal has a line each."""
+COMMON_SHARE = 0.5  # share of the variance from which on it is told that poses err in common
+MOST_LISTED = 20  # largest number of images for which the terminal has a line each
 
 
 @require_arguments
@@ -241,14 +239,12 @@ def summary(result: MeasureResult) -> list[str]:
 
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
-ELLIPSE_SHARE = 0.06
-"""Length with which the largest σ is drawn, as a share of the plot's width."""
+ELLIPSE_SHARE = 0.06  # length with which the largest σ is drawn, as a share of the plot's width
 HEADS = ("<image", "<faces", "circles", "<status", "x mm", "y", "z", "σ µm", "σ mdeg", "RMS px", "χ²/dof", "<fit")
 
 
 def measure_report(result: MeasureResult, where: str, every: bool = False) -> Document:
-    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images, not only for
-    those that need a look."""
+    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images."""
     images, left_out = result.images, [[each.name, each.reason] for each in result.left_out]
     at = np.array([image.pose.camera_from_target.translation for image in images])
     largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in images))

@@ -33,15 +33,12 @@ from stcal.sfm.planning.forecast import (
     worst_of,
 )
 from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
-from stcal.synthetic.placement import GroupShape, look_along, place_group, viewing_axes
-from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, group_name, image_circles
+from stcal.synthetic.placement import look_along
+from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, SceneOptions, image_circles, made_group
 
-REACH_DEG = 50.0
-"""Largest distance of candidates from the middle of a group's views, in azimuth and in elevation."""
-GRID_DEG = 10.0
-"""Step of the grid of candidates, in azimuth and in elevation."""
-ROLLS_DEG = (0.0, 90.0)
-"""Rolls of the camera. A turn by 90° separates intrinsics from poses, and is tried only if intrinsics are refined."""
+REACH_DEG = 50.0  # largest distance of candidates from the middle of a group's views, in azimuth and in elevation
+GRID_DEG = 10.0  # step of the grid of candidates, in azimuth and in elevation
+ROLLS_DEG = (0.0, 90.0)  # of the camera; 90° separates intrinsics from poses, and is tried if intrinsics are refined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,12 +228,9 @@ def single(
     return noise.applied(image, setup.camera, setup.radius_mm())
 
 
-LEAST_COSINE = -0.2
-"""Smallest cosine of the angle between two faces that one view is to show."""
-MAX_TILT_DEG = 60.0
-"""Largest tilt of a face whose corners count as seen."""
-SHARES = (0.35, 0.5, 0.65)
-"""Where candidates stand between the normals of two faces."""
+LEAST_COSINE = -0.2  # smallest cosine of the angle between two faces that one view is to show
+MAX_TILT_DEG = 60.0  # largest tilt of a face whose corners count as seen
+SHARES = (0.35, 0.5, 0.65)  # where candidates stand between the normals of two faces
 
 
 def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
@@ -270,16 +264,11 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
     return views
 
 
-SHORTLIST = 8
-"""Number of candidates that stay in the search after the first choice: the best so many for each face."""
-NEW_GROUP_SPREAD_RAD = float(np.radians(40))
-"""Spread of the views of a new group about the view that shows both faces equally."""
-AT_ONCE = 50
-"""Number of candidates that one process computes at a time."""
-MIN_NEW_GROUP = 3
-"""Least number of images with which a new group can be mapped."""
-BOARD_DOMINATES = 0.5
-"""Share of the board in the variance of the worst face beyond which more views hardly help."""
+SHORTLIST = 8  # number of candidates that stay in the search after the first choice: the best so many for each face
+NEW_GROUP_SPREAD_DEG = 40.0  # spread of the views of a new group about the view that shows both faces equally
+AT_ONCE = 50  # number of candidates that one process computes at a time
+MIN_NEW_GROUP = 3  # least number of images with which a new group can be mapped
+BOARD_DOMINATES = 0.5  # share of the board in the variance of the worst face beyond which more views hardly help
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -456,29 +445,17 @@ def _new_groups(known: KnownRun, now: Forecast, images: int) -> list[NewGroup]:
 
 def _new_model(known: KnownRun, pair: tuple[str, str], images: int) -> MetricModel:
     """Returns a group of two faces with the board beside them, at the distance of the present photographs."""
-    scene = known.scene
-    name = f"new {group_name(pair)}"
-    normals = [scene.target_from_face[face].rotation[:, 2] for face in pair]
-    axes = viewing_axes(normals[0], normals[1], name)
-    present = next(iter(scene.groups))
-    dots = np.column_stack([scene.board.xy_mm(), np.zeros(scene.board.rows * scene.board.columns)])
-    shape = GroupShape(
-        name,
-        np.vstack([scene.face_circles(face) for face in pair]),
-        np.repeat(normals, [len(scene.target.face(face).ids) for face in pair], axis=0),
-        axes,
-        np.vstack([scene.face_outline(face.id) for face in scene.target.faces]),
-        dots,
-        scene.groups[present].target_from_board.inverse() @ scene.board_outline(present),
+    scene, rng = known.scene, np.random.default_rng(0)
+    depth = float(np.median(np.concatenate([model.xyz_camera()[:, 2] for model in known.models])))
+    options = SceneOptions(
+        images_per_group=images, distance_mm=depth, spread_deg=NEW_GROUP_SPREAD_DEG, margin_mm=scene.margin_mm
     )
-    depth = np.median(np.concatenate([model.xyz_camera()[:, 2] for model in known.models]))
-    target_from_board, poses = place_group(
-        shape, scene.camera, images, float(depth), NEW_GROUP_SPREAD_RAD, np.random.default_rng(0)
-    )
-    group = Group(name, pair, axes, target_from_board, target_from_board @ dots, tuple(poses))
-    alone = replace(scene, groups={name: group})
-    (model,) = true_models(alone, observe(alone, 0.0, np.random.default_rng(0)))
-    return known.noise.applied(model, scene.camera, known.setup.radius_mm())
+    exact, parts = np.zeros((1, 3)), (scene.target, scene.board, scene.camera, scene.target_from_face)
+    group = made_group(pair, *parts, scene.circles_target, options, exact, rng)
+    alone = replace(scene, groups={group.name: group})
+    (model,) = true_models(alone, observe(alone, 0.0, rng))
+    new = replace(model, group=f"new {group.name}")  # a group of the run may have the name, and show other faces
+    return known.noise.applied(new, scene.camera, known.setup.radius_mm())
 
 
 @require_arguments

@@ -62,8 +62,7 @@ def _is_reference(target: TargetDesign) -> bool:
     return places.keys() == reference.keys() and all(np.allclose(places[k], reference[k], atol=0.5) for k in places)
 
 
-EXACT_SIGMA_PX = 0.005
-"""The σ that is stated for centres without noise."""
+EXACT_SIGMA_PX = 0.005  # the σ that is stated for centres without noise
 
 
 def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: float = 0.0) -> list[ImageObservations]:
@@ -101,23 +100,16 @@ def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list
     return models
 
 
-IMAGE_NOISE = 0.01
-"""Standard deviation of the grey values, as a fraction of full scale."""
-CONTRAST = 0.7
-"""Contrast between circle and surroundings, as a fraction of full scale."""
-BLUR_PX = 0.76
-"""Blur of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px."""
+IMAGE_NOISE = 0.01  # standard deviation of the grey values, as a fraction of full scale
+CONTRAST = 0.7  # contrast between circle and surroundings, as a fraction of full scale
+BLUR_PX = 0.76  # blur of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px
 PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
-CORNER_SIGMA_PX = 0.02
-"""σ of the corner of a tag or square in a good photograph, of tags whose cells are 6 to 14 px wide."""
-ONE_PLATE = 0.99
-"""Share of the board's variance that all groups have in common if the same plate is in all of them."""
-ENOUGH = 10_000
-"""Number of observations from which the parameters of their noise are estimated."""
-SMALLER = 1 - 1e-3
-"""Factor on the σ of a source of error whose share of the variance is sought."""
+CORNER_SIGMA_PX = 0.02  # σ of a corner of a tag or square in a good photograph, of cells 6 to 14 px wide
+ONE_PLATE = 0.99  # share of the board's variance that all groups have in common if the same plate is in all of them
+ENOUGH = 10_000  # number of observations from which the parameters of their noise are estimated
+SMALLER = 1 - 1e-3  # factor on the σ of a source of error whose share of the variance is sought
 
 
 @dataclass(frozen=True, slots=True)

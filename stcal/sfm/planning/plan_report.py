@@ -16,10 +16,8 @@ from stcal.sfm.planning.session import Plan, Remedy
 
 MICRO = 1e3
 PPM = 1e6
-LEAST_SHARE = 0.005
-"""Least share of a variance that is printed."""
-USUAL_FOCAL_MM = 24.0
-"""Focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide."""
+LEAST_SHARE = 0.005  # least share of a variance that is printed
+USUAL_FOCAL_MM = 24.0  # focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide
 
 
 @dataclass(frozen=True, slots=True)

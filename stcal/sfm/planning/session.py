@@ -38,24 +38,17 @@ from stcal.sfm.planning.forecast import (
 )
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
-from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene, seen_by
+from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene
 
 R = TypeVar("R")
 GROUP = "."
-DISTANCE_SIGMA_MM = 0.02
-"""σ of a distance that is measured with a caliper, as a remedy."""
-SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
-"""Spreads that are tried, from the largest down. The largest tilts that a view may have often forbid wide ones."""
-NEARER = 0.8
-"""Distance of the remedy of nearer cameras, relative to the plan's."""
+DISTANCE_SIGMA_MM = 0.02  # σ of a distance that is measured with a caliper, as a remedy
+SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)  # tried from the largest down, as tilts often forbid wide ones
+NEARER = 0.8  # distance of the remedy of nearer cameras, relative to the plan's
 MIN_IMAGES = 2
-MANY_DOTS = 2000
-"""Number of dots from which on remedies are forecast in processes of their own; fewer take less time than their
-start."""
-MAX_DOTS = 10_000
-"""Largest number of dots of a board."""
-FINE_DOTS, MAX_CENTRES = 500, 450_000
-"""Largest number of dots in all images, for boards of more than ``FINE_DOTS`` dots: about a minute and 0.8 GB."""
+MANY_DOTS = 2000  # from which on remedies are forecast in processes of their own, whose start takes time
+MAX_DOTS = 10_000  # largest number of dots of a board
+FINE_DOTS, MAX_CENTRES = 500, 450_000  # of boards of more than FINE_DOTS dots: about a minute and 0.8 GB
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -305,7 +298,6 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
 
 def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
     """Returns the scene with the nominal geometry, in which nothing is misplaced."""
-    file = None if options.camera is None else camera_model(options.camera)
     shape = SceneOptions(
         seed=options.seed,
         centre_sigma=0.0,
@@ -320,10 +312,7 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         height=round(options.width * 2 / 3),
         margin_mm=options.margin_mm,
     )
-    if file is not None:
-        shape = seen_by(shape, file)
-    scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
-    return scene if file is None else replace(scene, camera=file.calibrated(0, 0))
+    return make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
 
 
 def _beside_board(
@@ -370,8 +359,7 @@ def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
 
 
 def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, list[MetricModel], Setup]:
-    """Returns the photographs of a body in random poses: scene, its model with the σ of its corners, and input of a
-    forecast."""
+    """Returns the photographs of a body in random poses: scene, its model with σ, input of a forecast."""
     file = None if options.camera is None else camera_model(options.camera)
     camera = body_camera(options.width) if file is None else file.calibrated(0, 0)
     shape = BodyOptions(options.images, options.distance_mm, seed=options.seed, pose_sigma_mm=0, pose_sigma_deg=0)

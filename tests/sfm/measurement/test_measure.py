@@ -461,8 +461,7 @@ def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_data
     assert (tmp_path / "poses.csv").exists()
 
 
-SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])
-"""Of intrinsics: fx, fy, cx, cy, k1, k2, p1, p2."""
+SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])  # of intrinsics: fx, fy, cx, cy, k1, k2, p1, p2
 
 
 def test_what_is_common_is_less_than_the_whole(scene, known):

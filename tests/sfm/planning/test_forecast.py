@@ -44,11 +44,9 @@ from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
 from tests.outcome import fails_with
 from tests.shared import unsealed_copy
 
-NOISE = CentreNoise(0.1, 3.0)
-"""Of centres: about 0.013 px, so that image and a board of 20 µm matter alike."""
+NOISE = CentreNoise(0.1, 3.0)  # of centres: about 0.013 px, so that image and a board of 20 µm matter alike
 SLOW = pytest.mark.slow
-CHANCE = 1e-4
-"""Of a sound forecast to fall outside the bounds of a χ² test, on either side."""
+CHANCE = 1e-4  # of a sound forecast to fall outside the bounds of a χ² test, on either side
 SMALL = SceneOptions(
     seed=4, width=2592, height=1728, images_per_group=3, groups=(("1", "2"), ("1", "4")), circle_sigma_mm=0.0
 )
