@@ -33,7 +33,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.image_jobs import run_on_images
-from stcal.io.images import TOP_GROUP, ImageFile, Skipped, find_images, grey_8bit
+from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit
 from stcal.labels import DotLabel
 from stcal.locate.calibration import CalibrationImages
 from stcal.parallel import Progress, one_thread
@@ -167,7 +167,7 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
     fits = explain(candidates, missing, np.inf, alike=1)
     if not fits:
         return f"{few}, not where rows and columns of its file put them; correct them"
-    return f"{few}, as on a board of {' or '.join(each.words for each, _ in fits)}; correct its file"
+    return f"{few}, as on a board of {fits[0][0].words}; correct its file"
 
 
 def _find_asymmetric(
@@ -293,7 +293,10 @@ def detect_boards(
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")
     if model.width and model.height:
         model.require_inside(model.width, model.height, "the image")
-    camera, size_from = sized_by(model, list(files))
+    if (model.width and model.height) or common_size(files):
+        camera, size_from = sized_by(model, list(files))
+    else:  # of any size: each file says why it cannot be read
+        camera, size_from = model.sized(1, 1), MAJORITY
     outcomes: dict[int, BoardDetection | Skipped] = {}
     jobs = [(file, camera, size_from, board, tuple(dictionaries)) for file in files]
     for i, outcome in run_on_images(_detect_board, jobs, workers):

@@ -298,6 +298,10 @@ class MeasureResult(Brief):
     def __post_init__(self):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
 
+    def remedy(self, otherwise: str) -> str:
+        """Returns what to correct where poses do not fit: the camera file, if that explains it."""
+        return f"{' or '.join(self.mistakes)}; give that of these images" if self.mistakes else otherwise
+
 
 @require_arguments
 @one_thread()
@@ -356,7 +360,6 @@ def measure(
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
     files, unreadable = find_images(images)
     step = counted(progress, "detect", len(files))
-    shown = True
     if options.sequence:
         outcomes, searched = _followed(files, camera, replace(target, design=design), board, options, step)
         result = replace(_result_of(outcomes, target, options, prior), searched=searched)
@@ -375,7 +378,7 @@ def measure(
         printed = design.with_faces(printed=True).faces
         if printed and not shown:
             raise DetectionError("E-TARGET-UNSEEN", why_unseen(files, printed))
-        remedy = " or ".join(result.mistakes) or "check target.toml (radii, polarity), faces.json and the exposure"
+        remedy = result.remedy("check target.toml (radii, polarity), faces.json and the exposure")
         raise DetectionError(
             "E-MEASURE-NONE",
             f"no face of the target measured in {len(files)} images, first {last.name}: {last.reason}; {remedy}",

@@ -216,19 +216,15 @@ def plan(
 
 def _workers(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> int | None:
     """Refuses plans of too many dots; returns the number of processes, None for one per core."""
-    if (dots := board.rows * board.columns) > MAX_DOTS:
-        raise InputError(
-            "E-PLAN-TOO-LARGE",
-            f"plan: board of {board.rows}×{board.columns} = {dots} dots, up to {MAX_DOTS} possible; plan with "
-            "fewer dots over the same area, the σ of the faces hardly change",
-        )
-    images = options.images * len(_scene(options, target, board, nominal).groups) if dots > FINE_DOTS else 0
-    if dots * images > MAX_CENTRES:
-        raise InputError(
-            "E-PLAN-TOO-LARGE",
-            f"plan: {dots} dots in {images} images are {dots * images} centres, up to "
-            f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
-        )
+    dots = board.rows * board.columns
+    images = options.images * len(_scene(options, target, board, nominal).groups) if FINE_DOTS < dots <= MAX_DOTS else 1
+    for count, most, what in (
+        (dots, MAX_DOTS, f"a board of {board.rows}×{board.columns} has {dots} dots"),
+        (dots * images, MAX_CENTRES, f"{dots} dots in {images} images are {dots * images} centres"),
+    ):
+        if count > most:
+            remedy = "plan fewer images, or fewer dots over the same area: the σ of the faces hardly change"
+            raise InputError("E-PLAN-TOO-LARGE", f"plan: {what}, up to {most} possible; {remedy}")
     return None if dots > MANY_DOTS else 1
 
 
