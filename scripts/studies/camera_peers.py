@@ -40,9 +40,8 @@ from stcal.io.cameras.model import CameraModel, camera_from_colmap
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
 from stcal.sfm import run
-from stcal.sfm.camera.calibrate import calibrate_camera
+from stcal.sfm.camera.calibrate import FOLDS, calibrate_camera, foretold
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera, start_pose
-from stcal.sfm.camera.lens_checks import FOLDS, foretold
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.runs.options import RunOptions
 from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid

@@ -41,13 +41,13 @@ from stcal.sfm.camera.calibrate import (
     MAX_RESIDUAL_PX,
     CameraCalibration,
     calibrated,
+    foretold,
     judged,
     require_determined,
     require_views,
     unsized,
 )
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form
-from stcal.sfm.camera.lens_checks import foretold
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses

@@ -15,9 +15,17 @@ from stcal.report.camera import distortion_figure
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
-from stcal.sfm.camera.calibrate import CORNERS, OUTLIER_WEIGHT, CameraCalibration, residual_rms_px
+from stcal.sfm.camera.calibrate import (
+    CELLS,
+    CORNERS,
+    GRID,
+    OUTLIER_WEIGHT,
+    CameraCalibration,
+    TriedModel,
+    mean_residuals,
+    residual_rms_px,
+)
 from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
-from stcal.sfm.camera.lens_checks import CELLS, GRID, TriedModel, mean_residuals
 
 MIN_IN_CELL = 3
 ARROW_SHARE = 0.7  # largest length of a drawn mean residual, as a share of the cell

@@ -11,18 +11,20 @@ from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.io.images import ImageFile, Skipped
 from stcal.labels import DotLabel, unseen_lines
-from stcal.sfm.camera import lens_checks
+from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera.calibrate import (
     MAX_RESIDUAL_PX,
+    choose_model,
+    held_out,
     judged,
     of_chosen_model,
+    of_lens_model,
     require_determined,
     require_views,
     residual_rms_px,
 )
 from stcal.sfm.camera.camera_report import calibration_file, calibration_report
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
-from stcal.sfm.camera.lens_checks import choose_model, held_out, of_lens_model
 from stcal.workflows.board_views import without_gross_errors
 from tests.levels import sampled
 from tests.outcome import fails_with
@@ -149,13 +151,13 @@ def test_the_model_of_the_lens_is_chosen(truth, wanted):
     views = views_of(np.random.default_rng(4), count=16, camera=truth)
     chosen, rows = choose_model(views, BOARD, known_of(views, truth), 2)
     assert chosen in wanted
-    assert [row.model for row in rows] == list(lens_checks.CANDIDATES)
+    assert [row.model for row in rows] == list(calibration.CANDIDATES)
     assert min(row.worse for row in rows if row.worse is not None) == 0
     assert all(row.why for row in rows if row.worse is None)
 
 
 def few(monkeypatch):
-    monkeypatch.setattr(lens_checks, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
+    monkeypatch.setattr(calibration, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
 
 
 @pytest.mark.full
@@ -174,14 +176,14 @@ def test_as_good_and_simpler_is_taken(monkeypatch):
 def test_a_model_that_fails_says_why(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(6), count=12)
-    own = lens_checks.adjust_intrinsics
+    own = calibration.adjust_intrinsics
 
     def failing(views, board, start, model, *more):
         if model == "PINHOLE":
             raise DegenerateError("E-TEST", "no minimum")
         return own(views, board, start, model, *more)
 
-    monkeypatch.setattr(lens_checks, "adjust_intrinsics", failing)
+    monkeypatch.setattr(calibration, "adjust_intrinsics", failing)
     chosen, rows = choose_model(views, BOARD, known_of(views, TRUE), 1)
     assert chosen == "OPENCV"
     assert (rows[0].why, rows[0].rms_px) == ("no minimum", None)
@@ -200,7 +202,7 @@ def test_of_too_few_views_none_is_held_out_and_no_model_chosen(monkeypatch):
 @pytest.mark.full
 def test_where_no_perspective_lens_fits_the_wide_one_begins(monkeypatch):
     few(monkeypatch)
-    monkeypatch.setattr(lens_checks, "CANDIDATES", ("OPENCV_FISHEYE",))
+    monkeypatch.setattr(calibration, "CANDIDATES", ("OPENCV_FISHEYE",))
     views = views_of(np.random.default_rng(7), count=10, camera=FISHEYE)
     asked = []
 
@@ -228,7 +230,7 @@ def test_where_neither_fits_the_first_reason_is_given():
 def result():
     views = views_of(np.random.default_rng(8), count=12)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lens_checks, "CANDIDATES", ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"))
+        patch.setattr(calibration, "CANDIDATES", ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"))
         return of_chosen_model(lambda model: judged(calibrated(views, model), views, (), 1, True, BOARD), BOARD, 1)
 
 
