@@ -50,9 +50,7 @@ def simulate(
     fisheye: Annotated[float | None, "Use an equidistant lens of this diagonal field, °.", Opt(min=60, max=170)] = None,
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
-    f_number: Annotated[
-        float | None, "Use a thin lens of this f-number; if not given, all is in focus.", Opt(min=0.5, max=100)
-    ] = None,
+    f_number: Annotated[float | None, "Use a thin lens of this f-number; else no blur.", Opt(min=0.5, max=100)] = None,
     focus: Annotated[float | None, "Focus at this depth, or at --distance.", Opt("--focus-mm", min=10, max=1e7)] = None,
     focal: Annotated[
         float | None,
@@ -67,9 +65,7 @@ def simulate(
     ] = None,
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    groups: Annotated[
-        str | None, "Photograph these pairs of faces, such as 12,14; all that are visible together if not given."
-    ] = None,
+    groups: Annotated[str | None, "Photograph these pairs of faces, such as 12,14; else all visible ones."] = None,
     camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
     one_board: Annotated[bool, "Photograph one board with all groups, as `plan` assumes."] = False,
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
@@ -77,9 +73,7 @@ def simulate(
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     body_seed: Annotated[
-        int | None,
-        "Draw errors of target, camera and board with this seed; with --seed if not given.",
-        Opt(min=0, max=MOST_SEED),
+        int | None, "Draw errors of target, camera and board with this, not --seed.", Opt(min=0, max=MOST_SEED)
     ] = None,
     margin: shared.PlateMargin = 15.0,
     workers: shared.Workers = None,
@@ -313,16 +307,12 @@ def design(
     ] = "",
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
-        float | None,
-        "Draw the smaller circles with this radius; chosen if not given.",
-        Opt("--radius-mm", min=0.01, max=1e4),
+        float | None, "Draw the smaller circles with this radius; else chosen.", Opt("--radius-mm", min=0.01, max=1e4)
     ] = None,
     distance: shared.Distance = 1000.0,
     width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
-    bright: Annotated[
-        bool, "Make bright circles on dark plates, or dark ones on bright.", Opt("--bright/--dark")
-    ] = False,
+    bright: Annotated[bool, "Make bright circles on dark plates, or dark on bright.", Opt("--bright/--dark")] = False,
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
 ) -> None:

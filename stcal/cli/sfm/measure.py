@@ -36,22 +36,16 @@ def plan(
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     distance: shared.Distance = 1000.0,
-    width: Annotated[
-        int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
-    ] = 5184,
+    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
     run: Annotated[Path | None, "Take the σ of the centres from the finished run in this folder."] = None,
     target: shared.TargetFile = None,
     faces: Annotated[Path | None, "Place the faces of --target as in the faces.json of an earlier run."] = None,
     board: shared.BoardFile = None,
-    groups: Annotated[
-        str | None, "Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."
-    ] = None,
+    groups: Annotated[str | None, "Photograph these pairs of faces, such as 12,14 or front-right,front-top."] = None,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
-    one_board: Annotated[
-        bool, "Use one plate in all groups, instead of a new print for each.", Opt("--one-board/--own-boards")
-    ] = True,
+    one_board: Annotated[bool, "Use one plate in all groups, not one each.", Opt("--one-board/--own-boards")] = True,
     seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     margin: shared.PlateMargin = 15.0,
     out: shared.JsonFile = None,
@@ -130,19 +124,10 @@ def advise(
 
 @app.command(name="calibrate-camera")
 def calibrate_camera(
-    images: Annotated[
-        Path,
-        "Read photographs that show the board from this folder, or from IMAGES/<group>/, or frames of a video, as run "
-        "does.",
-        Arg(),
-    ],
+    images: Annotated[Path, "Read photographs of the board from this folder, or frames of a video, like run.", Arg()],
     out: Annotated[Path, "Write the camera to this file.", WRITES] = Path("cameras.txt"),
     target: shared.TargetFile = None,
-    board: Annotated[
-        Path | None,
-        "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid or "
-        "asymmetric circles, in place of the reference board.",
-    ] = None,
+    board: Annotated[Path | None, "Read the board, of any kind, from this file (TOML, or Kalibr's YAML)."] = None,
     model: Annotated[
         str,
         "Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV; "
@@ -151,7 +136,7 @@ def calibrate_camera(
     ] = "OPENCV",
     json_file: Annotated[
         Path | None,
-        "Write figures and checks to this file (JSON), or to standard output with `-`; beside --out if not given.",
+        "Write figures and checks here (JSON; `-`: standard output), or beside --out.",
         Opt("--json", writes=True),
     ] = None,
     report: shared.ReportFile = None,
@@ -206,18 +191,12 @@ def measure(
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None,
-        "Read the images of this folder and its subfolders. With --live, it may also be the URL of a stream or a video "
-        "file; with --serve, give none.",
+        "Read the images of this folder and its subfolders; with --live, also of a stream's URL or a video.",
         Arg(),
     ] = None,
     target: shared.TargetFile = None,
     out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = TABLE,
-    json_file: Annotated[
-        Path | None,
-        "Also write all results to this file, with both solutions of ambiguous images (JSON), or to standard output "
-        "with `-`.",
-        Opt("--json", writes=True),
-    ] = None,
+    json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
     joints: Annotated[
         Path | None, "Add the columns of this file to the table, such as joint values; it needs a column image (CSV)."
@@ -225,14 +204,10 @@ def measure(
     board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
     previous: Annotated[bool, "Decide between two solutions by the previous image, assuming small motions."] = False,
     sequence: Annotated[
-        bool,
-        "Follow the target from image to image of each folder, in order of name, and search a whole image only after "
-        "the target was lost. An ambiguous pose is decided as with --previous.",
+        bool, "Follow the target from image to image, by name; ambiguous poses are decided as with --previous."
     ] = False,
     sigma_factor: Annotated[
-        float | None,
-        "Multiply the σ of the centres by this; if not given, by the factor in faces.json.",
-        Opt(min=1e-3, max=1e3),
+        float | None, "Multiply the σ of the centres by this, not by that of faces.json.", Opt(min=1e-3, max=1e3)
     ] = None,
     strict: shared.Strict = False,
     min_diameter: shared.MinDiameter = None,
@@ -252,8 +227,7 @@ def measure(
         int, "Take the pictures of --live from the camera with this number.", Opt(min=0, max=99)
     ] = 0,
     host: Annotated[
-        str,
-        "Listen at this address with --serve or --live; with 0.0.0.0, other machines can connect that know --token.",
+        str, "Listen at this address with --serve or --live; at 0.0.0.0, other machines with --token can connect."
     ] = "127.0.0.1",
     port: Annotated[
         int, "Listen at this port with --serve or --live; 0 chooses a free one.", Opt(min=0, max=65535)
