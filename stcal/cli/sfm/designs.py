@@ -53,15 +53,13 @@ def simulate(
     f_number: Annotated[float | None, "Use a thin lens of this f-number; else no blur.", Opt(min=0.5, max=100)] = None,
     focus: Annotated[float | None, "Focus at this depth, or at --distance.", Opt("--focus-mm", min=10, max=1e7)] = None,
     focal: Annotated[
-        float | None,
-        "Set the focal length; that of a sensor 22.3 mm wide if not given.",
-        Opt("--focal-mm", min=0.5, max=5000),
+        float | None, "Set the focal length, or that of a sensor 22.3 mm wide.", Opt("--focal-mm", min=0.5, max=5000)
     ] = None,
     rim: Annotated[float, "Set the height of rims; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)] = 0.0,
     slope: Annotated[float, "Let the light of circles rise by this fraction across.", Opt(min=0, max=1)] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
-        float | None, "Add a table below that reflects this fraction.", Opt("--table-reflectance", min=0, max=1)
+        float | None, "Add a table of this reflectance.", Opt("--table-reflectance", min=0, max=1)
     ] = None,
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,

@@ -135,9 +135,7 @@ def calibrate_camera(
         "the simplest model that predicts held-out views as well as the best one.",
     ] = "OPENCV",
     json_file: Annotated[
-        Path | None,
-        "Write figures and checks here (JSON; `-`: standard output), or beside --out.",
-        Opt("--json", writes=True),
+        Path | None, "Write figures and checks here (JSON), or beside --out.", Opt("--json", writes=True)
     ] = None,
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
@@ -191,21 +189,17 @@ def measure(
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None,
-        "Read the images of this folder and its subfolders; with --live, also of a stream's URL or a video.",
+        "Read the images of this folder and its subfolders; or, with --live, a stream's URL or a video.",
         Arg(),
     ] = None,
     target: shared.TargetFile = None,
     out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = TABLE,
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
-    joints: Annotated[
-        Path | None, "Add the columns of this file to the table, such as joint values; it needs a column image (CSV)."
-    ] = None,
+    joints: Annotated[Path | None, "Add the columns of this file, such as joints, by its column image (CSV)."] = None,
     board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
     previous: Annotated[bool, "Decide between two solutions by the previous image, assuming small motions."] = False,
-    sequence: Annotated[
-        bool, "Follow the target from image to image, by name; ambiguous poses are decided as with --previous."
-    ] = False,
+    sequence: Annotated[bool, "Follow the target from image to image, by name, and decide as with --previous."] = False,
     sigma_factor: Annotated[
         float | None, "Multiply the σ of the centres by this, not by that of faces.json.", Opt(min=1e-3, max=1e3)
     ] = None,
@@ -215,31 +209,18 @@ def measure(
     workers: shared.Workers = None,
     scheduler: shared.Scheduler = None,
     send_images: shared.SendImages = False,
-    serve: Annotated[
-        bool, "Answer images that are sent over HTTP, POST /pose, with JSON for each, until Ctrl-C."
-    ] = False,
+    serve: Annotated[bool, "Answer images sent over HTTP, POST /pose, with JSON for each, until Ctrl-C."] = False,
     live: Annotated[
         bool,
         "Show a page with the pictures of a camera, or of the folder, stream or video IMAGES, and the target's pose in "
         "each, until Ctrl-C. One line is printed per second; with `--json -`, every pose is.",
     ] = False,
-    camera_index: Annotated[
-        int, "Take the pictures of --live from the camera with this number.", Opt(min=0, max=99)
-    ] = 0,
-    host: Annotated[
-        str, "Listen at this address with --serve or --live; at 0.0.0.0, other machines with --token can connect."
-    ] = "127.0.0.1",
-    port: Annotated[
-        int, "Listen at this port with --serve or --live; 0 chooses a free one.", Opt(min=0, max=65535)
-    ] = 8765,
-    max_megabytes: Annotated[
-        float, "Accept image files up to this size with --serve or --live.", Opt(min=0.01, max=2000)
-    ] = 64.0,
+    camera_index: Annotated[int, "Take the pictures of --live from this camera.", Opt(min=0, max=99)] = 0,
+    host: Annotated[str, "Listen at this address; at 0.0.0.0, other machines connect with --token."] = "127.0.0.1",
+    port: Annotated[int, "Listen at this port; 0 chooses a free one.", Opt(min=0, max=65535)] = 8765,
+    max_megabytes: Annotated[float, "Accept image files up to this size over HTTP.", Opt(min=0.01, max=2000)] = 64.0,
     token: Annotated[
-        str,
-        "Answer with --serve or --live only requests with `Authorization: Bearer` and this word; in a browser, add "
-        "?token= to the address.",
-        Opt(envvar="STCAL_TOKEN"),
+        str, "Answer only requests with this word, as `Authorization: Bearer` or ?token=.", Opt(envvar="STCAL_TOKEN")
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from the visible faces, with its 6×6 covariance."""

@@ -135,7 +135,7 @@ def of_lens_model(result: Intrinsics, views: Sequence[ImageObservations], board:
         return []
     why = ", which is in no σ: look at the mean residuals, and at light that is alike in all photographs"
     for model, left in explain(larger_models(result, views, board), lambda fit: agreement(fit)[0], found / 2):
-        why = f", {left:.2f} with a larger lens model; {model.words}"
+        why = f", {left:.2f} with a larger lens model: {result.colmap_model} is too small; {model.words}"
     return [f"residuals at one place of the image agree between photographs, correlation {found:.2f}{why}"]
 
 

@@ -253,7 +253,7 @@ def test_a_lens_model_too_small_is_named_and_no_larger_one_for_other_errors():
     bent = Camera(2592, 1728, TRUE.focal, TRUE.centre, [-0.06, 0.045, 0, 0, 0.3, 0, 0, 0])
     views = views_of(np.random.default_rng(9), count=12, camera=bent)
     (warning,) = of_lens_model(calibrated(views), views, BOARD)
-    assert "with a larger lens model; use --model FULL_OPENCV" in warning
+    assert "OPENCV is too small; use --model FULL_OPENCV" in warning
     rng = np.random.default_rng(10)
     for other in (views_of(rng, 12), with_a_field(views_of(rng, 12), rng, 0.04)):
         assert of_lens_model(calibrated(other), other, BOARD) == []
