@@ -253,14 +253,14 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
         near = int(cosine.argmax())
         axes = axes_of(model.camera_from_model[near], towards[near])
         right, up, ahead = (axes @ direction).tolist()
-        go_deg = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
+        azimuth, elevation = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
         pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
         tilts = {face: tilt_deg(normals[face], middles[face], centre + distance * direction) for face in normals}
         shown = {face: tilt for face, tilt in sorted(tilts.items()) if tilt < MAX_TILT_DEG}
         labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in shown]
         seen = single(model, f"{model.group}/view {one} {two} {share} {roll}", pose, labels, setup, noise)
         nearest = model.images[near], model.images[near], angle_deg(cosine[near])
-        views.append(PlannedView(model.group, seen, *go_deg, roll, distance, shown, *nearest))
+        views.append(PlannedView(model.group, seen, azimuth, elevation, roll, distance, shown, *nearest))
     return views
 
 
