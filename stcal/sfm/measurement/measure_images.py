@@ -109,14 +109,10 @@ class Tracker:
         pose: PoseOptions | None = None,
         ellipses: EllipseOptions | None = None,
     ):
-        if not isinstance(target, TargetCircles):
-            raise InputError(
-                "E-FACES-DESIGN",
-                f"target: {type(target).__name__}; give the circles of a run, result.circles(), or those that "
-                "stcal.sfm.read_target reads",
-            )
-        if target.design is None:
-            raise InputError("E-FACES-DESIGN", "target: circles without a design; read it with stcal.sfm.read_target")
+        if not isinstance(target, TargetCircles) or target.design is None:
+            what = "circles without a design" if isinstance(target, TargetCircles) else type(target).__name__
+            remedy = "give result.circles() of a run, or the circles that stcal.sfm.read_target reads"
+            raise InputError("E-FACES-DESIGN", f"target: {what}; {remedy}")
         self.target, self.design, self.board = target, target.design, board
         camera = camera_model(camera)
         self.model, self.pose_options, self.ellipses = camera, pose or PoseOptions(), ellipses or EllipseOptions()

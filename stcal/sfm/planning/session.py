@@ -138,14 +138,12 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     """Returns the pairs of face ids that a text like ``12,14`` or ``top-left,top-right`` names."""
     pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in pair_of_name:
-            raise InputError(
-                "E-OPTION-VALUE",
-                f"--groups: {name!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: ids "
-                "of one "
-                "character beside each other, longer ones with a hyphen",
-            )
+    if unknown := [name for name in names if name not in pair_of_name]:
+        raise InputError(
+            "E-OPTION-VALUE",
+            f"--groups: {unknown[0]!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: "
+            "ids of one character beside each other, longer ones with a hyphen",
+        )
     return tuple(pair_of_name[name] for name in names)
 
 
