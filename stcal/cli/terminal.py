@@ -141,7 +141,7 @@ def printed_last() -> Iterator[None]:
         with redirect_stdout(held):
             yield
     finally:
-        print(held.getvalue(), end="")
+        sys.stdout.write(held.getvalue())
 
 
 def write(path: Path, content, said: str = "written") -> None:
