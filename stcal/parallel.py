@@ -17,7 +17,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, cached_property
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TypeVar
@@ -25,22 +25,18 @@ from typing import TypeVar
 from stcal.errors import InputNote
 
 R = TypeVar("R")
-Progress = Callable[[str, int, int], None]
-"""Function that is called with (stage, done, total)."""
+Progress = Callable[[str, int, int], None]  # function that is called with (stage, done, total)
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Variables from which libraries read their number of threads when they are loaded; worker processes have it 1."""
 FOR_WORKERS: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
 """Environment of worker processes. The working folder might hold files with the names of modules."""
-AT_ONCE = 4
-"""Number of jobs that are handed over for each process, so that the next ones are there when one is done."""
+AT_ONCE = 4  # number of jobs that are handed over for each process, so that the next ones are there when one is done
 _limited = threading.Lock()
 _one_starts = threading.Lock()
 
 
-LOCK = ".lock"
-"""File of a scratch folder; the system releases it when its process ends, in whatever way."""
-YOUNG_S = 1.0
-"""Age below which such a file may not be locked yet."""
+LOCK = ".lock"  # file of a scratch folder; the system releases it when its process ends, in whatever way
+YOUNG_S = 1.0  # age below which such a file may not be locked yet
 
 
 @contextlib.contextmanager
@@ -93,8 +89,7 @@ def one_thread() -> Iterator[None]:
 
 @cache
 def reserve_buffers() -> None:
-    """Lets both libraries of linear algebra, NumPy's and SciPy's, take their working memory while there is some:
-    without it OpenBLAS ends the process, or tries for ever."""
+    """Lets NumPy and SciPy take their working memory: without it OpenBLAS ends the process, or tries for ever."""
     import numpy as np
     import scipy.linalg
 
@@ -119,7 +114,7 @@ def run_parallel(
             yield i, function(*job)
         return
     with contextlib.nullcontext(kept) if kept else _Processes(workers) as processes:
-        yield from processes.run(function, jobs)
+        yield from hand_over(processes.pool, function, jobs, AT_ONCE * processes.workers)
 
 
 def run_in_order(
@@ -144,8 +139,7 @@ def run_in_order(
 def hand_over(
     executor: Executor, function: Callable[..., R], jobs: Iterable[tuple], at_once: int
 ) -> Iterator[tuple[int, R]]:
-    """Yields index and result of each job, in any order; the executor, which stays open, has ``at_once`` of them at a
-    time."""
+    """Yields index and result of each job, in any order; the executor has ``at_once`` of them at a time."""
     waiting: dict[Future[R], int] = {}
     remaining = enumerate(jobs)
     try:
@@ -170,27 +164,25 @@ class _Processes:
 
     def __init__(self, workers: int):
         self.workers = workers
-        self._pool: ProcessPoolExecutor | None = None
         self._others = multiprocessing.active_children()
 
-    def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
-        if self._pool is None:
-            with _starting():
-                self._pool = ProcessPoolExecutor(self.workers, _context(), _follow_parent, (_sockets(),))
-        return hand_over(self._pool, function, jobs, AT_ONCE * self.workers)
+    @cached_property
+    def pool(self) -> ProcessPoolExecutor:
+        with _starting():
+            return ProcessPoolExecutor(self.workers, _context(), _follow_parent, (_sockets(),))
 
     def __enter__(self) -> "_Processes":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
-        if self._pool is None:
+        if "pool" not in vars(self):
             return
         if kind is not None and not issubclass(kind, Exception):  # asked to end: half-done work is of no use
             for process in multiprocessing.active_children():
                 if process not in self._others:
                     process.terminate()
         # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self.pool.shutdown(wait=True, cancel_futures=True)
 
 
 _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)
@@ -257,8 +249,7 @@ def _sockets() -> str:
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """Prepares the start of processes, by one thread at a time: new ones have the environment of workers and do not see
-    the file of the main module. Leaves all that it changes as it was."""
+    """Prepares the start of processes, by one thread at a time, and leaves all that it changes as it was."""
     main = vars(sys.modules["__main__"])
     with _one_starts, _deaf_to_interrupts():
         hidden = {name: main[name] for name in ("__file__", "__spec__") if name in main}

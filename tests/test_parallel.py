@@ -18,8 +18,7 @@ from stcal.parallel import ONE_THREAD, kept_processes, run_in_order, run_paralle
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
-CORES = str(len(os.sched_getaffinity(0)))
-"""OpenBLAS begins as many threads."""
+CORES = str(len(os.sched_getaffinity(0)))  # OpenBLAS begins as many threads
 
 
 def threads() -> set[int]:
@@ -130,26 +129,20 @@ def said() -> dict[str, list[str]]:
 
 
 @pytest.mark.slow
-def test_the_limit_ends_with_the_outermost_call_or_an_error(said):
-    assert said[LIMIT] == [CORES, "1", "1", "1", CORES]
-
-
-@pytest.mark.slow
-def test_calls_of_several_threads_leave_no_limit_behind(said):
-    """The first to begin is the first to end; the second found one thread, and must not restore that."""
-    assert said[SEVERAL_THREADS] == ["1", CORES]
-
-
-@pytest.mark.slow
-def test_workers_have_one_thread(said):
+@pytest.mark.parametrize(
+    ("program", "answer"),
+    [
+        pytest.param(LIMIT, [CORES, "1", "1", "1", CORES], id="the limit ends with the outermost call or an error"),
+        # The first to begin is the first to end; the second found one thread, and must not restore that.
+        pytest.param(SEVERAL_THREADS, ["1", CORES], id="calls of several threads leave no limit behind"),
+        pytest.param(WORKERS, ["1", "1"], id="workers have one thread"),
+        # By the first work of a process, in a thread of asyncio; by two threads at once; the main one; after an error.
+        pytest.param(NOTHING_LEFT, ["answered"], id="nothing is left behind"),
+    ],
+)
+def test_threads_and_what_is_left_of_them(said, program, answer):
     assert threads() == {1}
-    assert said[WORKERS] == ["1", "1"]
-
-
-@pytest.mark.slow
-def test_nothing_is_left_behind(said):
-    """By the first work of a process, in a thread of asyncio; by two threads at once; the main one; after an error."""
-    assert said[NOTHING_LEFT] == ["answered"]
+    assert said[program] == answer
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # what it is about

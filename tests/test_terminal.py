@@ -263,3 +263,19 @@ def test_a_quiet_command_says_a_verdict_that_is_not_good(capsys, rule, failed, v
 def test_every_command_can_be_quiet_or_say_more():
     for command in COMMANDS.values():
         assert {"quiet", "verbose"} <= set(inspect.signature(command).parameters)
+
+
+def test_files_are_written_before_a_reader_such_as_head_ends_the_command(tmp_path, monkeypatch):
+    class Ended(io.StringIO):
+        def write(self, _):
+            raise BrokenPipeError
+
+    def command():
+        with terminal.printed_last():
+            terminal.say("the answer")
+            terminal.write(tmp_path / "page.html", "the page", "report")
+
+    monkeypatch.setattr(sys, "stdout", Ended())
+    with pytest.raises(BrokenPipeError):
+        command()
+    assert (tmp_path / "page.html").read_text() == "the page"

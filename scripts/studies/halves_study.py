@@ -43,8 +43,8 @@ from stcal.sfm import measure, pipeline
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters, of_some_views
 from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.measurement.target import read_target
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from stcal.sfm.measurement.known_target import read_target
+from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 from stcal.workflows.handeye_inputs import read_handeye
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -18,9 +18,8 @@ import numpy as np
 
 from stcal.design import reference_board, reference_target
 from stcal.sfm.planning import forecast
-from stcal.sfm.planning.bodies import plan
 from stcal.sfm.planning.forecast import nominal_poses
-from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
+from stcal.sfm.planning.session import PlanOptions, pairs_of_faces, plan
 from stcal.sfm.runs.options import RunOptions
 
 BASE = PlanOptions()

@@ -25,9 +25,8 @@ from stcal.boards.target_file import target_of
 from stcal.design import BoardDesign
 from stcal.errors import StcalError
 from stcal.io.images import find_images
-from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera, residual_rms_px
-from stcal.sfm.camera.checks import FOLDS
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from stcal.sfm.camera.calibrate import FOLDS, CameraCalibration, calibrate_camera, residual_rms_px
+from stcal.workflows.board_views import calibrate_camera_by_corners, corner_grid
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 SETS = {

@@ -13,6 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -129,6 +130,18 @@ def said_apart() -> Iterator[None]:
             yield
     finally:
         _taker.reset(token)
+
+
+@contextmanager
+def printed_last() -> Iterator[None]:
+    """Holds back what is printed within the context, in which files are written: a reader such as ``head`` may end the
+    command as soon as it has its lines."""
+    held = StringIO()
+    try:
+        with redirect_stdout(held):
+            yield
+    finally:
+        sys.stdout.write(held.getvalue())
 
 
 def write(path: Path, content, said: str = "written") -> None:

@@ -30,8 +30,7 @@ from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Elli
 from stcal.sfm.detect.face_patterns import FaceFinder
 from stcal.sfm.detect.sightings import MIN_NAMING, in_common
 from stcal.sfm.planning.advise import expected_noise
-from stcal.sfm.planning.bodies import plan_body
-from stcal.sfm.planning.session import Plan, PlanOptions, plan_with_board
+from stcal.sfm.planning.session import Plan, PlanOptions, plan
 from stcal.synthetic.designs import Body, face_of_drawing, tag_body
 from stcal.synthetic.scene import FOCAL_PER_WIDTH
 
@@ -487,7 +486,7 @@ def design_target(
         noise=noise,
         seed=options.seed,
     )
-    forecast = plan_with_board(session, target, board or made.board, target.rough_poses())
+    forecast = plan(session, target, board or made.board, target.rough_poses())
     files: tuple[Path, ...] = ()
     if target_file is not None and board_file is not None:
         save_target(target_file, target)
@@ -544,7 +543,7 @@ def design_tag_body(
     target, (noise, source) = tag_body(kind, size_mm, dictionary, first_id, faces), expected_noise(of_corners=True)
     forecast, reason = None, ""
     try:
-        forecast = plan_body(replace(session or PlanOptions(), noise=noise), target, target.rough_poses())
+        forecast = plan(replace(session or PlanOptions(), noise=noise), target, None, target.rough_poses())
     except InputError as error:
         if error.code != "E-PLAN-UNLINKED":
             raise

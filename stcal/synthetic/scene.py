@@ -222,7 +222,7 @@ def make_scene(
     common = board.sigma_mm * made.standard_normal((len(board.labels()), 3)) if options.one_board else None
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
-        group = _made_group(pair, target, board, camera, target_from_face, circles, options, common, rng)
+        group = made_group(pair, target, board, camera, target_from_face, circles, options, common, rng)
         if group.name in groups:
             raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
@@ -282,7 +282,7 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
     return visible_pairs
 
 
-def _made_group(pair, target, board, camera, target_from_face, circles, options, errors, rng) -> Group:
+def made_group(pair, target, board, camera, target_from_face, circles, options, errors, rng) -> Group:
     """Returns a group; ``errors`` : of the places of the board's dots, mm, drawn here if None."""
     name, labels = group_name(pair), [target.face(face).labels() for face in pair]
     normals = [target_from_face[face].rotation[:, 2] for face in pair]

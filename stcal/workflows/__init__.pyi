@@ -1,5 +1,5 @@
+from .board_views import calibrate_camera_by_corners as calibrate_camera_by_corners
 from .board_views import calibration_images as calibration_images
-from .calibrate_camera import calibrate_camera_by_corners as calibrate_camera_by_corners
 from .from_photos import robot_from_photos as robot_from_photos
 from .handeye_inputs import read_handeye as read_handeye
 from .handeye_inputs import without_flips as without_flips

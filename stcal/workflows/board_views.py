@@ -1,9 +1,8 @@
-"""Corners of a board of any kind in one image and in a folder of images."""
+"""Boards of any kind in images: their points, and the camera that took photographs of a board of corners or circles."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from stcal.boards.design import (
     BoardView,
     CharucoDesign,
     ChessboardDesign,
+    CornerBoard,
     FlatBoard,
     HexagonalCirclesDesign,
     TagLayout,
@@ -25,6 +25,7 @@ from stcal.boards.on_faces import shift_by_curves, straightened
 from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.explain import Candidate, explain
 from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, circle_image_offset, fit_homography, refine_planar_pose
@@ -32,35 +33,33 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.image_jobs import run_on_images
-from stcal.io.images import (
-    MAJORITY,
-    TOP_GROUP,
-    ImageFile,
-    Skipped,
-    common_size,
-    decode,
-    find_images,
-    grey_8bit,
-    size_fault,
-)
+from stcal.io.images import MAJORITY, TOP_GROUP, ImageFile, Skipped, common_size, find_images, grey_8bit
 from stcal.labels import DotLabel
 from stcal.locate.layout_calibration import CalibrationImages
-from stcal.parallel import Progress
+from stcal.parallel import Progress, one_thread
+from stcal.sfm.camera.calibrate import (
+    MAX_RESIDUAL_PX,
+    CameraCalibration,
+    calibrated,
+    foretold,
+    judged,
+    require_determined,
+    require_views,
+    unsized,
+)
+from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
 from stcal.sfm.detect.defocus import correct_defocus
+from stcal.sfm.detect.files import load_image, sized_by
 from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.labelling import labelled_image
 
-CENTRING_ROUNDS = 3
-"""Rounds of the correction for the ellipses' centres. The error of the pose from these centres is less than a
-thousandth of the correction; two rounds would be enough."""
-CORNER_SIGMA_PX = 0.1
-"""σ of corners whose detector states none, where they are used with boards whose detector does."""
-NEAREST = 6
-"""Number of outlines about a circle, one of which is its neighbour."""
-MIN_SHARE = 0.35
-"""Smallest share of a board's circles that must be seen."""
+CENTRING_ROUNDS = 3  # of the correction for the ellipses' centres; two would leave a thousandth of it
+CORNER_SIGMA_PX = 0.1  # σ of corners whose detector states none
+NEAREST = 6  # number of outlines about a circle, one of which is its neighbour
+MIN_SHARE = 0.35  # smallest share of a board's circles that must be seen
 Board = BoardDesign | FlatBoard | BoardSet
 KINDS = {
     BoardDesign: "dots",
@@ -74,7 +73,6 @@ KINDS = {
 
 
 def kind_of(board: Board) -> str:
-    """Returns the name of the board's kind in messages."""
     return f"{len(board.boards)} boards" if isinstance(board, BoardSet) else KINDS[type(board)]
 
 
@@ -106,24 +104,23 @@ def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tu
         views.append(replace(view, ids=view.ids + first, xyz_board=xyz, normal=normal, unused=unused))
     if not views:
         return None, "; ".join(reasons)
-    # A board whose detector states no covariances gets the default, since the other boards have theirs.
-    covariances = [
-        np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
-        if view.covariance_px2 is None
-        else view.covariance_px2
-        for view in views
-    ]
     ids, xyz, xy, normals = (
         np.concatenate([getattr(view, part) for view in views]) for part in ("ids", "xyz_board", "xy_px", "normal")
     )
     unused = (*(reason for view in views for reason in view.unused), *reasons)
-    return BoardView(name, ids, xyz, xy, np.concatenate(covariances), normals, unused), ""
+    return BoardView(name, ids, xyz, xy, np.concatenate([*map(covariance_px2, views)]), normals, unused), ""
+
+
+def covariance_px2(view: BoardView) -> np.ndarray:
+    """Returns the covariances (k, 2, 2) of a view's points, or that of corners if their detector states none."""
+    if view.covariance_px2 is None:
+        return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
+    return view.covariance_px2
 
 
 def _find_flat(
     image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
 ) -> tuple[BoardView | None, str]:
-    """Returns the view of a single board, or the reason why there is none."""
     if isinstance(board, BoardDesign):
         place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
         return _find_circles(image, name, camera, board, board, place)
@@ -143,7 +140,6 @@ def _find_flat(
 
 
 def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
-    """Returns the reason why there are no corners, as far as the tags show it."""
     ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
     few, board_ids = "fewer than 4 corners of the ChArUco board", board.tag_ids()
     if not ids:
@@ -153,17 +149,25 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
         return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}" + (
             f" from {board_ids[0]}" if board_ids[0] else ""
         )
-    turned = replace(board, rows=board.columns, columns=board.rows)
-    others = [replace(own, legacy=legacy) for own in (board, turned) for legacy in (False, True)]
-    found = [(len(view), other) for other in others if (view := find_charuco(image, "", other)) is not None]
-    if not found:
-        return f"{few}, but {len(ids)} of its tags, not where rows and columns of its file put them; correct them"
-    _, fits = max(found, key=itemgetter(0))
-    legacy = f", legacy = {str(fits.legacy).lower()}" if fits.legacy != board.legacy else ""
-    return (
-        f"{few}, but {len(ids)} of its tags, as on a board of rows = {fits.rows}, columns = {fits.columns}{legacy}; "
-        "correct its file"
-    )
+    turned, few = replace(board, rows=board.columns, columns=board.rows), f"{few}, but {len(ids)} of its tags"
+    candidates = [
+        Candidate(
+            f"rows = {own.rows}, columns = {own.columns}"
+            + (f", legacy = {str(legacy).lower()}" if legacy != board.legacy else ""),
+            partial(replace, own, legacy=legacy),
+        )
+        for own in (board, turned)
+        for legacy in (False, True)
+    ]
+
+    def missing(other: CharucoDesign) -> float:
+        view = find_charuco(image, "", other)
+        return np.inf if view is None else 1 / len(view)
+
+    fits = explain(candidates, missing, np.inf, alike=1)
+    if not fits:
+        return f"{few}, not where rows and columns of its file put them; correct them"
+    return f"{few}, as on a board of {fits[0][0].words}; correct its file"
 
 
 def _find_asymmetric(
@@ -199,8 +203,7 @@ def _find_circles(
     grid: BoardDesign,
     place: np.ndarray,
 ) -> tuple[BoardView | None, str]:
-    """Returns the view of a board of circles, or why there is none. ``grid`` : lattice in which they are found;
-    ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
+    """``grid`` : lattice in which circles are found; ``place`` : (rows, columns) rows of the lattice in ``xy_mm``."""
     pattern = "board of dots" if grid is board else f"grid of {kind_of(board)}"
     detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
     if detected.repeated:
@@ -211,17 +214,8 @@ def _find_circles(
     if not _turned_only(ids, board):
         return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
     centres, xy = detected.centres.select(detected.board.rows), board.xy_mm()[ids[0]]
-    labels = tuple(DotLabel(*cell) for cell in detected.board.numberings[0].tolist())
-    seen = ImageObservations(
-        name,
-        TOP_GROUP,
-        labels,
-        centres.centre_px,
-        centres.centre,
-        centres.shape,
-        centres.covariance_px2,
-        blur_px=centres.blur_px,
-    )
+    labels = [DotLabel(*cell) for cell in detected.board.numberings[0].tolist()]
+    seen = labelled_image(name, TOP_GROUP, labels, centres, ()).observations
     (sharp,), _ = correct_defocus([seen], camera, pattern_of_board(grid))
     xyz = np.column_stack([xy, np.zeros(len(xy))])
     centre_px = images_of_centres(sharp.centre_px, xyz, board.radii_mm()[ids[0]], camera)
@@ -257,7 +251,6 @@ class BoardDetection:
     """One readable image: ``view``, or None with the reason ``why``; ``tags`` of the requested dictionaries."""
 
     name: str
-    size: tuple[int, int]
     view: BoardView | None
     why: str = ""
     tags: Tags | None = None
@@ -274,7 +267,6 @@ class BoardDetections:
     symmetries: tuple[Rigid, ...]
 
     def views(self) -> dict[str, BoardView]:
-        """Returns the views by image, for the images that show the board."""
         return {detection.name: detection.view for detection in self.images if detection.view is not None}
 
     def unused(self) -> list[str]:
@@ -299,51 +291,38 @@ def detect_boards(
     images done, and all. Raises InputError: no image is readable, or the camera is not that of the images."""
     if not files:
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")
-    size, stated_by = None, MAJORITY
     if model.width and model.height:
-        size, stated_by = (model.width, model.height), "the camera file"
-        model.require_inside(*size, "the image")
-    elif (found := common_size(files)) is not None:
-        size, name = found
-        model.require_inside(*size, name)
-    jobs = [(file, model, size, stated_by, board, tuple(dictionaries)) for file in files]
-    by_job: dict[int, BoardDetection | Skipped] = {}
-    for i, detection in run_on_images(_detect_board, jobs, workers):
-        by_job[i] = detection
+        model.require_inside(model.width, model.height, "the image")
+    if (model.width and model.height) or common_size(files):
+        camera, size_from = sized_by(model, list(files))
+    else:  # of any size: each file says why it cannot be read
+        camera, size_from = model.sized(1, 1), MAJORITY
+    outcomes: dict[int, BoardDetection | Skipped] = {}
+    jobs = [(file, camera, size_from, board, tuple(dictionaries)) for file in files]
+    for i, outcome in run_on_images(_detect_board, jobs, workers):
+        outcomes[i] = outcome
         if progress:
-            progress(len(by_job), len(jobs))
-    outcomes = [by_job[i] for i in range(len(jobs))]
-    detections = tuple(outcome for outcome in outcomes if isinstance(outcome, BoardDetection))
-    if size is None or not detections:
-        first = next(outcome for outcome in outcomes if isinstance(outcome, Skipped))
-        raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
-    without = (Skipped(s.name, s.why, "board") for s in detections if s.view is None)
-    skipped = (*(outcome for outcome in outcomes if isinstance(outcome, Skipped)), *without)
-    return BoardDetections(model.sized(*size), detections, skipped, tuple(symmetries(board)))
+            progress(len(outcomes), len(jobs))
+    every = [outcomes[i] for i in range(len(jobs))]
+    detections = tuple(each for each in every if isinstance(each, BoardDetection))
+    unusable = tuple(each for each in every if isinstance(each, Skipped))
+    if not detections:
+        reason = f"{unusable[0].name}: {unusable[0].reason}"
+        raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {reason}")
+    without = (Skipped(each.name, each.why, "board") for each in detections if each.view is None)
+    return BoardDetections(camera, detections, (*unusable, *without), tuple(symmetries(board)))
 
 
 def _detect_board(
-    file: ImageFile,
-    model: CameraModel,
-    size: tuple[int, int] | None,
-    stated_by: str,
-    board: Board,
-    dictionaries: tuple[str, ...],
+    file: ImageFile, camera: Camera, size_from: str, board: Board, dictionaries: tuple[str, ...]
 ) -> BoardDetection | Skipped:
-    try:
-        data = file.read()
-    except OSError as error:
-        return Skipped(file.name, f"cannot be read: {error.strerror or error}")
-    try:
-        image = decode(data, file.name, size)
-    except InputError as error:
-        return Skipped(file.name, str(error).removeprefix(f"{file.name}: "))
-    height, width = image.shape
-    if size is not None and size != (width, height):
-        return size_fault(file.name, (width, height), size, stated_by)
+    loaded = load_image(file, camera, size_from)
+    if isinstance(loaded, Skipped):
+        return loaded
+    image = loaded[1]
     tags = find_tags(image, dictionaries) if dictionaries else None
-    view, why = find_board(image, file.name, model.sized(width, height), board)
-    return BoardDetection(file.name, (width, height), view, why, tags)
+    view, why = find_board(image, file.name, camera, board)
+    return BoardDetection(file.name, view, why, tags)
 
 
 @require_arguments
@@ -389,3 +368,142 @@ def calibration_images(
         replace(each, corners_px=each.corners_px - shift_by_curves(each.corners_px, detections.camera)) for each in tags
     )
     return CalibrationImages(names, views, tags, detections.camera, detections.symmetries, left_out)
+
+
+GROSS_SIGMAS = 10.0  # smallest deviation of a gross error from camera and board; it is above MAX_RESIDUAL_PX, too
+LEAST_CORNERS = 6  # smallest number of corners of a view of which others were left out: they still check one another
+LEAST_SHARE = 0.5  # of the corners of a view that are no gross errors; with fewer of them the view is not used
+
+
+@require_arguments
+@one_thread()
+def calibrate_camera_by_corners(
+    images: str | Path,
+    board: FlatBoard,
+    colmap_model: str = "OPENCV",
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> CameraCalibration:
+    """Returns intrinsics from photographs of a chessboard, ChArUco board, AprilGrid, or asymmetric circles.
+
+    Parameters
+    ----------
+    images : str or Path
+        Folder of photographs, or of folders of them.
+    board : board design
+        The board, mm, with the σ of its corners, of :func:`stcal.load_flat_board`.
+    colmap_model : str
+        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    CameraCalibration
+        The same result as from dots; a corner (row, column) stands for the dot of that place.
+
+    Raises
+    ------
+    StcalError
+        One of its subclasses, with a one-line message that says what to do.
+    """
+    grid = corner_grid(board)
+    told, rounds = progress or (lambda *_: None), ROUNDS.get(type(board), 1)
+
+    def of_model(
+        files: list[ImageFile], not_images: Sequence[Skipped], camera: Camera, colmap_model: str
+    ) -> CameraCalibration:
+        for done in range(1, rounds + 1):
+            step = partial(told, f"detect {done}")
+            detections = detect_boards(files, unsized(camera, colmap_model), board, (), workers, step)
+            views = _observations(files, detections.views(), grid, camera)
+            skipped = (*not_images, *detections.skipped)
+            require_views(views, files, skipped)
+            start = camera if done > 1 else closed_form(views, grid, camera)
+            result = adjust_intrinsics(views, grid, start, colmap_model)
+            camera = result.camera
+        kept, without, warnings = without_gross_errors(views, grid, result)
+        if without or warnings:
+            views, skipped = kept, (*skipped, *without)
+            require_views(views, files, skipped)
+            result = replace(adjust_intrinsics(views, grid, camera, colmap_model), restarted=result.restarted)
+        require_determined(result, views, grid)
+        calibration = judged(result, views, skipped, rounds, True, grid)
+        return replace(calibration, warnings=(*calibration.warnings, *warnings))
+
+    return calibrated(of_model, images, grid, colmap_model, workers)
+
+
+def without_gross_errors(
+    views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics
+) -> tuple[list[ImageObservations], list[Skipped], list[str]]:
+    """Returns the views without gross errors, those that consist of them, and a warning about the others."""
+    suspects = {
+        model.images[image]
+        for model in result.models
+        for image in model.image_index[np.linalg.norm(model.residuals_px(result.camera), axis=1) > MAX_RESIDUAL_PX]
+    }
+    limits = f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px"
+    kept, skipped, off = [], [], []
+    for view in views:
+        own = _gated(view, grid, result) if view.name in suspects else view
+        if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
+            reason = (
+                f"{len(view) - len(own)} of {len(view)} corners lie more than {limits} from where the camera and the "
+                "other views put them"
+            )
+            skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
+            continue
+        kept.append(own)
+        off += [(view.name, label) for label in view.labels if label not in own.labels]
+    if not off:
+        return kept, skipped, []
+    image, label = off[0]
+    warning = (
+        f"{len(off)} corners in {len(dict(off))} views are left out, first {image} {label}: they lie more than "
+        f"{limits} from where the camera and all views put them; look whether something hides the board there"
+    )
+    return kept, skipped, [warning]
+
+
+def _gated(view: ImageObservations, grid: BoardDesign, result: Intrinsics) -> ImageObservations:
+    """Returns a view without its gross errors, one by one, as each disturbs the pose and thereby the others."""
+    while len(view) > LEAST_CORNERS:
+        residual_px, in_sigma = foretold(view, grid, result)
+        length_px = np.linalg.norm(residual_px, axis=1)
+        in_sigmas = np.linalg.norm(in_sigma, axis=1) / result.factors.centres
+        worst = int(np.argmax(np.where(length_px > MAX_RESIDUAL_PX, in_sigmas, 0)))
+        if length_px[worst] <= MAX_RESIDUAL_PX or in_sigmas[worst] <= GROSS_SIGMAS:
+            break
+        view = view.select(np.delete(np.arange(len(view)), worst))
+    return view
+
+
+ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3, HexagonalCirclesDesign: 3}
+"""Rounds of detection where the camera helps to find the points, and for circles also moves them: an error of their
+eccentricity shrinks to less than a tenth with each round. Corners of chessboards and ChArUco boards need one."""
+
+
+def corner_grid(board: FlatBoard) -> CornerBoard:
+    """Returns a board's points as dots without extent; raises InputError: points that are not on a grid."""
+    if isinstance(board, TagLayout):
+        raise InputError(
+            "E-BOARD-TYPE",
+            f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid, asymmetric "
+            "or hexagonal circles needed to calibrate a camera",
+        )
+    return CornerBoard.of(board)
+
+
+def _observations(
+    files: Sequence[ImageFile], views: dict[str, BoardView], grid: CornerBoard, camera: Camera
+) -> list[ImageObservations]:
+    group = {file.name: file.group for file in files}
+    observations = []
+    for name, view in views.items():
+        labels = tuple(DotLabel(*cell) for cell in grid.cells()[view.ids].tolist())
+        rays, shape = camera.normalised_from_pixel(view.xy_px), np.zeros((len(view), 2, 2))
+        observations.append(ImageObservations(name, group[name], labels, view.xy_px, rays, shape, covariance_px2(view)))
+    return observations

@@ -14,8 +14,7 @@ from stcal.errors import DetectionError, InputError
 from stcal.io.image_jobs import spread
 from stcal.parallel import AT_ONCE
 
-ANSWER_S = 10
-"""Longest time that a scheduler, and the first worker, may take to answer, in s."""
+ANSWER_S = 10  # longest time that a scheduler, and the first worker, may take to answer, in s
 ADDRESS = re.compile(r"((tcp|tls)://)?([\w.-]+|\[[\da-fA-F:]+\]):\d{1,5}")
 
 
@@ -79,8 +78,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _require_scheduler(address: str) -> None:
-    """Refuse addresses without a scheduler: for some of them, and for answers of other programs, Dask's client waits
-    for ever."""
+    """Refuses addresses without a scheduler, for some of which Dask's client waits for ever."""
     from distributed.core import rpc
     from distributed.security import Security
 

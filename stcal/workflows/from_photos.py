@@ -51,8 +51,9 @@ from stcal.robot.kinematics.file import require_robot_written
 from stcal.robot.kinematics.measurements import joint_values, targets_of
 from stcal.robot.use.compensation import Compensated, CompensationFile, compensated_summary
 from stcal.robot.use.report import compensation_report
-from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
-from stcal.sfm.measurement.report import (
+from stcal.sfm.measurement.known_target import TargetCircles
+from stcal.sfm.measurement.measure_images import MeasureOptions, MeasureResult, measure
+from stcal.sfm.measurement.pose_report import (
     IMAGE,
     measure_report,
     poses_csv,
@@ -60,7 +61,6 @@ from stcal.sfm.measurement.report import (
     require_table_written,
     summary,
 )
-from stcal.sfm.measurement.target import TargetCircles
 
 STAGES = {
     "poses": "Poses of the target in the photographs",

@@ -17,7 +17,7 @@ from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import made
 from stcal.robot.use.targets import Targets
-from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
+from stcal.sfm.measurement.measure_images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows import from_photos as work

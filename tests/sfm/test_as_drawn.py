@@ -16,7 +16,7 @@ from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.note import ELSEWHERE, NOT_AS_DRAWN, Note
 from stcal.sfm.mapping.body import Corners, wrong_sizes
 from stcal.sfm.mapping.placed import place_with_camera
-from stcal.sfm.planning.bodies import corners_seen
+from stcal.sfm.planning.session import corners_seen
 from stcal.sfm.report.judgement import judgement_of
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import load_run

@@ -30,10 +30,9 @@ from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
-from stcal.sfm.measurement.tracker import Tracker
-from stcal.sfm.planning.bodies import plan_body, planned_photographs
-from stcal.sfm.planning.file import plan_text
-from stcal.sfm.planning.session import PlanOptions
+from stcal.sfm.measurement.measure_images import Tracker
+from stcal.sfm.planning.plan_report import plan_text
+from stcal.sfm.planning.session import PlanOptions, plan, planned_photographs
 from stcal.sfm.report.compare import compare
 from stcal.sfm.report.judgement import TESTED_BY
 from stcal.sfm.runs.options import RunOptions
@@ -300,15 +299,15 @@ def test_faces_that_are_hardly_seen_are_named():
     for face in scene.target.faces:
         assert f"{face.id} ({shown.count(face.id)} of 2 images" in scene.hardly_seen()
     target = tag_cube(60)
-    plan = plan_body(PlanOptions(10, distance_mm=300, width=900), target, target.rough_poses())
-    assert "hardly seen: face" in plan_text(plan, "")
+    planned = plan(PlanOptions(10, distance_mm=300, width=900), target)
+    assert "hardly seen: face" in plan_text(planned, "")
 
 
 def test_what_is_forecast_is_what_is_simulated():
     """The same views, although simulated faces are not quite where the design has them, so near that few poses fit."""
     target, near = tag_cube(60), 145.0
-    plan = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
-    forecast, _, _ = planned_photographs(plan, target)
+    options = PlanOptions(images=8, distance_mm=near, width=900, seed=3, camera=body_camera(900))
+    forecast, _, _ = planned_photographs(options, target)
     simulated = make_body_scene(target, body_camera(900), BodyOptions(8, near, seed=3, print_errors=1.0))
     pairs = list(zip(forecast.camera_from_target, simulated.camera_from_target, strict=True))
     assert all(np.array_equal(one.matrix(), two.matrix()) for one, two in pairs)
@@ -340,11 +339,11 @@ def test_photographs_from_the_shortest_distance_of_a_design_can_be_simulated(tmp
 
 def test_more_images_and_a_known_distance_help_a_planned_body():
     target = tag_cube(60)
-    plan = plan_body(PlanOptions(images=12, distance_mm=300, width=900, seed=1), target, target.rough_poses())
-    worst = plan.forecast.worst()[1]
-    remedies = {remedy.what: remedy.sigma_mm for remedy in plan.remedies}
-    assert set(plan.shares["2"]) == {"image noise", "print", "flatness", "intrinsics"}
-    for shares in plan.shares.values():
+    planned = plan(PlanOptions(images=12, distance_mm=300, width=900, seed=1), target)
+    worst = planned.forecast.worst()[1]
+    remedies = {remedy.what: remedy.sigma_mm for remedy in planned.remedies}
+    assert set(planned.shares["2"]) == {"image noise", "print", "flatness", "intrinsics"}
+    for shares in planned.shares.values():
         assert sum(shares.values()) == pytest.approx(1, abs=2e-3)
     assert all(sigma < worst for sigma in remedies.values())
     assert remedies["a distance known to 20 µm"] < 0.6 * worst  # the edges of tags leave the size open

@@ -14,8 +14,8 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import unmoved
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.measurement.pose import TargetPose
-from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.planning.forecast import observe, true_models
 from stcal.synthetic.scene import Scene
 

@@ -1,8 +1,8 @@
 """Commands ``stcal-sfm``: calibration of a target from images, and related tasks."""
 
 from stcal.cli.help import group
-from stcal.cli.sfm import colmap, designs, measure, planning, run
+from stcal.cli.sfm import colmap, designs, measure, run
 
 app = group("stcal-sfm", "Calibrate a target from a folder of images. With --debug, any command prints a traceback.")
-for part in (run, designs, colmap, planning, measure):
+for part in (run, designs, colmap, measure):
     app.add_typer(part.app)

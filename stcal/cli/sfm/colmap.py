@@ -65,12 +65,8 @@ def crosscheck(
     tolerance_sigma: Annotated[float, "Accept differences of faces and circles up to this, in σ.", LIMIT] = 0.5,
     tolerance_um: Annotated[float | None, "Accept differences of faces and circles up to this, µm.", LIMIT] = None,
     tolerance_mdeg: Annotated[float | None, "Accept differences of faces up to this, millidegrees.", LIMIT] = None,
-    camera_tolerance_um: Annotated[
-        float | None, "Accept differences of camera positions up to this, µm.", LIMIT
-    ] = None,
-    camera_tolerance_mdeg: Annotated[
-        float | None, "Accept differences of camera attitudes up to this, mdeg.", LIMIT
-    ] = None,
+    camera_tolerance_um: Annotated[float | None, "Accept camera positions that differ up to this, µm.", LIMIT] = None,
+    camera_tolerance_mdeg: Annotated[float | None, "Accept attitudes that differ up to this, mdeg.", LIMIT] = None,
     timeout: Annotated[float, "Stop the native mapper after this time for a group, s.", Opt(min=1, max=1e6)] = 600.0,
 ) -> None:
     """Map the same database with the native COLMAP, compare faces, circles and cameras, and add this to the report."""

@@ -12,7 +12,7 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import MOST_SEED, WRITES, Arg, Opt
-from stcal.cli.terminal import StageProgress, print_each, say, write_if
+from stcal.cli.terminal import StageProgress, print_each, printed_last, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import COMPARISON, RUN_MARKER, json_text, real_place, save
 
@@ -52,26 +52,20 @@ def simulate(
     fisheye: Annotated[float | None, "Use an equidistant lens of this diagonal field, °.", Opt(min=60, max=170)] = None,
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
-    f_number: Annotated[
-        float | None, "Use a thin lens of this f-number; if not given, all is in focus.", Opt(min=0.5, max=100)
-    ] = None,
+    f_number: Annotated[float | None, "Use a thin lens of this f-number; else no blur.", Opt(min=0.5, max=100)] = None,
     focus: Annotated[float | None, "Focus at this depth, or at --distance.", Opt("--focus-mm", min=10, max=1e7)] = None,
     focal: Annotated[
-        float | None,
-        "Set the focal length; that of a sensor 22.3 mm wide if not given.",
-        Opt("--focal-mm", min=0.5, max=5000),
+        float | None, "Set the focal length, or that of a sensor 22.3 mm wide.", Opt("--focal-mm", min=0.5, max=5000)
     ] = None,
     rim: Annotated[float, "Set the height of rims; < 0: raised discs.", Opt("--rim-mm", min=-20, max=20)] = 0.0,
     slope: Annotated[float, "Let the light of circles rise by this fraction across.", Opt(min=0, max=1)] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
-        float | None, "Add a table below that reflects this fraction.", Opt("--table-reflectance", min=0, max=1)
+        float | None, "Add a table of this reflectance.", Opt("--table-reflectance", min=0, max=1)
     ] = None,
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    groups: Annotated[
-        str | None, "Photograph these pairs of faces, such as 12,14; all that are visible together if not given."
-    ] = None,
+    groups: Annotated[str | None, "Photograph these pairs of faces, such as 12,14; else all visible ones."] = None,
     camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
     one_board: Annotated[bool, "Photograph one board with all groups, as `plan` assumes."] = False,
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
@@ -79,9 +73,7 @@ def simulate(
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     body_seed: Annotated[
-        int | None,
-        "Draw errors of target, camera and board with this seed; with --seed if not given.",
-        Opt(min=0, max=MOST_SEED),
+        int | None, "Draw errors of target, camera and board with this, not --seed.", Opt(min=0, max=MOST_SEED)
     ] = None,
     margin: shared.PlateMargin = 15.0,
     workers: shared.Workers = None,
@@ -228,8 +220,9 @@ def compare(
 
     if run.suffix.lower() == ".csv":
         of_poses = compare_poses(run, truth)
-        say(poses_table(of_poses))
-        write_if(out, lambda: of_poses, "as JSON")
+        with printed_last():
+            say(poses_table(of_poses))
+            write_if(out, lambda: of_poses, "as JSON")
         return
 
     into_run = run / COMPARISON
@@ -238,11 +231,12 @@ def compare(
         comparison = against(run, truth)
         if stage is not None:
             save(stage / COMPARISON, json_text(comparison))
-    say(comparison_table(comparison))
-    if is_added:
-        say(f"as JSON: {into_run}")
-    else:
-        write_if(out or (into_run if run.is_dir() else None), lambda: comparison, "as JSON")
+    with printed_last():
+        say(comparison_table(comparison))
+        if is_added:
+            say(f"as JSON: {into_run}")
+        else:
+            write_if(out or (into_run if run.is_dir() else None), lambda: comparison, "as JSON")
 
 
 @app.command()
@@ -271,8 +265,7 @@ def demo(
     say(comparison_table(comparison))
 
 
-CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
-"""Defaults of `design`."""
+CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"  # defaults of `design`
 
 
 @app.command()
@@ -314,16 +307,12 @@ def design(
     ] = "",
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
-        float | None,
-        "Draw the smaller circles with this radius; chosen if not given.",
-        Opt("--radius-mm", min=0.01, max=1e4),
+        float | None, "Draw the smaller circles with this radius; else chosen.", Opt("--radius-mm", min=0.01, max=1e4)
     ] = None,
     distance: shared.Distance = 1000.0,
     width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
-    bright: Annotated[
-        bool, "Make bright circles on dark plates, or dark ones on bright.", Opt("--bright/--dark")
-    ] = False,
+    bright: Annotated[bool, "Make bright circles on dark plates, or dark on bright.", Opt("--bright/--dark")] = False,
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
     seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
 ) -> None:
@@ -333,7 +322,7 @@ def design(
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make import DesignOptions, design_tag_body, design_target, faces_of, made_text, size_of
-    from stcal.sfm.planning.file import plan_text
+    from stcal.sfm.planning.plan_report import plan_text
     from stcal.sfm.planning.session import PlanOptions
     from stcal.synthetic.designs import made_text as body_text
     from stcal.synthetic.designs import width_of

@@ -1,5 +1,4 @@
-"""Commands ``stcal-sfm calibrate-camera`` and ``measure``: intrinsics from photographs of the board, and poses of the
-calibrated target in images."""
+"""Commands ``stcal-sfm plan``, ``advise``, ``calibrate-camera`` and ``measure``: photographs before and after a run."""
 
 import json
 import re
@@ -16,27 +15,119 @@ import typer
 
 from stcal.cli import options as shared
 from stcal.cli.options import WRITES, Arg, Opt
-from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, verbose, write, write_if, write_out
+from stcal.cli.terminal import (
+    STANDARD_OUTPUT,
+    StageProgress,
+    print_each,
+    printed_last,
+    say,
+    verbose,
+    write,
+    write_if,
+    write_out,
+)
 from stcal.errors import InputError
 
 app = typer.Typer()
 
 
+@app.command()
+def plan(
+    images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
+    spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
+    distance: shared.Distance = 1000.0,
+    width: Annotated[int, "Take images of this width, px, 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)] = 5184,
+    camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
+    noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
+    run: Annotated[Path | None, "Take the σ of the centres from the finished run in this folder."] = None,
+    target: shared.TargetFile = None,
+    faces: Annotated[Path | None, "Place the faces of --target as in the faces.json of an earlier run."] = None,
+    board: shared.BoardFile = None,
+    groups: Annotated[str | None, "Photograph these pairs of faces, such as 12,14 or front-right,front-top."] = None,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
+    one_board: Annotated[bool, "Use one plate in all groups, not one each.", Opt("--one-board/--own-boards")] = True,
+    seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    margin: shared.PlateMargin = 15.0,
+    out: shared.JsonFile = None,
+) -> None:
+    """Forecast the σ before any photograph is taken, without Monte Carlo, and say what would help most."""
+    from stcal.boards.board_file import load_dots
+    from stcal.boards.target_file import target_of
+    from stcal.io.cameras.read import read_camera
+    from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run
+    from stcal.sfm.planning.forecast import CentreNoise
+    from stcal.sfm.planning.plan_report import PlanFile, plan_text
+    from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
+    from stcal.sfm.planning.session import plan as planned
+    from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.saved import load_run
+
+    design = target_of(target)
+    if noise is not None and run is not None:
+        raise InputError(
+            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
+        )
+    if noise is not None:
+        centre_noise = CentreNoise(0.0, floor_px=noise, corner_px=noise)
+        source = "--noise, whatever the size of a circle"
+    elif run is not None:
+        saved = load_run(run)
+        centre_noise, source = noise_of_run(saved), f"by size and tilt as in {run}"
+        if failures := failures_of(saved):
+            print_each("warning", [f"{failures}: the σ of its centres have in them what failed"])
+    else:
+        centre_noise, source = expected_noise(of_corners=bool(design.with_faces(printed=True).faces))
+        source = f"{source} (--noise, --run)"
+    options = PlanOptions(
+        images,
+        spread,
+        distance,
+        width,
+        read_camera(camera) if camera else None,
+        pairs_of_faces(groups, design) if groups else None,
+        centre_noise,
+        one_board,
+        RunOptions(refine_camera=refine_camera),
+        seed,
+        margin,
+    )
+    with shared.designs_told(target, board):
+        result = planned(options, design, load_dots(board) if board else None, faces)
+    with printed_last():
+        say(plan_text(result, source))
+        write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
+
+
+@app.command()
+def advise(
+    run: shared.Run,
+    count: Annotated[int, "Advise this many views.", Opt(min=1, max=50)] = 5,
+    out: shared.JsonFile = None,
+) -> None:
+    """Compute which further photographs would lower the σ of the worst face of a run most."""
+    shared.load_ahead(None)
+    from stcal.sfm.planning.advise import advise as advice_for
+    from stcal.sfm.planning.advise import doubts, known_of
+    from stcal.sfm.planning.plan_report import AdviceFile, advice_text
+    from stcal.sfm.runs.saved import load_run
+
+    saved = load_run(run)
+    if doubt := doubts(saved):
+        print_each("warning", [doubt])
+    geometry = known_of(saved)
+    with StageProgress() as progress:
+        advice = advice_for(geometry, count, progress)
+    with printed_last():
+        say(advice_text(advice))
+        write_if(out, lambda: AdviceFile.of_advice(advice), "as JSON")
+
+
 @app.command(name="calibrate-camera")
 def calibrate_camera(
-    images: Annotated[
-        Path,
-        "Read photographs that show the board from this folder, or from IMAGES/<group>/, or frames of a video, as run "
-        "does.",
-        Arg(),
-    ],
+    images: Annotated[Path, "Read photographs of the board from this folder, or frames of a video, like run.", Arg()],
     out: Annotated[Path, "Write the camera to this file.", WRITES] = Path("cameras.txt"),
     target: shared.TargetFile = None,
-    board: Annotated[
-        Path | None,
-        "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid or "
-        "asymmetric circles, in place of the reference board.",
-    ] = None,
+    board: Annotated[Path | None, "Read the board, of any kind, from this file (TOML, or Kalibr's YAML)."] = None,
     model: Annotated[
         str,
         "Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV; "
@@ -44,9 +135,7 @@ def calibrate_camera(
         "the simplest model that predicts held-out views as well as the best one.",
     ] = "OPENCV",
     json_file: Annotated[
-        Path | None,
-        "Write figures and checks to this file (JSON), or to standard output with `-`; beside --out if not given.",
-        Opt("--json", writes=True),
+        Path | None, "Write figures and checks here (JSON), or beside --out.", Opt("--json", writes=True)
     ] = None,
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
@@ -61,9 +150,8 @@ def calibrate_camera(
     from stcal.io.cameras.read import save_camera
     from stcal.io.video import images_or_frames
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
-    from stcal.sfm.camera.file import CalibrationFile
-    from stcal.sfm.camera.report import calibration_report
-    from stcal.workflows.calibrate_camera import calibrate_camera_by_corners
+    from stcal.sfm.camera.camera_report import calibration_file, calibration_report
+    from stcal.workflows.board_views import calibrate_camera_by_corners
 
     json_file = json_file or out.with_suffix(".json")
     shared.require_new([("--out", out), *([("--json", json_file)] if json_file != STANDARD_OUTPUT else [])])
@@ -78,18 +166,18 @@ def calibrate_camera(
             result = calibrate_camera_by_corners(folder, board_design, model, workers, progress)
     intrinsics = result.intrinsics
     save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance), "colmap")
-    summary = CalibrationFile.of(result)
+    summary = calibration_file(result)
     document = calibration_report(result, summary, str(images))
-    say(document.text())
-    print_each("warning", result.warnings)
-    say(f"camera file: {out}")
-    write(json_file, summary, "figures and checks")
-    write_if(report, document.page, "report")
+    with printed_last():
+        say(document.text())
+        print_each("warning", result.warnings)
+        say(f"camera file: {out}")
+        write(json_file, summary, "figures and checks")
+        write_if(report, document.page, "report")
     shared.require_passed(strict, [] if intrinsics.settled else ["σ of centres and dots"], report)
 
 
-SAY_EVERY_S = 1.0
-"""Shortest time between two lines of --live, s."""
+SAY_EVERY_S = 1.0  # shortest time between two lines of --live, s
 
 
 TABLE = Path("poses.csv")
@@ -101,33 +189,19 @@ def measure(
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None,
-        "Read the images of this folder and its subfolders. With --live, it may also be the URL of a stream or a video "
-        "file; with --serve, give none.",
+        "Read the images of this folder and its subfolders; or, with --live, a stream's URL or a video.",
         Arg(),
     ] = None,
     target: shared.TargetFile = None,
     out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = TABLE,
-    json_file: Annotated[
-        Path | None,
-        "Also write all results to this file, with both solutions of ambiguous images (JSON), or to standard output "
-        "with `-`.",
-        Opt("--json", writes=True),
-    ] = None,
+    json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
-    joints: Annotated[
-        Path | None, "Add the columns of this file to the table, such as joint values; it needs a column image (CSV)."
-    ] = None,
+    joints: Annotated[Path | None, "Add the columns of this file, such as joints, by its column image (CSV)."] = None,
     board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
     previous: Annotated[bool, "Decide between two solutions by the previous image, assuming small motions."] = False,
-    sequence: Annotated[
-        bool,
-        "Follow the target from image to image of each folder, in order of name, and search a whole image only after "
-        "the target was lost. An ambiguous pose is decided as with --previous.",
-    ] = False,
+    sequence: Annotated[bool, "Follow the target from image to image, by name, and decide as with --previous."] = False,
     sigma_factor: Annotated[
-        float | None,
-        "Multiply the σ of the centres by this; if not given, by the factor in faces.json.",
-        Opt(min=1e-3, max=1e3),
+        float | None, "Multiply the σ of the centres by this, not by that of faces.json.", Opt(min=1e-3, max=1e3)
     ] = None,
     strict: shared.Strict = False,
     min_diameter: shared.MinDiameter = None,
@@ -135,32 +209,18 @@ def measure(
     workers: shared.Workers = None,
     scheduler: shared.Scheduler = None,
     send_images: shared.SendImages = False,
-    serve: Annotated[
-        bool, "Answer images that are sent over HTTP, POST /pose, with JSON for each, until Ctrl-C."
-    ] = False,
+    serve: Annotated[bool, "Answer images sent over HTTP, POST /pose, with JSON for each, until Ctrl-C."] = False,
     live: Annotated[
         bool,
         "Show a page with the pictures of a camera, or of the folder, stream or video IMAGES, and the target's pose in "
         "each, until Ctrl-C. One line is printed per second; with `--json -`, every pose is.",
     ] = False,
-    camera_index: Annotated[
-        int, "Take the pictures of --live from the camera with this number.", Opt(min=0, max=99)
-    ] = 0,
-    host: Annotated[
-        str,
-        "Listen at this address with --serve or --live; with 0.0.0.0, other machines can connect that know --token.",
-    ] = "127.0.0.1",
-    port: Annotated[
-        int, "Listen at this port with --serve or --live; 0 chooses a free one.", Opt(min=0, max=65535)
-    ] = 8765,
-    max_megabytes: Annotated[
-        float, "Accept image files up to this size with --serve or --live.", Opt(min=0.01, max=2000)
-    ] = 64.0,
+    camera_index: Annotated[int, "Take the pictures of --live from this camera.", Opt(min=0, max=99)] = 0,
+    host: Annotated[str, "Listen at this address; at 0.0.0.0, other machines connect with --token."] = "127.0.0.1",
+    port: Annotated[int, "Listen at this port; 0 chooses a free one.", Opt(min=0, max=65535)] = 8765,
+    max_megabytes: Annotated[float, "Accept image files up to this size over HTTP.", Opt(min=0.01, max=2000)] = 64.0,
     token: Annotated[
-        str,
-        "Answer with --serve or --live only requests with `Authorization: Bearer` and this word; in a browser, add "
-        "?token= to the address.",
-        Opt(envvar="STCAL_TOKEN"),
+        str, "Answer only requests with this word, as `Authorization: Bearer` or ?token=.", Opt(envvar="STCAL_TOKEN")
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from the visible faces, with its 6×6 covariance."""
@@ -198,10 +258,10 @@ def measure(
     from stcal.boards.target_file import target_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.table import read_table
-    from stcal.sfm.measurement import images as work
-    from stcal.sfm.measurement import report as output
+    from stcal.sfm.measurement import measure_images as work
+    from stcal.sfm.measurement import pose_report as output
+    from stcal.sfm.measurement.known_target import read_target
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
-    from stcal.sfm.measurement.target import read_target
 
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
@@ -228,12 +288,13 @@ def measure(
         )
     text, apart = output.poses_csv(result, table)
     document = output.measure_report(result, str(images), every=verbose())
-    say(document.text())
-    print_each("not joined", apart)
-    write(out, text, "poses")
-    output.require_table_written(out, result, table)
-    write_if(json_file, lambda: output.poses_file(result), "as JSON")
-    write_if(report, document.page, "report")
+    with printed_last():
+        say(document.text())
+        print_each("not joined", apart)
+        write(out, text, "poses")
+        output.require_table_written(out, result, table)
+        write_if(json_file, lambda: output.poses_file(result), "as JSON")
+        write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     shared.require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
@@ -253,7 +314,7 @@ def _serve(setting: tuple, source: int | str | None, host: str, port: int, limit
     """Answers images until Ctrl-C, or shows the pictures of a source as long as there are any."""
     from stcal.io.device import pictures_of
     from stcal.sfm.measurement.live import LiveService, line_of, served
-    from stcal.sfm.measurement.tracker import Tracker
+    from stcal.sfm.measurement.measure_images import Tracker
 
     service = LiveService(Tracker(*setting), source is not None, **limits)
     shown = nullcontext(iter(())) if source is None else pictures_of(source)

@@ -1,29 +1,215 @@
-"""Intrinsics from views of the dot board: start, and one adjustment over intrinsics and board poses."""
+"""Intrinsics from views of the dot board: start, and one adjustment over intrinsics, board poses and places of dots."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import compress
+from typing import Any
 
 import numpy as np
 
+from stcal.adjust.blocks import Huber, Vector
 from stcal.adjust.components import sigma_factor
+from stcal.adjust.engine import Adjustment, Joined, JoinedSolution
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
+from stcal.geometry.clusters import ByClusters
+from stcal.geometry.least_squares import minimise
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.print_modes import PrintModes
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.labels import DotLabel, Label
-from stcal.sfm.adjust.equations import normalised, robust_weights
-from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.equations import Board, Normal, Setting, State, dots_costs, minimum
+from stcal.sfm.adjust.equations import image_cost, normalised, robust_weights
+from stcal.sfm.adjust.refine import eccentricity_px, placed, reproject
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectedImage
+from stcal.sfm.detect.labelling import labelled_image
 
-START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
-"""Approximate focal lengths over the longer image side: between wide-angle and portrait; equidistant lens of 127°."""
-FOCAL_LIMITS = (0.2, 50.0)
-"""Limits of the focal length over the longer image side. Results of the closed form outside of them are noise."""
+MAX_STEPS = 200
+EXACTLY = 1e-15  # largest relative decrease of χ² that is predicted for a step at convergence
+SETTLED_PX = 1e-5  # largest move of a projection at convergence: along a valley, χ² may decrease forever, unseen
+TINY_PX = 1e-3  # focal length that stands for invalid parameters
+CREEPING_PX = 1e-3  # largest move accepted after all steps: what hardly changes the images has a large σ
+START_DAMPING = 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensState:
+    models: tuple[MetricModel, ...]  # of one folder's board each
+    camera: Camera
+
+    def only(self, names: set[str]) -> "LensState":
+        parts = [_of_images(model, names) for model in self.models]
+        return replace(self, models=tuple(part for part in parts if part.images))
+
+    def cost(self, huber: float) -> float:
+        return sum(image_cost(model, self.camera, huber) for model in self.models)
+
+    def redundancy(self, kept: int) -> int:
+        """Observed coordinates minus unknowns of poses minus ``kept``; dots are observed as often as unknown."""
+        return sum(2 * len(m.image_index) - 6 * len(m.images) for m in self.models) - kept
+
+
+def _of_images(model: MetricModel, names: set[str]) -> MetricModel:
+    """Returns the model with the images of these names alone, and with all its points."""
+    keep = np.array([name in names for name in model.images])
+    seen = model.observed(np.flatnonzero(keep[model.image_index]))
+    return replace(
+        seen,
+        images=tuple(compress(model.images, keep)),
+        camera_from_model=tuple(compress(model.camera_from_model, keep)),
+        image_index=(np.cumsum(keep) - 1)[seen.image_index],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Board:
+    """The board of one folder as drawn: ``places`` (n, 3) of its dots, mm, and how its print may deviate."""
+
+    places: np.ndarray
+    modes: PrintModes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensSetting:
+    basis: np.ndarray  # (16, q)
+    weight: np.ndarray  # (q, q) of the vague prior about ``start``
+    start: Camera
+    boards: dict[str, Board]
+    sigma_mm: float
+    huber: float
+
+    def away(self, camera: Camera) -> np.ndarray:
+        """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
+        return np.linalg.pinv(self.basis) @ (camera.parameters() - self.start.parameters())
+
+    def camera(self, away: Vector) -> Camera:
+        """Returns the camera with these parameters of the COLMAP model minus those at the start, (1, q)."""
+        parameters = self.start.parameters() + self.basis @ away.array[0]
+        if not ((parameters[:2] > 0).all() and np.isfinite(parameters).all()):  # of no camera: no image agrees with it
+            parameters = np.r_[TINY_PX, TINY_PX, np.zeros(len(parameters) - 2)]
+        return self.start.with_parameters(parameters)
+
+    @property
+    def kept(self) -> int:
+        return self.basis.shape[1]
+
+    def dots_cost(self, state: LensState) -> float:
+        """Returns the χ² of the places of dots by themselves, without the modes of the prints."""
+        off = [(self.boards[model.group], model.xyz_model) for model in state.models]
+        return float(sum(own.modes.costs(xyz - own.places, self.sigma_mm)[0] for own, xyz in off))
+
+
+@dataclass(frozen=True, eq=False)
+class LensNormal:
+    """The adjustment linearised about a state; only the lens is damped, as dots and poses are optimal for each step."""
+
+    models: tuple[MetricModel, ...]  # at any state
+    setting: LensSetting
+    solution: JoinedSolution
+
+    @classmethod
+    def of(cls, state: LensState, setting: LensSetting) -> "LensNormal":
+        joined, values = _problem(state, setting)
+        return cls(state.models, setting, joined.at(values))
+
+    @cached_property
+    def state(self) -> LensState:
+        return self._state(self.solution.values)
+
+    @property
+    def cost(self) -> float:
+        return float(self.solution.cost)
+
+    def by_photographs(self) -> ByClusters:
+        """Returns the covariance of the lens model's parameters by how the photographs differ."""
+        if not self.setting.kept:
+            return ByClusters(np.zeros((0, 0)), np.zeros((0, 0)), 1.0, np.zeros(0))
+        return self.solution.by_clusters(self.solution.problem.parts[0].blocks[LENS])
+
+    def with_found_prints(self) -> tuple[float, dict[str, Board]]:
+        """Returns the redundancy of the dots by themselves, and the boards with the amplitudes of their prints."""
+        boards, left, sigma_mm = {}, 0.0, self.setting.sigma_mm
+        for model, part in zip(self.state.models, self.solution.whole, strict=True):
+            board, covariance = self.setting.boards[model.group], part.covariance(part.problem.blocks[DOTS])
+            modes = board.modes.modes
+            of_modes = modes.T @ covariance @ modes
+            left += len(covariance) - len(of_modes) - float(np.trace(covariance) - np.trace(of_modes)) / sigma_mm**2
+            found = board.modes.as_found(model.xyz_model - board.places, of_modes, sigma_mm)
+            boards[model.group] = replace(board, modes=found)
+        return left, boards
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Returns the step of all unknowns, and the predicted gain: none where no projection moves visibly."""
+        step, gain = self.solution.step(damping)
+        return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
+
+    def largest_move(self, step: np.ndarray) -> float:
+        new = self.moved(step)
+        pairs = zip(self.state.models, new.models, strict=True)
+        moves = (b.residuals_px(new.camera) - a.residuals_px(self.state.camera) for a, b in pairs)
+        return max(float(np.abs(move).max()) for move in moves)
+
+    def moved(self, step: np.ndarray) -> LensState:
+        return self._state(self.solution.problem.moved(self.solution.values, step))
+
+    def _state(self, values: Mapping[str, Any]) -> LensState:
+        names = [model.group for model in self.models]
+        moved = [placed(m, values[POSES + n], values[DOTS_OF + n]) for m, n in zip(self.models, names, strict=True)]
+        return LensState(tuple(moved), self.setting.camera(values["lens"]))
+
+
+POSES, DOTS_OF = "poses of ", "dots of "
+LENS, DOTS = 0, 1
+
+
+def _problem(state: LensState, setting: LensSetting) -> tuple[Joined, dict[str, Any]]:
+    """Returns the adjustment of all boards from a state, and its unknowns there."""
+    parts, first = [], 0
+    values: dict[str, Any] = {"lens": Vector(setting.away(state.camera)[None])}
+    for model in state.models:
+        a, board = Adjustment(), setting.boards[model.group]
+        values[POSES + model.group] = Poses.of(model.camera_from_model)
+        values[DOTS_OF + model.group] = Vector(model.xyz_model)
+        lens = a.block("lens", values["lens"])
+        dots = a.block(DOTS_OF + model.group, values[DOTS_OF + model.group])
+        poses = a.block(POSES + model.group, values[POSES + model.group], eliminate=True)
+        cluster, loss = first + model.image_index, Huber(setting.huber)
+        reproject(a, model, (dots, poses, lens), setting.camera, setting.basis, cluster=cluster, loss=loss)
+        a.prior(dots, board.places, board.modes.weight(setting.sigma_mm))
+        if not parts:
+            a.prior(lens, np.zeros((1, setting.kept)), setting.weight)
+        parts.append(a)
+        first += len(model.images)
+    return Joined(parts, ("lens",)), values
+
+
+def minimum(state: LensState, setting: LensSetting) -> LensState:
+    joined, values = _problem(state, setting)
+    solution = minimise(
+        values,
+        lambda at: LensNormal(state.models, setting, joined.at(at)),
+        joined.moved,
+        cost=joined.cost,
+        damping=START_DAMPING,
+        settled=EXACTLY,
+        max_steps=MAX_STEPS,
+    )
+    if not solution.converged:  # a direction that hardly changes the images has a large σ
+        move = solution.linear.largest_move(solution.linear.step(START_DAMPING)[0])
+        if not move < CREEPING_PX:
+            raise ConvergenceError(
+                "E-NO-MINIMUM",
+                f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
+                "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
+            )
+    return solution.linear.state
+
+
+START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45  # over the longer side: between wide-angle and portrait; equidistant, 127°
+FOCAL_LIMITS = (0.2, 50.0)  # of the focal length over the longer image side; closed forms outside of them are noise
 TRIED_FOCALS, TRIED_VIEWS = tuple(np.geomspace(0.4, 12.8, 11).tolist()), 12
 """Focal lengths over the longer side that are tried where the closed form gives none, a factor of √2 apart, and the
 number of views, those of most dots, by which they are judged."""
@@ -76,8 +262,7 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
 
 LEAST_FREE, FAR_BETTER = 3, 0.5
 """Fewest views for two focal lengths and the principal point, and most of the misfit that these may leave."""
-ALMOST_SQUARE = 0.05
-"""Relative difference of two focal lengths up to which pixels count as square at the start."""
+ALMOST_SQUARE = 0.05  # relative difference of two focal lengths up to which pixels count as square at the start
 
 
 def _conic(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -87,8 +272,7 @@ def _conic(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _of_any_pixels(rows: np.ndarray, camera: Camera, low: float, high: float) -> Camera | None:
-    """Returns ``camera`` with two focal lengths and a principal point by the rows of its views; None if there are none
-    within the limits of the ratio of a focal length and the assumed one."""
+    """Returns ``camera`` with two focal lengths and a principal point by its views; None outside of the limits."""
     b11, b22, b13, b23, b33 = np.linalg.svd(rows)[2][-1]
     with np.errstate(all="ignore"):
         scale = b33 - b13**2 / b11 - b23**2 / b22
@@ -119,24 +303,15 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
         if sighting is not None and len(sighting.rows):
             dots = image.detection.centres.select(sighting.rows)
             numberings[image.file.name] = sighting.numberings
-            views.append(
-                ImageObservations(
-                    name=image.file.name,
-                    group=image.file.group,
-                    labels=tuple(DotLabel(0, i) for i in range(len(dots))),
-                    centre_px=dots.centre_px,
-                    centre=dots.centre,
-                    shape=dots.shape,
-                    covariance_px2=dots.covariance_px2,
-                    blur_px=dots.blur_px,
-                )
-            )
-    labels: dict[str, tuple[DotLabel, ...]] = {}
+            labels = [DotLabel(0, i) for i in range(len(dots))]
+            views.append(labelled_image(image.file.name, image.file.group, labels, dots, ()).observations)
+    numbered: dict[str, ImageObservations] = {}
     for members in by_group(views).values():
         fields = [_deviations(numberings[v.name], camera.normalised_from_pixel(v.centre_px), board) for v in members]
         for view, choice in zip(members, _choose_alike(fields), strict=True):
-            labels[view.name] = tuple(DotLabel(*cell) for cell in numberings[view.name][choice].tolist())
-    return [replace(view, labels=labels[view.name]) for view in views]
+            cells = numberings[view.name][choice].tolist()
+            numbered[view.name] = replace(view, labels=tuple(DotLabel(*cell) for cell in cells))
+    return [numbered[view.name] for view in views]
 
 
 def _deviations(numberings: np.ndarray, xy_normalised: np.ndarray, board: BoardDesign) -> np.ndarray:
@@ -165,23 +340,18 @@ def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
 
 MAX_ROUNDS = 20
 LEAST_ROUNDS = 2
-SETTLED_FACTOR = 0.005
-"""Largest relative change of a variance component in the last round."""
-SETTLED_SHIFT_PX = 1e-5
-"""Largest change of an eccentricity in the last round, px."""
-LEAST_ROBUST = 1e-6
-"""Smallest robust σ of normalised residuals, for exact data."""
+SETTLED_FACTOR = 0.005  # largest relative change of a variance component in the last round
+SETTLED_SHIFT_PX = 1e-5  # largest change of an eccentricity in the last round, px
+LEAST_ROBUST = 1e-6  # smallest robust σ of normalised residuals, for exact data
 LOUD = 1.5
 """Ratio of a photograph's residuals to those of most from which its σ grow with them: one that was moved or out of
 focus does not decide. Of 20 centres, chance exceeds it in one photograph of 600."""
-LEAST_DOTS = 0.1
-"""Smallest factor of the dots' σ: dots may be more accurate than the board file states, but never exact."""
-MIN_BOARD_REDUNDANCY = 20.0
-"""Smallest redundancy of the dots for estimating their σ. Below it the σ of the board file is kept."""
+LEAST_DOTS = 0.1  # smallest factor of the dots' σ: dots may be more accurate than stated, but never exact
+MIN_BOARD_REDUNDANCY = 20.0  # smallest redundancy of the dots that gives their σ; below it the board file's is kept
 
 
 @dataclass(frozen=True, slots=True)
-class SigmaFactors:
+class BoardSigmaFactors:
     """Ratios of residuals to the detected centres' σ (``centres``), and to the board file's σ of dots (``dots``)."""
 
     centres: float = 1.0
@@ -190,8 +360,6 @@ class SigmaFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intrinsics:
-    """Intrinsics of a camera after the adjustment."""
-
     camera: Camera
     colmap_model: str
     covariance: np.ndarray  # (q, q) of the parameters of ``colmap_model``, by how the photographs differ
@@ -199,19 +367,17 @@ class Intrinsics:
     differ: float  # by how much photographs differ more than their pixels explain, as a ratio of σ
     freedom: np.ndarray  # (q,) effective degrees of freedom of what the photographs tell
     models: tuple[MetricModel, ...]  # of one folder's board each, mm, board frame
-    factors: SigmaFactors
+    factors: BoardSigmaFactors
     huber: float  # length of a normalised residual beyond which its weight decreases
     redundancy: int
     settled: bool  # whether σ and eccentricities converged within :data:`MAX_ROUNDS`
-    solution: tuple[State, Setting]  # from which solutions of some of the views start
+    solution: tuple[LensState, LensSetting]  # from which solutions of some of the views start
     restarted: bool = False  # the descent from the start did not end, and began again with the focal length alone
 
     def sigma(self) -> np.ndarray:
-        """Returns the standard deviations of the parameters, (q,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def residuals_px(self) -> np.ndarray:
-        """Returns the residuals of all observations, (n, 2)."""
         return np.concatenate([model.residuals_px(self.camera) for model in self.models])
 
     def prints(self) -> dict[str, tuple[float, float]]:
@@ -220,7 +386,6 @@ class Intrinsics:
         return {m.group: boards[m.group].modes.stretch(m.xyz_model - boards[m.group].places) for m in self.models}
 
     def weights(self) -> list[np.ndarray]:
-        """Returns the Huber weights of each model."""
         return [robust_weights(model, self.camera, self.huber) for model in self.models]
 
 
@@ -255,8 +420,8 @@ def adjust_intrinsics(
     for folder, members in by_group(views).items():
         labels = tuple(sorted({label for view in members for label in view.labels}))
         models.append(model_of_views(folder, labels, members, board, start))
-    state = State(tuple(models), start)
-    setting = Setting(
+    state = LensState(tuple(models), start)
+    setting = LensSetting(
         basis=basis,
         weight=np.zeros((0, 0)) if held else np.linalg.inv(vague_prior(start, colmap_model)),
         start=start,
@@ -269,13 +434,15 @@ def adjust_intrinsics(
     except ConvergenceError:
         if held:
             raise
-    # A focal length far off makes the rest of the lens wander: it comes first, alone.
-    result = _adjusted(_with_focal_length(state, setting), setting, board, colmap_model)
-    return replace(result, restarted=True)
+    # A focal length far off makes the rest of the lens wander: it comes first, alone, and one for both axes.
+    focal, weight = intrinsic_basis("SIMPLE_PINHOLE")[:, :1], np.full((1, 1), start.focal[0] ** -2.0)
+    alone = replace(setting, basis=focal, weight=weight)
+    for _ in range(FOCAL_ROUNDS):
+        state, alone = _robust_minimum(state, alone)
+    return replace(_adjusted(state, setting, board, colmap_model), restarted=True)
 
 
-def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
-    """Returns the intrinsics of an adjustment, from its ``last`` normal equations."""
+def _intrinsics(last: LensNormal, colmap_model: str, factors: BoardSigmaFactors, settled: bool) -> Intrinsics:
     state, setting, by_photographs = last.state, last.setting, last.by_photographs()
     return Intrinsics(
         camera=state.camera,
@@ -302,36 +469,29 @@ they end, in σ²: no parameter is then off by more than a third of its σ."""
 def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
     """Returns the intrinsics from some of the views of ``result``: by steps from the solution of all, with its weights,
     and the factors of σ by one step of their own; by :func:`adjust_intrinsics` where the steps do not settle."""
-    state, setting = result.solution
-    last = _stepped(state.only({view.name for view in views}), setting)
-    if last is None:
-        return adjust_intrinsics(views, board, result.camera, result.colmap_model)
-    return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
-
-
-def _stepped(state: State, setting: Setting) -> Normal | None:
-    """Returns the normal equations where steps from ``state`` settle, or None if they do not."""
+    whole, setting = result.solution
+    state = whole.only({view.name for view in views})
     for _ in range(MOST_STEPS):
-        normal = Normal.of(state, setting)
-        step, gain = normal.step(0.0)
+        last = LensNormal.of(state, setting)
+        step, gain = last.step(0.0)
         if gain < NO_GAIN:
-            return normal
-        state = normal.moved(step)
+            return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors)[0], True)
+        state = last.moved(step)
         if not np.isfinite(state.cost(setting.huber)):
-            return None
-    return None
+            break
+    return adjust_intrinsics(views, board, result.camera, result.colmap_model)
 
 
-def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: str) -> Intrinsics:
+def _adjusted(state: LensState, setting: LensSetting, board: BoardDesign, colmap_model: str) -> Intrinsics:
     """Alternates minimisation and estimation of σ, amplitudes of the prints, and eccentricity."""
-    detected_covariance, factors = [m.covariance_px2 for m in state.models], SigmaFactors()
+    detected_covariance, factors = [m.covariance_px2 for m in state.models], BoardSigmaFactors()
     for round_index in range(MAX_ROUNDS):
         before = state
         state = _weighted(state, detected_covariance, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
         setting = replace(setting, sigma_mm=factors.dots * board.sigma_mm)
         state, setting = _robust_minimum(state, setting)
-        last = Normal.of(state, setting)
+        last = LensNormal.of(state, setting)
         updated, boards = _updated_factors(last, factors)
         changes = [updated.centres / factors.centres, updated.dots / factors.dots] + [
             boards[folder].modes.amplitude / old.modes.amplitude for folder, old in setting.boards.items()
@@ -344,20 +504,11 @@ def _adjusted(state: State, setting: Setting, board: BoardDesign, colmap_model: 
     return _intrinsics(last, colmap_model, factors, settled)
 
 
-def _with_focal_length(state: State, setting: Setting) -> State:
-    """Returns the state of least cost over the focal lengths alone, each of all of a camera, with robust weights."""
-    basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
-    setting = replace(setting, basis=basis, weight=np.full((1, 1), setting.start.focal[0] ** -2.0))
-    for _ in range(FOCAL_ROUNDS):
-        state, setting = _robust_minimum(state, setting)
-    return state
-
-
-def _robust_minimum(state: State, setting: Setting) -> tuple[State, Setting]:
+def _robust_minimum(state: LensState, setting: LensSetting) -> tuple[LensState, LensSetting]:
     """Returns the state of least cost, and the setting with Huber's limit by its residuals."""
     state = minimum(state, setting)
-    robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
-    return state, replace(setting, huber=HUBER * robust)
+    length = np.linalg.norm(np.concatenate([normalised(model, state.camera) for model in state.models]), axis=1)
+    return state, replace(setting, huber=HUBER * max(robust_sigma(length, 2), LEAST_ROBUST))
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
@@ -380,7 +531,7 @@ def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDe
     )
 
 
-def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board: BoardDesign) -> State:
+def _weighted(state: LensState, own: list[np.ndarray], factors: BoardSigmaFactors, board: BoardDesign) -> LensState:
     """Returns the state with scaled σ of the centres, larger ones in loud photographs, and updated eccentricity."""
     radius: dict[Label, float] = {**board.radius_of()}
     equal = [replace(m, covariance_px2=factors.centres**2 * each) for m, each in zip(state.models, own, strict=True)]
@@ -396,7 +547,7 @@ def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board:
     return replace(state, models=models)
 
 
-def _loudness(state: State) -> list[np.ndarray]:
+def _loudness(state: LensState) -> list[np.ndarray]:
     """Returns by model the factor on σ of each photograph: above 1 where its residuals exceed those of most by far."""
     sizes = []
     for model in state.models:
@@ -406,12 +557,11 @@ def _loudness(state: State) -> list[np.ndarray]:
     return [np.maximum(own / usual, 1.0) for own in sizes]
 
 
-def _updated_factors(last: Normal, factors: SigmaFactors) -> tuple[SigmaFactors, dict[str, Board]]:
-    """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy, and
-    the boards with the amplitudes of their prints."""
+def _updated_factors(last: LensNormal, factors: BoardSigmaFactors) -> tuple[BoardSigmaFactors, dict[str, Board]]:
+    """Returns variance components of centres and dots (Förstner 1979), and the boards with their amplitudes."""
     state, setting = last.state, last.setting
     dots_left, boards = last.with_found_prints()
     dots, image_redundancy = factors.dots, state.redundancy(setting.kept) - dots_left
     if dots_left > MIN_BOARD_REDUNDANCY:
-        dots = max(LEAST_DOTS, dots * sigma_factor(dots_costs(state, setting)[0], dots_left))
-    return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards
+        dots = max(LEAST_DOTS, dots * sigma_factor(setting.dots_cost(state), dots_left))
+    return BoardSigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots), boards

@@ -17,15 +17,14 @@ from ipaddress import ip_address
 import cv2
 import numpy as np
 
-from stcal.errors import InputError, StcalError
-from stcal.io.images import Skipped, decode, stated_size
+from stcal.errors import InputError
+from stcal.io.images import decode, stated_size
 from stcal.parallel import one_thread
 from stcal.report.document import environment
 from stcal.report.svg import AXIS_COLOURS, COLOURS
-from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
+from stcal.sfm.measurement.measure_images import Tracker, measured_by
 from stcal.sfm.measurement.pose import TargetPose
-from stcal.sfm.measurement.report import poses_file
-from stcal.sfm.measurement.tracker import Tracker
+from stcal.sfm.measurement.pose_report import poses_file
 
 try:
     import uvicorn
@@ -38,17 +37,12 @@ except ImportError as error:
     needed = "--live, --serve: need Starlette and uvicorn; install stereo-target-calibration[live]"
     raise InputError("E-EXTRA-MISSING", needed) from error
 
-WIDEST_PX = 1280
-"""Largest width of the picture that is sent."""
+WIDEST_PX = 1280  # largest width of the picture that is sent
 JPEG_QUALITY = 80
-RATE_OVER = 20
-"""Number of pictures over which the rate is taken."""
-LOOK_S = 0.01
-"""Interval at which a page's connection looks for a newer picture, s."""
-CONNECTIONS = 16
-"""Number of connections at a time; each may hold an image of the largest size."""
-END_S = 2
-"""Time in which pages receive the last picture at the end, s."""
+RATE_OVER = 20  # number of pictures over which the rate is taken
+LOOK_S = 0.01  # interval at which a page's connection looks for a newer picture, s
+CONNECTIONS = 16  # number of connections at a time; each may hold an image of the largest size
+END_S = 2  # time in which pages receive the last picture at the end, s
 OWN_HOST = re.compile(r"(localhost|127\.[\d.]+|\[::1\])(:\d+)?")
 """Host of a request to this machine. Without a token, any other name could be one that a page of another origin has
 pointed to this machine (DNS rebinding)."""
@@ -74,17 +68,17 @@ class LiveService:
         for number, frame in enumerate(frames, 1):
             began = time.monotonic()
             with self._measuring, one_thread():
-                centres, measured, poses = observed(tracker, frame, f"picture {number}")
+                result, centres = measured_by(tracker, frame, f"picture {number}")
             times.append(time.monotonic())
-            pose = None if isinstance(measured, Skipped) else measured.pose
+            pose = result.images[0].pose if result.images else None
             content = {
                 "picture": number,
                 "status": pose.status if pose else "no pose",
-                "reason": measured.reason if isinstance(measured, Skipped) else "",
+                "reason": "" if pose else result.left_out[0].reason,
                 "rate": (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0,
                 "measured_in_s": times[-1] - began,
                 "shown": rows_of(pose) if pose else [],
-                "poses": poses,
+                "poses": poses_file(result).content(),
             }
             picture = drawn(frame, centres, pose, tracker)
             jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
@@ -97,10 +91,10 @@ class LiveService:
         try:
             stated_size(data, name)  # refuses a small file of a huge image
             with self._measuring, one_thread():
-                _, measured, poses = observed(copy(self.tracker), decode(data, name), name)
+                result, _ = measured_by(copy(self.tracker), decode(data, name), name)
         except InputError as error:
             return 400, {"error": str(error), "code": error.code}
-        return 422 if isinstance(measured, Skipped) else 200, poses
+        return 200 if result.images else 422, poses_file(result).content()
 
     async def _pose(self, request: Request) -> JSONResponse:
         self._require_allowed(request)
@@ -174,19 +168,6 @@ def served(service: LiveService, host: str = "127.0.0.1", port: int = 8765) -> I
             thread.join()
 
 
-def observed(tracker: Tracker, image: np.ndarray, name: str):
-    """Returns the centres (n, 2) in an image, px, the measured image or why it has no pose, and its poses file."""
-    try:
-        labelled, pose = tracker.observe(image, name)
-        centres, measured = labelled.observations.centre_px, outcome(name, pose, labelled.notes)
-    except InputError:
-        raise
-    except StcalError as error:  # such as a distortion that cannot be inverted: the next image may do
-        centres, measured = np.zeros((0, 2)), outcome(name, error, ())
-    result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
-    return centres, measured, poses_file(result).content()
-
-
 def rows_of(pose: TargetPose) -> list[list[str]]:
     """Returns the rows of the page for a pose: names and values with their σ, camera_from_target in mm and degrees."""
     pose_sigma = pose.camera_from_target.log_sigma(pose.covariance)
@@ -248,5 +229,4 @@ def drawn(frame: np.ndarray, centres_px: np.ndarray, pose: TargetPose | None, tr
 
 
 def _bgr(colour: str) -> tuple[int, ...]:
-    """Returns blue, green and red of a colour like ``#0b5394``."""
     return tuple(bytes.fromhex(colour[1:]))[::-1]

@@ -2,20 +2,27 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
+from stcal.geometry import least_squares
 from stcal.geometry.arrays import Brief, freeze, frozen, require_fields, rms
 from stcal.geometry.camera import Camera, intrinsic_basis
-from stcal.geometry.least_squares import Minima, block_diagonal
+from stcal.geometry.least_squares import Minima, Normal, block_diagonal
 from stcal.geometry.plane import (
+    MAX_OUTLIER_SHARE,
     MAX_SIGMA_RAD,
     OUTLIER,
+    Descend,
+    camera_from_plane,
     deciding_delta,
     distinct,
+    fit_homography,
     mirrored,
+    two_minima,
     weigh,
     weights_of,
 )
@@ -24,26 +31,156 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import ImageObservations, Outlier
-from stcal.sfm.measurement.minima import (
-    HOPELESS,
-    MIN_CIRCLES,
-    PoseProblem,
-    covariance_of_centres,
-    minima_without_outliers,
-    start_pose,
-)
-from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.data.patterns import CircleImages, project_circles
+from stcal.sfm.measurement.known_target import TargetCircles
 
-CURVED = 0.2
-"""Relative deviation of χ² from its parabola, two σ away, beyond which the covariance is taken from samples."""
+SETTLED = 1e-4
+"""Decrease of χ² below which the descent ends. A smaller step moves the pose by less than a hundredth of its σ, and two
+steps with new weights of the centres follow. A second solution with a large χ² needs no better accuracy."""
+HOPELESS = 500.0  # excess in χ² that no weights can make up for
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseProblem:
+    """Data of a pose: n circles, their measured centres and all covariances. Centres are free of distortion."""
+
+    labels: tuple[CircleLabel, ...]
+    xyz: np.ndarray  # (n, 3) target frame, as ``normal``
+    normal: np.ndarray
+    radius: np.ndarray  # (n,)
+    centre: np.ndarray  # (n, 2) of the ellipses, normalised coordinates
+    px_by_centre: np.ndarray  # (n, 2, 2) Jacobian of the lens
+    noise: np.ndarray  # (n, 2, 2) covariance of ``centre``
+    by_camera: np.ndarray  # (n, 2, q) derivative of ``centre`` by the intrinsics, q = 0 if they are held fixed
+    prior: np.ndarray  # (q, q) covariance of the intrinsics
+    shape: np.ndarray  # (3n, 3n) mm² covariance of the circles
+    outliers: tuple[Outlier, ...] = ()  # circles that were left out
+
+    def seen(self, poses: Poses) -> tuple[np.ndarray, CircleImages]:
+        """Returns, for h poses, measured minus projected centres (h, n, 2), and the projections."""
+        image = project_circles(self.xyz, self.normal, self.radius, poses.rotation, poses.translation)
+        return self.centre - image.centre, image
+
+    def in_px(self, residual: np.ndarray) -> np.ndarray:
+        return (self.px_by_centre @ residual[..., None])[..., 0]
+
+    def without(self, bad: np.ndarray, outliers: list[Outlier]) -> "PoseProblem":
+        """Returns the problem without the circles of a mask (n,), which are ``outliers``."""
+        keep = np.flatnonzero(~bad)
+        rows = (3 * keep[:, None] + np.arange(3)).ravel()
+        by_circle = ("xyz", "normal", "radius", "centre", "px_by_centre", "noise", "by_camera")
+        return replace(
+            self,
+            labels=tuple(self.labels[i] for i in keep),
+            **{name: getattr(self, name)[keep] for name in by_circle},
+            shape=self.shape[np.ix_(rows, rows)],
+            outliers=(*self.outliers, *outliers),
+        )
+
+
+def covariance_of_centres(problem: PoseProblem, image: CircleImages, noise: np.ndarray) -> np.ndarray:
+    """Returns the covariance (h, 2n, 2n) of all centres from noise (h, n, 2, 2), circles and intrinsics."""
+    by_circle = block_diagonal(image.by_circle)
+    full = block_diagonal(noise) + by_circle @ problem.shape @ np.swapaxes(by_circle, 1, 2)
+    by_camera = problem.by_camera.reshape(full.shape[-1], -1)
+    return full + by_camera @ problem.prior @ by_camera.T
+
+
+def descent_near(problem: PoseProblem, pose: Poses) -> Descend:
+    """Returns the descent near a pose: residuals whitened by each centre's noise and own circle, Huber's loss."""
+    by_circle = problem.seen(pose)[1].by_circle
+    n = len(problem.xyz)
+    own = problem.shape.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    covariance = problem.noise + by_circle @ own @ np.swapaxes(by_circle, -1, -2)
+    whiten = block_diagonal(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def descend(poses: Poses, huber: float) -> Minima:
+        h = len(poses)
+
+        def evaluate(poses: Poses) -> Normal:
+            residual, image = problem.seen(poses)
+            r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
+            return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), np.all(image.depth > 0, axis=1), huber)
+
+        return least_squares.descend(evaluate, poses, SETTLED, HOPELESS)
+
+    return descend
+
+
+MIN_CIRCLES = 4  # least number of circles of one face that determine its homography
+WORST_SHARE = 0.5  # of the worst excess, from which centres are removed with it; others may only be pulled along
+MIN_BREADTH = 0.05  # ratio to the length of the visible circles: a row leaves the rotation about itself open
+
+
+def start_pose(problem: PoseProblem, target: TargetCircles, where: str) -> tuple[Poses, Rigid]:
+    """Returns the pose from the homography of the face with the most circles, and target_from_plane of that face."""
+    faces: dict[str, list[int]] = {}
+    for i, label in enumerate(problem.labels):
+        if label.face in target.target_from_plane:
+            faces.setdefault(label.face, []).append(i)
+    by_size = sorted(faces, key=lambda face: -len(faces[face]))
+    if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
+        count = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
+        raise DegenerateError(
+            "E-MEASURE-FEW-CIRCLES",
+            f"{where}: {count} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
+        )
+    reasons = []
+    for face in by_size:
+        if len(faces[face]) >= MIN_CIRCLES:
+            try:
+                pose = _pose_by_face(target.target_from_plane[face], problem, faces[face])
+            except DegenerateError as error:
+                reasons.append(error)
+                continue
+            return Poses.of([pose]), target.target_from_plane[face]
+    raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
+
+
+def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int]) -> Rigid:
+    plane_from_target = target_from_plane.inverse()
+    xy = (plane_from_target @ problem.xyz[rows])[:, :2]
+    long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
+    if broad < MIN_BREADTH * long:
+        reason = f"{len(rows)} circles, {MIN_CIRCLES} needed that are not on one line"
+        raise DegenerateError("E-MEASURE-AMBIGUOUS", reason)
+    pose = camera_from_plane(fit_homography(xy, problem.centre[rows])) @ plane_from_target
+    if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
+        raise DegenerateError("E-MEASURE-AMBIGUOUS", "its circles would be behind the camera; check their labels")
+    return pose
+
+
+def minima_without_outliers(problem: PoseProblem, start: Poses, plane: Rigid, where: str) -> tuple[Minima, PoseProblem]:
+    """Returns the minima without centres that contradict the others, and the problem without these."""
+    count, alone = len(problem.labels), len({label.face for label in problem.labels}) == 1
+    failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"
+    while True:
+        both = two_minima(partial(descent_near, problem), start, plane, failure, planar=alone)
+        best, limit = both.minima, both.outlier_limit
+        excess = best.length[0] / limit
+        bad = excess > max(1.0, WORST_SHARE * excess.max())
+        if not bad.any():
+            return best, problem
+        residual = np.linalg.norm(problem.in_px(problem.seen(best.poses[[0]])[0][0]), axis=1)
+        limits, labels = limit * (residual / best.length[0]), problem.labels
+        off = [Outlier(where, labels[i], float(residual[i]), float(limits[i])) for i in np.flatnonzero(bad)]
+        problem = problem.without(bad, off)
+        outliers = problem.outliers
+        if len(outliers) > MAX_OUTLIER_SHARE * count or len(problem.labels) < MIN_CIRCLES:
+            raise DegenerateError(
+                "E-MEASURE-CONTRADICTS",
+                f"{where}: {len(outliers)} of {count} circles contradict the others, first {outliers[0].label} by "
+                f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together",
+            )
+        start = best.poses
+
+
+CURVED = 0.2  # relative deviation of χ² from its parabola, two σ away, from which the covariance is sampled
 SAMPLES = 1000
-SAMPLED_WIDER = 1.5
-"""Factor on the σ with which samples are drawn. Else the tails would rest on a few samples."""
+SAMPLED_WIDER = 1.5  # factor on the σ with which samples are drawn; else the tails would rest on a few samples
 SAMPLE_ROUNDS = 2
-MIN_EFFECTIVE = 20
-"""Least effective number of samples (Kong 1992). With fewer, the distribution they are drawn from is the better one."""
-OTHER_SIDE = 3.0
-"""Distance in σ from which the pose mirrored at the line of sight is another solution. A nearer one is covered by σ."""
+MIN_EFFECTIVE = 20  # least effective number of samples (Kong 1992); with fewer, what they are drawn from is better
+OTHER_SIDE = 3.0  # distance in σ from which the pose mirrored at the line of sight is another solution
 
 
 def covariance_of_likelihood(
@@ -57,11 +194,12 @@ def covariance_of_likelihood(
     plausible: float,
 ) -> tuple[np.ndarray, float]:
     """Returns the covariance of a pose (6, 6), and the excess in χ² of its mirror image, infinite if that does not
-    matter. If the likelihood is not Gaussian, it is the second moment, by importance sampling with fixed numbers
+    matter: it does if its excess is below ``plausible``, and it is some σ away and far more probable than these say.
+
+    If the likelihood is not Gaussian, the covariance is its second moment, by importance sampling with fixed numbers
     (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4), without poses nearer to the ``second``
     solution. ``full``: (2n, 2n) of the centres; ``least``: χ² of the pose; ``covariance``: (6, 6), linearised.
-    ``plane``: merged into a valley, of which the linearised problem sees one side. The mirror image matters if its
-    excess is below ``plausible``, it is some σ away, and it is far more probable than these σ say."""
+    """
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
     def excess(step: np.ndarray) -> np.ndarray:
@@ -114,27 +252,20 @@ def _sampled(excess, least: float, pose: Poses, covariance: np.ndarray, second: 
 
 
 def _principal(covariance: np.ndarray) -> np.ndarray:
-    """Returns the principal axes in units of σ, as rows. The sum of their outer products is the covariance."""
     sigma = np.sqrt(np.diag(covariance))
     value, vector = np.linalg.eigh(covariance / sigma / sigma[:, None])
     return (vector * np.sqrt(np.maximum(value, 0))).T * sigma
 
 
-MISFIT = 0.03
-"""Largest RMS residual, as a share of the extent of the circles in the image; mirrored photographs of two faces leave 9
-to 18 %."""
-NEAR_PREVIOUS = 1 / 3
-"""Largest ratio of two rotations from the previous image's pose, of the nearer pose over the other, that decides."""
+MISFIT = 0.03  # largest RMS residual over the extent of the circles; mirrored photographs of two faces leave 9 to 18 %
+NEAR_PREVIOUS = 1 / 3  # largest ratio of two rotations from the previous pose, the nearer over the other, that decides
 NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
-SUSPICIOUS, FAILED = 1e-3, 1e-5
-"""Limits of the p-value of a fit's χ², the same as in the checks of a run."""
+SUSPICIOUS, FAILED = 1e-3, 1e-5  # limits of the p-value of a fit's χ², the same as in the checks of a run
 Status = Literal["certain", "resolved", "ambiguous"]
 
 
 @dataclass(frozen=True, slots=True)
 class PoseOptions:
-    """Options of the measurement of a pose."""
-
     flip_odds: float = 1e-6  # largest odds of the second solution for a pose to be certain, for Gaussian errors
     sigma_margin: float = 1.5  # factor by which the stated σ may be too small while this holds
     sigma_factor: float | None = None  # on the centres' own σ; None: that of the target's run
@@ -150,7 +281,6 @@ class PoseOptions:
             )
 
     def needed(self, chi2_per_dof: float) -> float:
-        """Returns the Δχ² that makes a pose certain."""
         return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
 
 
@@ -207,8 +337,7 @@ def pose_from_circles(
     of the largest face, and from its reflection, Huber's loss of single centres is minimised. The minima are then
     weighed by the whole covariance of the centres: noise, target and intrinsics."""
     options = options or PoseOptions()
-    labels = parse_labels(labels)
-    problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
+    problem = _problem(parse_labels(labels), centre_px, covariance_px2, target, camera, options, prior, where)
     start, plane = start_pose(problem, target, where)
     minima, problem = minima_without_outliers(problem, start, plane, where)
     if len(problem.labels) < MIN_CIRCLES:
@@ -239,7 +368,6 @@ def pose_from_circles(
 
 
 def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where) -> PoseProblem:
-    """Returns the data of the pose: the target's circles among the labels."""
     n = len(labels)
     centre, noise = frozen(centre_px, (n, 2), "centres"), frozen(covariance_px2, (n, 2, 2), "centres' covariance")
     used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
@@ -276,7 +404,6 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
 
 
 def _answer(problem: PoseProblem, found: Minima, plane: Rigid, options: PoseOptions) -> TargetPose:
-    """Decides between the two minima, or the two sides of a valley, and returns the pose."""
     excess, second = _second_solution(problem, found)
     alone = second is None and len({label.face for label in problem.labels}) == 1
     first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
@@ -380,7 +507,7 @@ def measured_pose(
 
 
 def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
-    """Pose with its two-fold ambiguity decided by the image before, if one solution is clearly nearer to it."""
+    """Returns the pose with its ambiguity decided by the image before, if one solution is clearly nearer to it."""
     if pose.status == "certain" or pose.second is None:
         return pose
     turn, turn_of_second = (
@@ -401,8 +528,7 @@ def fit_verdict(pose: TargetPose) -> str:
 FELT = 0.5
 """Variance, in units of their noise, that a common error may have in the direction in which all poses together feel it
 most, and still pass for independent: a result that feels nothing but this has a σ that is 20 % too small."""
-MOST = 24
-"""Largest number of directions."""
+MOST = 24  # largest number of directions
 LARGEST_SHARE = 0.999
 """Largest common share of a pose's variance in any direction. The remainder must stay positive definite, even after
 rounding or if the likelihood of a pose is narrower than its linearisation."""
@@ -429,6 +555,5 @@ def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: Cam
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Returns a square root (n, n) of the covariance. Its product with its transpose is the covariance."""
     value, vector = np.linalg.eigh(covariance)
     return vector * np.sqrt(np.maximum(value, 0))

@@ -1,19 +1,22 @@
 """Advice after a run: further photographs that would improve its worst face, or whether only a better board would."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, kept_processes, one_thread, run_in_order
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import result_of
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.planning.bodies import body_views
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,
@@ -29,25 +32,247 @@ from stcal.sfm.planning.forecast import (
     variance_shares,
     worst_of,
 )
-from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
-from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
-from stcal.synthetic.scene import Group, Scene, group_name
+from stcal.synthetic.placement import look_along
+from stcal.synthetic.scene import MAX_FOUND_TILT_RAD, Group, Scene, SceneOptions, image_circles, made_group
 
-SHORTLIST = 8
-"""Number of candidates that stay in the search after the first choice: the best so many for each face."""
-NEW_GROUP_SPREAD_RAD = float(np.radians(40))
-"""Spread of the views of a new group about the view that shows both faces equally."""
-AT_ONCE = 50
-"""Number of candidates that one process computes at a time."""
-MIN_NEW_GROUP = 3
-"""Least number of images with which a new group can be mapped."""
-BOARD_DOMINATES = 0.5
-"""Share of the board in the variance of the worst face beyond which more views hardly help."""
+REACH_DEG = 50.0  # largest distance of candidates from the middle of a group's views, in azimuth and in elevation
+GRID_DEG = 10.0  # step of the grid of candidates, in azimuth and in elevation
+ROLLS_DEG = (0.0, 90.0)  # of the camera; 90° separates intrinsics from poses, and is tried if intrinsics are refined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class PlannedView:
+    """A photograph to take in a group, at angles about its middle that count from the ``middle`` photograph."""
+
+    group: str
+    model: MetricModel  # of this one image
+    azimuth_deg: float
+    elevation_deg: float
+    roll_deg: float  # about the camera's axis
+    distance_mm: float
+    tilts_deg: dict[str, float]  # between normal and line of sight, by face and ``board``
+    middle: str
+    nearest: str  # photograph, at the angle ``nearest_deg``
+    nearest_deg: float
+
+    @property
+    def camera_from_target(self) -> Rigid:
+        return self.model.camera_from_model[0]
+
+    @property
+    def labels(self) -> list[Label]:
+        return [self.model.labels[i] for i in self.model.point_index]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stand:
+    centre: np.ndarray  # (3,) middle of board and faces
+    axes: np.ndarray  # (3, 3) rows right, up, towards the cameras
+    distance_mm: float  # median, of the cameras from the centre
+    directions: np.ndarray  # (m, 3) unit vectors from the centre to the cameras
+    middle: str  # image in the middle of the views
+
+    @classmethod
+    def of(cls, model: MetricModel) -> "_Stand":
+        centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
+        from_centre = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
+        distance = np.linalg.norm(from_centre, axis=1)
+        directions = from_centre / distance[:, None]
+        towards = directions.mean(0) / np.linalg.norm(directions.mean(0))
+        middle = int(np.argmax(directions @ towards))
+        axes = axes_of(model.camera_from_model[middle], towards)
+        return cls(centre, axes, float(np.median(distance)), directions, model.images[middle])
+
+    def pose(self, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> Rigid:
+        azimuth, elevation, roll = np.radians([azimuth_deg, elevation_deg, roll_deg])
+        local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+        return looking_at(self.centre, np.array(local) @ self.axes, self.axes[1], self.distance_mm, roll)
+
+
+def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
+    """Returns the axes (3, 3) rows right, up, towards the camera, as a photograph shows right and up."""
+    towards = towards / np.linalg.norm(towards)
+    right = np.cross(-camera_from_target.rotation[1], towards)
+    right /= np.linalg.norm(right)
+    return np.array([right, np.cross(towards, right), towards])
+
+
+def looking_at(centre: np.ndarray, direction: np.ndarray, up: np.ndarray, distance_mm: float, roll: float) -> Rigid:
+    """Returns camera_from_target of a camera that looks at the centre from a direction (3,), rolled by rad."""
+    rotation = look_along(-direction[None], up, np.array([-roll]))[0]
+    return Rigid(rotation, -rotation @ (centre + distance_mm * direction))
+
+
+def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
+    """Returns the scene of a run, target frame: its calibrated faces and circles and its boards, without views."""
+    circles = dict(zip(joint.labels, joint.xyz_model, strict=True))
+    groups, dots = {}, np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
+    for model in models:
+        seen = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
+        pose = joint.model_from_board[model.group]
+        groups[model.group] = Group(model.group, seen, _Stand.of(model).axes, pose, pose @ dots, ())
+    faces = []
+    for face in setup.target.faces:
+        if face.id in setup.start.target_from_face:
+            keep = [i for i, label in enumerate(face.labels()) if label in circles]
+            ids = tuple(face.ids[i] for i in keep)
+            faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
+    return Scene(
+        target=replace(setup.target, faces=tuple(faces)),
+        board=setup.board,
+        camera=Camera.of(setup.camera, colmap_model),
+        target_from_face=setup.start.target_from_face,
+        circles_target=circles,
+        groups=groups,
+        seed=0,
+    )
+
+
+def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+    """Returns the views, on a grid about the present ones, that show the whole board and at least one whole face."""
+    stand = _Stand.of(model)
+    steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
+    places = [
+        (float(azimuth), float(elevation), roll)
+        for roll in ROLLS_DEG[: 1 if setup.prior is None else None]
+        for elevation in steps
+        for azimuth in steps
+    ]
+    poses = [stand.pose(*place) for place in places]
+    group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
+    scene = replace(scene, groups={model.group: group})
+    limit = _largest_tilt(scene, model)
+    members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
+    views = []
+    for i, place in enumerate(places):
+        labels = set(model.labels) & shown(scene, model.group, i, limit)
+        if not (members["board"] <= labels and any(own <= labels for key, own in members.items() if key != "board")):
+            continue
+        position = poses[i].inverse().translation
+        cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
+        seen = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup, noise)
+        tilts = _tilts_deg(scene, model.group, position, labels)
+        nearest = stand.middle, model.images[int(np.argmax(cosine))], angle_deg(cosine.max())
+        views.append(PlannedView(model.group, seen, *place, stand.distance_mm, tilts, *nearest))
+    return views
+
+
+def _largest_tilt(scene: Scene, model: MetricModel) -> float:
+    """Returns the largest tilt of the circles that the run measured in the group, rad, up to ``MAX_FOUND_TILT_RAD``."""
+    normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
+    board = -scene.groups[model.group].target_from_board.rotation[:, 2]
+    normals = np.array([board if isinstance(x, DotLabel) else normal.get(x.face, board) for x in model.labels])
+    centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
+    ray = centres - model.xyz_model[model.point_index]
+    cosine = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)
+    return min(float(np.arccos(np.clip(cosine.min(), -1, 1))), MAX_FOUND_TILT_RAD)
+
+
+def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]:
+    """Returns the labels of the group's circles that a view shows whole, not too oblique and not hidden by a plate."""
+    circles = image_circles(scene, group, image)
+    camera_from_target = scene.groups[group].camera_from_target[image]
+    plates = [scene.face_outline(face.id) for face in scene.target.faces] + [scene.board_outline(group)]
+    hidden = _behind(circles.xyz_camera, camera_from_target @ np.stack(plates)).any(0)
+    visible = circles.must_find & (circles.tilt_rad <= max_tilt_rad) & ~hidden
+    return {label for label, is_visible in zip(circles.labels, visible, strict=True) if is_visible}
+
+
+def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
+    """Returns whether rectangles (m, 4, 3) are between the camera and points (n, 3); (m, n)."""
+    origin, a, b = corners_camera[:, 0], corners_camera[:, 1], corners_camera[:, 3]
+    a, b = a - origin, b - origin
+    normal = np.cross(a, b)
+    with np.errstate(divide="ignore", invalid="ignore"):  # lines of sight parallel to the plane never meet it
+        depth_ratio = (origin * normal).sum(1)[:, None] / (normal @ xyz_camera.T)
+        from_corner = depth_ratio[..., None] * xyz_camera - origin[:, None]
+        u, v = ((from_corner @ side[..., None])[..., 0] / (side * side).sum(1)[:, None] for side in (a, b))
+        return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
+
+
+def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
+    normal, middle = scene.groups[group].target_from_board.rotation[:, 2], scene.board_outline(group).mean(0)
+    tilts = {"board": tilt_deg(-normal, middle, position)}
+    for face in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
+        outward, middle = scene.target_from_face[face].rotation[:, 2], scene.face_outline(face).mean(0)
+        tilts[face] = tilt_deg(outward, middle, position)
+    return tilts
+
+
+def tilt_deg(normal: np.ndarray, middle: np.ndarray, position: np.ndarray) -> float:
+    ray = position - middle
+    return angle_deg(normal @ ray / np.linalg.norm(ray))
+
+
+def angle_deg(cosine: ArrayLike) -> float:
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def single(
+    model: MetricModel, name: str, pose: Rigid, labels: list[Label], setup: Setup, noise: CentreNoise
+) -> MetricModel:
+    """Returns the model of one image of the group that shows these points, with the σ that they will have."""
+    points, n = np.array([model.labels.index(label) for label in labels]), len(labels)
+    image = replace(
+        model,
+        images=(name,),
+        camera_from_model=(pose,),
+        image_index=np.zeros(n, int),
+        point_index=points,
+        keypoint=np.arange(n),
+        measured_px=setup.camera.project(pose @ model.xyz_model[points]),
+        shift_px=np.zeros((n, 2)),
+        covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+    )
+    return noise.applied(image, setup.camera, setup.radius_mm())
+
+
+LEAST_COSINE = -0.2  # smallest cosine of the angle between two faces that one view is to show
+MAX_TILT_DEG = 60.0  # largest tilt of a face whose corners count as seen
+SHARES = (0.35, 0.5, 0.65)  # where candidates stand between the normals of two faces
+
+
+def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+    """Returns candidates, each with two faces that one view can show, as a motion from the nearest photograph."""
+    target_from_face = setup.start.target_from_face
+    faces = [face for face in setup.target.faces if face.id in target_from_face]
+    normals = {face.id: face.outward * target_from_face[face.id].rotation[:, 2] for face in faces}
+    middles = {face.id: target_from_face[face.id] @ np.append(face.xy_mm.mean(0), 0.0) for face in faces}
+    centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
+    towards = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
+    away = np.linalg.norm(towards, axis=1)
+    distance = float(np.median(away))
+    views = []
+    for (one, two), share, roll in product(combinations(normals, 2), SHARES, ROLLS_DEG):
+        if normals[one] @ normals[two] < LEAST_COSINE:
+            continue
+        direction = share * normals[one] + (1 - share) * normals[two]
+        direction /= np.linalg.norm(direction)
+        cosine = towards @ direction / away
+        near = int(cosine.argmax())
+        axes = axes_of(model.camera_from_model[near], towards[near])
+        right, up, ahead = (axes @ direction).tolist()
+        azimuth, elevation = np.degrees([np.arctan2(right, ahead), np.arcsin(np.clip(up, -1, 1))]).round().tolist()
+        pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
+        tilts = {face: tilt_deg(normals[face], middles[face], centre + distance * direction) for face in normals}
+        shown = {face: tilt for face, tilt in sorted(tilts.items()) if tilt < MAX_TILT_DEG}
+        labels: list[Label] = [e for e in model.labels if isinstance(e, CircleLabel) and e.face in shown]
+        seen = single(model, f"{model.group}/view {one} {two} {share} {roll}", pose, labels, setup, noise)
+        nearest = model.images[near], model.images[near], angle_deg(cosine[near])
+        views.append(PlannedView(model.group, seen, azimuth, elevation, roll, distance, shown, *nearest))
+    return views
+
+
+SHORTLIST = 8  # number of candidates that stay in the search after the first choice: the best so many for each face
+NEW_GROUP_SPREAD_DEG = 40.0  # spread of the views of a new group about the view that shows both faces equally
+AT_ONCE = 50  # number of candidates that one process computes at a time
+MIN_NEW_GROUP = 3  # least number of images with which a new group can be mapped
+BOARD_DOMINATES = 0.5  # share of the board in the variance of the worst face beyond which more views hardly help
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdvisedView:
     """A view to add. ``face``, ``sigma_mm`` : the worst face with this view and all choices before it, and its σ."""
 
     view: PlannedView
@@ -57,8 +282,6 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class NewGroup:
-    """A pair of faces to photograph together for the first time."""
-
     faces: tuple[str, str]
     images: int  # number of views
     face: str  # the worst one with these views, and its σ
@@ -72,7 +295,7 @@ class Advice(Brief):
     now: Forecast  # of the run as it is
     shares: dict[str, dict[str, float]]  # of its variance, by face and source
     noise: CentreNoise
-    choices: tuple[Choice, ...]  # each chosen in addition to those before it
+    choices: tuple[AdvisedView, ...]  # each chosen in addition to those before it
     new_groups: tuple[NewGroup, ...]  # the best first
     better_board: Forecast  # with half the board's σ
     tried: int  # number of candidates
@@ -89,7 +312,7 @@ class Advice(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Known(Brief):
+class KnownRun(Brief):
     """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
 
     models: tuple[MetricModel, ...]
@@ -99,7 +322,7 @@ class Known(Brief):
     scene: Scene
 
 
-def known_of(run: SavedRun) -> Known:
+def known_of(run: SavedRun) -> KnownRun:
     """Returns the geometry of a finished run, adjusted once more for the data that ``faces.json`` does not contain."""
     again = adjusted_run(run)
     joint = result_of(again.state)
@@ -118,7 +341,7 @@ def known_of(run: SavedRun) -> Known:
         rims_mm2=rims,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
-    return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
+    return KnownRun(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
 
 
 def doubts(run: SavedRun) -> str:
@@ -137,7 +360,7 @@ def failures_of(run: SavedRun) -> str:
 
 @require_arguments
 @one_thread()
-def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = None) -> Advice:
+def advise(known: KnownRun | AnyRun, count: int = 5, progress: Progress | None = None) -> Advice:
     """Returns the views that lower the σ of the worst face most, one after the other, and new groups of as many images.
 
     Parameters
@@ -155,7 +378,7 @@ def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = No
     Advice
         The views, with the worst face and its σ (mm) after each; the present σ and their sources.
     """
-    if not isinstance(known, Known):
+    if not isinstance(known, KnownRun):
         known = known_of(saved_run(known))
     setup = known.setup
     now = forecast(known.models, setup)
@@ -167,44 +390,45 @@ def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = No
         else:
             by_group = [body_views(model, setup, known.noise) for model in known.models]
         views = [view for views_of_group in by_group for view in views_of_group]
-        chosen = _greedy(known, views, now, count, progress or (lambda *_: None))
+        chosen = tuple(_greedy(known, views, now, count, progress or (lambda *_: None)))
     return Advice(
         now,
         shares,
         known.noise,
-        tuple(chosen),
+        chosen,
         tuple(_new_groups(known, now, max(count, MIN_NEW_GROUP))) if setup.board.rows else (),
         forecast(known.models, setup.better_board(0.5), now.derivatives),
         len(views),
     )
 
 
-def _greedy(known: Known, views: list[PlannedView], now: Forecast, count: int, progress: Progress) -> list[Choice]:
-    """Chooses view after view, each time the one with which the worst face has the smallest σ."""
-    chosen: list[Choice] = []
+def _greedy(
+    known: KnownRun, views: list[PlannedView], now: Forecast, count: int, progress: Progress
+) -> Iterator[AdvisedView]:
+    """Yields view after view, each time the one with which the worst face has the smallest σ."""
     models = {model.group: model for model in known.models}
-    while views and len(chosen) < count:
-        progress(f"view {len(chosen) + 1}", 0, len(views))
+    for number in range(1, count + 1):
+        if not views:
+            return
+        progress(f"view {number}", 0, len(views))
         positions = PositionsWith.of(list(models.values()), known.setup, now.derivatives)
         jobs = [(positions, views[i : i + AT_ONCE]) for i in range(0, len(views), AT_ONCE)]
         results = [sigma for part in run_in_order(_positions, jobs, 1) for sigma in part]
-        progress(f"view {len(chosen) + 1}", len(views), len(views))
+        progress(f"view {number}", len(views), len(views))
         best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
-        chosen.append(Choice(views[best], *worst_of(results[best])))
+        yield AdvisedView(views[best], *worst_of(results[best]))
         models[views[best].group] = models[views[best].group].plus(views[best].model)
         # The best views for each of the faces, as another face may become the worst one.
         ranked = [sorted(range(len(views)), key=lambda i, face=face: results[i][face]) for face in results[0]]
         keep = {i for order in ranked for i in order[:SHORTLIST]} - {best}
         views = [views[i] for i in sorted(keep)]
-    return chosen
 
 
 def _positions(positions: PositionsWith, views: Sequence[PlannedView]) -> list[dict[str, float]]:
     return [positions(view.model) for view in views]
 
 
-def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
-    """Returns the pairs of faces that no group shows together but one view can, the best first."""
+def _new_groups(known: KnownRun, now: Forecast, images: int) -> list[NewGroup]:
     together = [model.points_by_face().keys() for model in known.models]
     new_groups = []
     for pair in combinations(sorted(face.id for face in known.scene.target.faces), 2):
@@ -219,31 +443,19 @@ def _new_groups(known: Known, now: Forecast, images: int) -> list[NewGroup]:
     return sorted(new_groups, key=lambda group: group.sigma_mm)
 
 
-def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
+def _new_model(known: KnownRun, pair: tuple[str, str], images: int) -> MetricModel:
     """Returns a group of two faces with the board beside them, at the distance of the present photographs."""
-    scene = known.scene
-    name = f"new {group_name(pair)}"
-    normals = [scene.target_from_face[face].rotation[:, 2] for face in pair]
-    axes = viewing_axes(normals[0], normals[1], name)
-    present = next(iter(scene.groups))
-    dots = np.column_stack([scene.board.xy_mm(), np.zeros(scene.board.rows * scene.board.columns)])
-    shape = GroupShape(
-        name,
-        np.vstack([scene.face_circles(face) for face in pair]),
-        np.repeat(normals, [len(scene.target.face(face).ids) for face in pair], axis=0),
-        axes,
-        np.vstack([scene.face_outline(face.id) for face in scene.target.faces]),
-        dots,
-        scene.groups[present].target_from_board.inverse() @ scene.board_outline(present),
+    scene, rng = known.scene, np.random.default_rng(0)
+    depth = float(np.median(np.concatenate([model.xyz_camera()[:, 2] for model in known.models])))
+    options = SceneOptions(
+        images_per_group=images, distance_mm=depth, spread_deg=NEW_GROUP_SPREAD_DEG, margin_mm=scene.margin_mm
     )
-    depth = np.median(np.concatenate([model.xyz_camera()[:, 2] for model in known.models]))
-    target_from_board, poses = place_group(
-        shape, scene.camera, images, float(depth), NEW_GROUP_SPREAD_RAD, np.random.default_rng(0)
-    )
-    group = Group(name, pair, axes, target_from_board, target_from_board @ dots, tuple(poses))
-    alone = replace(scene, groups={name: group})
-    (model,) = true_models(alone, observe(alone, 0.0, np.random.default_rng(0)))
-    return known.noise.applied(model, scene.camera, known.setup.radius_mm())
+    exact, parts = np.zeros((1, 3)), (scene.target, scene.board, scene.camera, scene.target_from_face)
+    group = made_group(pair, *parts, scene.circles_target, options, exact, rng)
+    alone = replace(scene, groups={group.name: group})
+    (model,) = true_models(alone, observe(alone, 0.0, rng))
+    new = replace(model, group=f"new {group.name}")  # a group of the run may have the name, and show other faces
+    return known.noise.applied(new, scene.camera, known.setup.radius_mm())
 
 
 @require_arguments

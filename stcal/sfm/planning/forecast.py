@@ -62,8 +62,7 @@ def _is_reference(target: TargetDesign) -> bool:
     return places.keys() == reference.keys() and all(np.allclose(places[k], reference[k], atol=0.5) for k in places)
 
 
-EXACT_SIGMA_PX = 0.005
-"""The σ that is stated for centres without noise."""
+EXACT_SIGMA_PX = 0.005  # the σ that is stated for centres without noise
 
 
 def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: float = 0.0) -> list[ImageObservations]:
@@ -101,23 +100,16 @@ def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list
     return models
 
 
-IMAGE_NOISE = 0.01
-"""Standard deviation of the grey values, as a fraction of full scale."""
-CONTRAST = 0.7
-"""Contrast between circle and surroundings, as a fraction of full scale."""
-BLUR_PX = 0.76
-"""Blur of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px."""
+IMAGE_NOISE = 0.01  # standard deviation of the grey values, as a fraction of full scale
+CONTRAST = 0.7  # contrast between circle and surroundings, as a fraction of full scale
+BLUR_PX = 0.76  # blur of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px
 PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
-CORNER_SIGMA_PX = 0.02
-"""σ of the corner of a tag or square in a good photograph, of tags whose cells are 6 to 14 px wide."""
-ONE_PLATE = 0.99
-"""Share of the board's variance that all groups have in common if the same plate is in all of them."""
-ENOUGH = 10_000
-"""Number of observations from which the parameters of their noise are estimated."""
-SMALLER = 1 - 1e-3
-"""Factor on the σ of a source of error whose share of the variance is sought."""
+CORNER_SIGMA_PX = 0.02  # σ of a corner of a tag or square in a good photograph, of cells 6 to 14 px wide
+ONE_PLATE = 0.99  # share of the board's variance that all groups have in common if the same plate is in all of them
+ENOUGH = 10_000  # number of observations from which the parameters of their noise are estimated
+SMALLER = 1 - 1e-3  # factor on the σ of a source of error whose share of the variance is sought
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +163,7 @@ class CentreNoise:
         sampled = [model.observed(np.flatnonzero(~own)) for model, own in zip(sampled, corner, strict=True)]
         if not any(len(model.point_index) for model in sampled):
             return replace(cls.expected(), corner_px=corner_px)
-        rims = [_Rims.of(model, camera, radius_mm) for model in sampled]
+        rims = [_RimImages.of(model, camera, radius_mm) for model in sampled]
         both = [rim.information @ model.covariance_px2 for rim, model in zip(rims, sampled, strict=True)]
         ratio = np.trace(np.concatenate(both), axis1=1, axis2=2) / 2
         narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
@@ -182,12 +174,11 @@ class CentreNoise:
         return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)), corner_px=corner_px)
 
     def scaled(self, factor: float) -> "CentreNoise":
-        """Returns the same noise with all σ multiplied by a factor."""
         return CentreNoise(factor * self.edge, self.narrow_px, factor * self.floor_px, factor * self.corner_px)
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
         """Returns the metric model with the covariances that this noise gives its observations."""
-        rims = _Rims.of(model, camera, radius_mm)
+        rims = _RimImages.of(model, camera, radius_mm)
         size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
         covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
         covariance[_is_corner(model, radius_mm)] = self.corner_px**2 * np.eye(2)
@@ -200,14 +191,14 @@ def _is_corner(model: MetricModel, radius_mm: dict[Label, float]) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rims:
+class _RimImages:
     """Images of n circles: ``information`` : (n, 2, 2) ∮ n nᵀ ds, px; ``minor_px`` : (n,) minor semi-axis."""
 
     information: np.ndarray
     minor_px: np.ndarray
 
     @classmethod
-    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
+    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_RimImages":
         """Returns the rims as ellipses, to first order in radius over distance. The error is negligible for a σ."""
         radius = np.array([radius_mm[label] for label in model.labels])
         in_plane = np.linalg.svd(model.normals()[:, None])[2][:, 1:] * radius[:, None, None]
@@ -249,7 +240,6 @@ class Setup:
         return self.sigma0**2 * adjusted_mm2 + (0.0 if self.rims_mm2 is None else self.rims_mm2)
 
     def radius_mm(self) -> dict[Label, float]:
-        """Radius by label, mm."""
         return self.target.radius_of() | self.board.radius_of()
 
     def better_board(self, factor: float) -> "Setup":
@@ -274,16 +264,13 @@ class Forecast:
     derivatives: Derivatives  # reusable for other views of the same circles
 
     def position_sigma_mm(self) -> dict[str, float]:
-        """Returns the σ of each face's position, see :func:`position_sigma_mm`."""
         return {face: position_sigma_mm(c) for face, c in self.face_covariance.items()}
 
     def worst(self) -> tuple[str, float]:
-        """Returns the face with the largest σ of position, and this σ in mm."""
         return worst_of(self.position_sigma_mm())
 
 
 def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
-    """Returns the face with the largest σ, and this σ."""
     face = max(sigma, key=sigma.__getitem__)
     return face, sigma[face]
 
@@ -334,7 +321,6 @@ class PositionsWith:
 
 
 def position_sigma_mm(face_covariance: np.ndarray) -> float:
-    """Returns the root of the trace of a face's position covariance, which is the RMS length of the error."""
     return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 

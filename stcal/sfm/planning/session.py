@@ -1,49 +1,54 @@
 """Forecast of a plan before any image exists: the σ to expect, and what would help most."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import permutations
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import BoardDesign, KnownDistance, ScaleReference, TargetDesign, reference_board, scale_reference
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, require_fields, rms
+from stcal.geometry.arrays import Brief, require_arguments, require_fields, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import camera_model
+from stcal.labels import CircleLabel, Label, circle_labels
 from stcal.parallel import one_thread, run_in_order
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.data.model import MetricModel
+from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
+from stcal.sfm.mapping.models import assemble
+from stcal.sfm.mapping.placed import unknown_lens
 from stcal.sfm.planning.forecast import (
     ONE_PLATE,
     CentreNoise,
     Forecast,
     Setup,
     forecast,
+    nominal_poses,
     observe,
     true_models,
     variance_shares,
 )
 from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene, seen_by
+from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
+from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene
 
 R = TypeVar("R")
-SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
-"""Spreads that are tried, from the largest down. The largest tilts that a view may have often forbid wide ones."""
-NEARER = 0.8
-"""Distance of the remedy of nearer cameras, relative to the plan's."""
+GROUP = "."
+DISTANCE_SIGMA_MM = 0.02  # σ of a distance that is measured with a caliper, as a remedy
+SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)  # tried from the largest down, as tilts often forbid wide ones
+NEARER = 0.8  # distance of the remedy of nearer cameras, relative to the plan's
 MIN_IMAGES = 2
-MANY_DOTS = 2000
-"""Number of dots from which on remedies are forecast in processes of their own; fewer take less time than their
-start."""
-MAX_DOTS = 10_000
-"""Largest number of dots of a board."""
-FINE_DOTS, MAX_CENTRES = 500, 450_000
-"""Largest number of dots in all images, for boards of more than ``FINE_DOTS`` dots: about a minute and 0.8 GB."""
+MANY_DOTS = 2000  # from which on remedies are forecast in processes of their own, whose start takes time
+MAX_DOTS = 10_000  # largest number of dots of a board
+FINE_DOTS, MAX_CENTRES = 500, 450_000  # of boards of more than FINE_DOTS dots: about a minute and 0.8 GB
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -108,8 +113,6 @@ class PlanOptions(Brief):
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """A change of the plan."""
-
     what: str
     sigma_mm: float | None  # of the worst face with it, or None and the ``reason`` if it is impossible
     reason: str = ""
@@ -135,61 +138,105 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     """Returns the pairs of face ids that a text like ``12,14`` or ``top-left,top-right`` names."""
     pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in pair_of_name:
-            raise InputError(
-                "E-OPTION-VALUE",
-                f"--groups: {name!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: ids "
-                "of one "
-                "character beside each other, longer ones with a hyphen",
-            )
+    if unknown := [name for name in names if name not in pair_of_name]:
+        raise InputError(
+            "E-OPTION-VALUE",
+            f"--groups: {unknown[0]!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: "
+            "ids of one character beside each other, longer ones with a hyphen",
+        )
     return tuple(pair_of_name[name] for name in names)
 
 
+Photographs = Callable[[PlanOptions], tuple[Scene | BodyScene, list[MetricModel], Setup]]
+"""Type of functions that simulate the photographs of a plan."""
+
+
+@require_arguments
 @one_thread()
-def plan_with_board(
-    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
+def plan(
+    options: PlanOptions,
+    target: TargetDesign,
+    board: BoardDesign | None = None,
+    nominal: Mapping[str, Rigid] | str | Path | None = None,
 ) -> Plan:
-    """Returns the forecast of photographs of a target of circles beside a board; see :func:`stcal.sfm.plan`."""
-    if (dots := board.rows * board.columns) > MAX_DOTS:
+    """Returns the forecast of a plan.
+
+    The geometry is nominal. Board and cameras stand where a simulated session would have them; a body with boards or
+    tags on its faces is turned before a camera, without a board.
+
+    Parameters
+    ----------
+    options : PlanOptions
+        Images, camera, groups and noise.
+    target : TargetDesign
+        Design of the target, drawing frame of each face, mm.
+    board : BoardDesign, optional
+        Board with its σ, mm; the reference board if None. There must be none beside a body with boards or tags.
+    nominal : dict of Rigid, or path, optional
+        Pose of every face in one common frame, mm, by face id, or ``faces.json`` of an earlier run; the rough poses of
+        the design if None.
+
+    Returns
+    -------
+    Plan
+        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
+
+    Raises
+    ------
+    InputError
+        If a face has no nominal pose, a group names an unknown face, a board or groups are given for a body with boards
+        or tags, or there are more dots than ``MAX_DOTS`` or ``MAX_CENTRES``.
+    DegenerateError
+        If a group cannot be photographed as planned.
+    """
+    printed = bool(target.with_faces(printed=True).faces)
+    if printed and (unfit := [n for n, v in {"--groups": options.groups, "--board": board}.items() if v]):
         raise InputError(
-            "E-PLAN-TOO-LARGE",
-            f"plan: board of {board.rows}×{board.columns} = {dots} dots, up to {MAX_DOTS} possible; plan with "
-            "fewer dots over the same area, the σ of the faces hardly change",
+            "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
         )
-    scene = _scene(options, target, board, nominal)
-    if dots > FINE_DOTS and (centres := dots * options.images * len(scene.groups)) > MAX_CENTRES:
-        raise InputError(
-            "E-PLAN-TOO-LARGE",
-            f"plan: {dots} dots in {options.images * len(scene.groups)} images are {centres} centres, up to "
-            f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
-        )
-    inputs = (target, board, nominal)
+    poses = dict(nominal) if isinstance(nominal, Mapping) else nominal_poses(target, nominal)
+    if printed:
+        faces = (replace(face, rough_target_from_face=poses[face.id]) for face in target.faces)
+        make, workers = partial(planned_photographs, target=replace(target, faces=tuple(faces))), 1
+    else:
+        board = reference_board() if board is None else board
+        make = partial(_beside_board, target=target, board=board, nominal=poses)
+        workers = _workers(options, target, board, poses)
     jobs = [
-        (_now, scene, options, board),
-        (remedy, "twice the images", _forecast, replace(options, images=2 * options.images), *inputs),
-        (_wider, options, *inputs),
-        (remedy, "nearer by 20 %", _forecast, replace(options, distance_mm=NEARER * options.distance_mm), *inputs),
+        (_as_asked, make, options),
+        (_remedy, make, replace(options, images=2 * options.images), "twice the images"),
+        (_remedy, make, replace(options, distance_mm=NEARER * options.distance_mm), "nearer by 20 %"),
+        *([] if printed else [(_wider, make, options)]),
     ]
-    workers = None if dots > MANY_DOTS else 1
-    now, more, wider, near = run_in_order(_called, jobs, workers)
-    return replace(now, remedies=(more, wider, *now.remedies, near))
+    now, more, near, *wider = run_in_order(_called, jobs, workers)
+    return replace(now, remedies=(more, *wider, *now.remedies, near))
+
+
+def _workers(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> int | None:
+    """Refuses plans of too many dots; returns the number of processes, None for one per core."""
+    dots = board.rows * board.columns
+    images = options.images * len(_scene(options, target, board, nominal).groups) if FINE_DOTS < dots <= MAX_DOTS else 1
+    for count, most, what in (
+        (dots, MAX_DOTS, f"a board of {board.rows}×{board.columns} has {dots} dots"),
+        (dots * images, MAX_CENTRES, f"{dots} dots in {images} images are {dots * images} centres"),
+    ):
+        if count > most:
+            remedy = "plan fewer images, or fewer dots over the same area: the σ of the faces hardly change"
+            raise InputError("E-PLAN-TOO-LARGE", f"plan: {what}, up to {most} possible; {remedy}")
+    return None if dots > MANY_DOTS else 1
 
 
 def _called(function: Callable[..., R], *arguments) -> R:
-    """Returns what a function returns; a job of another process."""
     with one_thread():
         return function(*arguments)
 
 
-def _now(scene: Scene, options: PlanOptions, board: BoardDesign) -> Plan:
-    return plan_as_asked(options, _setup(scene, options, board), _models(scene, options), "a board of half the σ")
-
-
-def plan_as_asked(options: PlanOptions, setup: Setup, models: Sequence[MetricModel], half_sigma: str) -> Plan:
-    """Returns the plan of these photographs, with ``half_sigma``, half the σ of what tells the size, as only remedy."""
-    expected = forecast(models, setup)
-    better = forecast(models, setup.better_board(0.5), expected.derivatives)
+def _as_asked(make: Photographs, options: PlanOptions) -> Plan:
+    scene, models, setup = make(options)
+    now = forecast(models, setup)
+    better = {"a board of half the σ" if setup.board.rows else "print and size of half the σ": setup.better_board(0.5)}
+    if isinstance(setup.board, ScaleReference):
+        better[f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm"] = _with_distance(setup, setup.board, models[0])
     return Plan(
         options,
         setup,
@@ -197,10 +244,35 @@ def plan_as_asked(options: PlanOptions, setup: Setup, models: Sequence[MetricMod
         sum(len(model.image_index) for model in models),
         rms(np.concatenate([model.sigma_px() for model in models])),
         widest_aperture_mm(models, setup.camera),
-        expected,
-        variance_shares(expected, models, setup),
-        (Remedy(half_sigma, better.worst()[1]),),
+        now,
+        variance_shares(now, models, setup),
+        tuple(Remedy(what, forecast(models, own, now.derivatives).worst()[1]) for what, own in better.items()),
+        scene.hardly_seen() if isinstance(scene, BodyScene) else "",
     )
+
+
+def _with_distance(setup: Setup, size: ScaleReference, model: MetricModel) -> Setup:
+    away = np.linalg.norm(model.xyz_model[:, None] - model.xyz_model, axis=2)
+    one, two = circle_labels(model.labels[i] for i in np.unravel_index(int(away.argmax()), away.shape))
+    known = KnownDistance(one, two, float(away.max()), DISTANCE_SIGMA_MM)
+    return replace(setup, board=replace(size, distances=(*size.distances, known)))
+
+
+def _remedy(make: Photographs, options: PlanOptions, what: str) -> Remedy:
+    try:
+        _, models, setup = make(options)
+        return Remedy(what, forecast(models, setup).worst()[1])
+    except (DegenerateError, InputError) as error:
+        return Remedy(what, None, str(error))
+
+
+def _wider(make: Photographs, options: PlanOptions) -> Remedy:
+    """Returns the remedy of the largest spread at which there are enough views."""
+    found = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
+    for spread in SPREADS_DEG:
+        if spread > options.spread_deg and found.sigma_mm is None:
+            found = _remedy(make, replace(options, spread_deg=spread), f"spread of ±{spread:g}°")
+    return found
 
 
 def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
@@ -220,7 +292,6 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
 
 def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
     """Returns the scene with the nominal geometry, in which nothing is misplaced."""
-    file = None if options.camera is None else camera_model(options.camera)
     shape = SceneOptions(
         seed=options.seed,
         centre_sigma=0.0,
@@ -235,13 +306,14 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         height=round(options.width * 2 / 3),
         margin_mm=options.margin_mm,
     )
-    if file is not None:
-        shape = seen_by(shape, file)
-    scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
-    return scene if file is None else replace(scene, camera=file.calibrated(0, 0))
+    return make_scene(shape, target, replace(board, sigma_mm=0.0), nominal, options.camera)
 
 
-def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
+def _beside_board(
+    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal
+) -> tuple[Scene, list[MetricModel], Setup]:
+    """Returns the photographs of a plan with a board: scene, models with their σ, input of a forecast."""
+    scene = _scene(options, target, board, nominal)
     run = options.run.adjustment(scene.target)
     linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
     start = CalibratedTarget(
@@ -250,7 +322,7 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
         scene.circles_target,
         dict.fromkeys(scene.groups, Rigid()),
     )
-    return Setup(
+    setup = Setup(
         target=scene.target,
         board=board,
         camera=scene.camera,
@@ -260,6 +332,9 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
         prior=camera_prior(refinable(scene.camera)) if run.refine_camera else None,
         common=ONE_PLATE if options.one_board else 0.0,
     )
+    exact = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    return scene, [options.noise.applied(model, scene.camera, radius) for model in exact], setup
 
 
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
@@ -277,29 +352,47 @@ def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
     return linked
 
 
-def _models(scene: Scene, options: PlanOptions) -> list[MetricModel]:
-    radius = scene.target.radius_of() | scene.board.radius_of()
-    exact = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
-    return [options.noise.applied(model, scene.camera, radius) for model in exact]
+def planned_photographs(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, list[MetricModel], Setup]:
+    """Returns the photographs of a body in random poses: scene, its model with σ, input of a forecast."""
+    file = None if options.camera is None else camera_model(options.camera)
+    camera = body_camera(options.width) if file is None else file.calibrated(0, 0)
+    shape = BodyOptions(options.images, options.distance_mm, seed=options.seed, pose_sigma_mm=0, pose_sigma_deg=0)
+    scene = make_body_scene(target, camera, shape)
+    run = options.run.adjustment(target)
+    images, place = corners_seen(scene, options.noise.corner_px)
+    xyz: dict[Label, np.ndarray] = {**place}
+    model = assemble(MetricModel, GROUP, images, list(scene.camera_from_target), xyz)
+    faces = {label.face for label in model.labels if isinstance(label, CircleLabel)}
+    if unseen := [face.id for face in target.faces if face.id not in faces]:
+        raise InputError(
+            "E-PLAN-UNLINKED",
+            f"plan: {options.images} images of which fewer than two show face {unseen[0]}; plan more images",
+        )
+    start = CalibratedTarget(run.reference_face, scene.target_from_face, place, {GROUP: Rigid()})
+    prior = camera_prior(unknown_lens(camera)) if file is None else None
+    if file is not None and run.refine_camera:
+        prior = camera_prior(refinable(camera))
+    size = with_edge_sigma(scale_reference(None, target), images)
+    return scene, [model], Setup(target, size, camera, start, run.frame, run.flatness_mm, prior, 0)
 
 
-def _forecast(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Forecast:
-    scene = _scene(options, target, board, nominal)
-    return forecast(_models(scene, options), _setup(scene, options, board))
-
-
-def remedy(what: str, make: Callable[..., Forecast], *inputs) -> Remedy:
-    """Returns a change with the σ of the worst face of its forecast, or with the reason why it is impossible."""
-    try:
-        return Remedy(what, make(*inputs).worst()[1])
-    except (DegenerateError, InputError) as error:
-        return Remedy(what, None, str(error))
-
-
-def _wider(options: PlanOptions, *inputs) -> Remedy:
-    """Returns the remedy of the largest spread at which there are enough views."""
-    found = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
-    for spread in SPREADS_DEG:
-        if spread > options.spread_deg and found.sigma_mm is None:
-            found = remedy(f"spread of ±{spread:g}°", _forecast, replace(options, spread_deg=spread), *inputs)
-    return found
+def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservations], dict[CircleLabel, np.ndarray]]:
+    """Returns exact corners with this σ of the faces that two photographs show, and their places, (3,) mm by label."""
+    shown = [scene.faces_in_view(image) for image in range(len(scene.camera_from_target))]
+    often = Counter(face.id for faces in shown for face in faces)
+    images: list[ImageObservations] = []
+    place: dict[CircleLabel, np.ndarray] = {}
+    for i, (faces, pose) in enumerate(zip(shown, scene.camera_from_target, strict=True)):
+        own = {
+            label: xyz
+            for face in faces
+            if often[face.id] > 1
+            for label, xyz in zip(
+                face.labels(), scene.target_from_face[face.id] @ face.places_mm(face.ids), strict=True
+            )
+        }
+        xy, n = scene.camera.project(pose @ np.array(list(own.values())).reshape(-1, 3)), len(own)
+        covariance = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
+        images.append(ImageObservations(f"{i:04d}", GROUP, tuple(own), xy, xy, np.zeros((n, 2, 2)), covariance))
+        place |= own
+    return images, place

@@ -28,7 +28,7 @@ from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labelling import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
-from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import GroupSolution

@@ -1,6 +1,7 @@
 """Cameras from photographs of a chessboard and of a ChArUco board: drawn, and measured."""
 
 import json
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,16 +17,55 @@ from stcal.boards.design import (
     TagLayout,
 )
 from stcal.labels import DotLabel
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
+from stcal.workflows.board_views import corner_grid
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph
 from tests.outcome import fails_with
 
 FOCAL, CENTRE = (1500.0, 1490.0), (610.0, 440.0)
-CHESSBOARD = 'type = "chessboard"\nrows = 7\ncolumns = 10\nsquare_mm = 12.0\n'
 
 
-def taken(folder, sheet: np.ndarray, origin_mm, middle_mm, count: int, away_mm=(230, 300)) -> None:
-    """Photographs, 1200×900 px, of a sheet (4 px a millimetre) whose board begins at ``origin_mm`` of it."""
+def aprilgrid():
+    """Sheet (4 px a millimetre), where its board begins and has its middle, distances, and the board's file."""
+    sheet, origin = aprilgrid_mm(AprilGridDesign(3, 4, 20.0, 0.3), 2)
+    board = "target_type: 'aprilgrid'\ntagCols: 4\ntagRows: 3\ntagSize: 0.02\ntagSpacing: 0.3\n"
+    return sheet, origin, (52.0, -36.0, 0.0), (230, 300), "april.yaml", board
+
+
+def chessboard():
+    sheet, first_mm = chessboard_mm(7, 10, 12.0)
+    board = 'type = "chessboard"\nrows = 7\ncolumns = 10\nsquare_mm = 12.0\n'
+    return sheet, (first_mm, first_mm), (54.0, 36.0, 0.0), (230, 300), "board.toml", board
+
+
+def circles(kind, across, down, stated):
+    sheet = np.full((160 * 4, 100 * 4), 255, np.uint8)
+    for row in range(11):
+        for place in range(4):
+            x, y = 20 + 8.0 * across * (place + row % 2 / 2), 20 + 8.0 * down * row
+            centre = (round((4 * x - 0.5) * 16), round((4 * y - 0.5) * 16))  # mm begin at the edge of the first pixel
+            cv2.circle(sheet, centre, round(4.0 * 4 * 16), 0, -1, cv2.LINE_AA, 4)
+    board = f'type = "{kind}-circles"\nrows = 11\ncolumns = 4\nspacing_mm = {stated}\n'
+    board += 'radius_mm = 4.0\npolarity = "dark"\n'
+    return sheet, (20, 20), (28.0, 40.0, 0.0), (190, 240), "board.toml", board
+
+
+@pytest.mark.parametrize(
+    ("drawn", "count"),
+    [
+        pytest.param(aprilgrid, 8, marks=pytest.mark.slow),
+        pytest.param(partial(circles, "asymmetric", 2.0, 1.0, 8.0), 8, marks=pytest.mark.slow, id="asymmetric"),
+        pytest.param(
+            partial(circles, "hexagonal", 1.5, 1.5 * np.sqrt(0.75), 12.0), 8, marks=pytest.mark.slow, id="hexagonal"
+        ),
+        pytest.param(chessboard, 10, marks=pytest.mark.full),
+    ],
+)
+def test_photographs_of_a_drawn_board_give_the_camera_with_its_sigma(tmp_path, stcal_sfm, drawn, count):
+    """Photographs of 1200×900 px; an AprilGrid is that of Kalibr."""
+    sheet, origin_mm, middle_mm, away_mm, name, board = drawn()
+    images = tmp_path / "photographs"
+    images.mkdir()
+    (tmp_path / name).write_text(board, encoding="utf-8")
     rng = np.random.default_rng(5)
     inner = np.array([[FOCAL[0], 0, CENTRE[0]], [0, FOCAL[1], CENTRE[1]], [0, 0, 1]])
     board_from_sheet = np.array([[1, 0, -origin_mm[0]], [0, 1, -origin_mm[1]], [0, 0, 1.0]])
@@ -33,55 +73,16 @@ def taken(folder, sheet: np.ndarray, origin_mm, middle_mm, count: int, away_mm=(
         turn = Rotation.from_euler("xyz", [*rng.uniform(-30, 30, 2), rng.uniform(-30, 30)], degrees=True).as_matrix()
         place = np.array([rng.uniform(-15, 15), rng.uniform(-12, 12), rng.uniform(*away_mm)]) - turn @ middle_mm
         image_from_mm = inner @ np.column_stack([turn[:, :2], place])
-        cv2.imwrite(str(folder / f"{i}.png"), photograph(sheet, 4, image_from_mm @ board_from_sheet))
-
-
-def assert_true_camera(stcal_sfm, folder, board: str) -> str:
-    """What the command prints of the photographs in a folder."""
-    code, text, error = stcal_sfm(
-        *("calibrate-camera", folder / "photographs", "--board", folder / board),
-        *("--out", folder / "cameras.txt", "--model", "PINHOLE"),
-    )
+        cv2.imwrite(str(images / f"{i}.png"), photograph(sheet, 4, image_from_mm @ board_from_sheet))
+    files = "--board", tmp_path / name, "--out", tmp_path / "cameras.txt"
+    code, text, error = stcal_sfm("calibrate-camera", images, *files, "--model", "PINHOLE")
     assert code == 0, error
-    found = json.loads((folder / "cameras.json").read_text())["parameters"]
+    assert f"{count} views of the board" in text
+    assert "photographs differ" in text
+    found = json.loads((tmp_path / "cameras.json").read_text())["parameters"]
     for name, true in zip(("fx", "fy", "cx", "cy"), (*FOCAL, *CENTRE), strict=True):
         assert 0 < found[name]["sigma"] < 5
         assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"] + 0.5  # half a pixel of drawing
-    return text
-
-
-KALIBR = "target_type: 'aprilgrid'\ntagCols: 4\ntagRows: 3\ntagSize: 0.02\ntagSpacing: 0.3\n"
-
-
-@pytest.mark.slow
-def test_an_aprilgrid_of_kalibr_gives_the_camera(tmp_path, stcal_sfm):
-    board = AprilGridDesign(3, 4, 20.0, 0.3)
-    sheet, origin = aprilgrid_mm(board, 2)
-    (tmp_path / "photographs").mkdir()
-    taken(tmp_path / "photographs", sheet, origin, np.array([52.0, -36.0, 0.0]), 8)
-    (tmp_path / "april.yaml").write_text(KALIBR)
-    assert "8 views of the board" in assert_true_camera(stcal_sfm, tmp_path, "april.yaml")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("kind", "across", "down"), [("asymmetric", 2.0, 1.0), ("hexagonal", 1.5, 1.5 * np.sqrt(0.75))]
-)
-def test_circles_in_shifted_rows_give_the_camera(tmp_path, stcal_sfm, kind, across, down):
-    rows, columns, spacing, radius = 11, 4, 8.0, 4.0
-    sheet = np.full((160 * 4, 100 * 4), 255, np.uint8)
-    for row in range(rows):
-        for place in range(columns):
-            x, y = 20 + spacing * across * (place + row % 2 / 2), 20 + spacing * down * row
-            centre = (round((4 * x - 0.5) * 16), round((4 * y - 0.5) * 16))  # mm begin at the edge of the first pixel
-            cv2.circle(sheet, centre, round(radius * 4 * 16), 0, -1, cv2.LINE_AA, 4)
-    (tmp_path / "photographs").mkdir()
-    taken(tmp_path / "photographs", sheet, (20, 20), np.array([28.0, 40.0, 0.0]), 8, (190, 240))
-    stated = 8.0 if kind == "asymmetric" else 12.0
-    (tmp_path / "board.toml").write_text(
-        f'type = "{kind}-circles"\nrows = 11\ncolumns = 4\nspacing_mm = {stated}\nradius_mm = 4.0\npolarity = "dark"\n'
-    )
-    assert_true_camera(stcal_sfm, tmp_path, "board.toml")
 
 
 @pytest.mark.parametrize(
@@ -104,25 +105,11 @@ def test_points_keep_their_places(board):
     assert len(set(labels)) == len(board.xy_mm())
 
 
-@pytest.mark.full
-def test_a_chessboard_gives_the_camera_with_its_sigma(tmp_path, stcal_sfm):
-    sheet, first_mm = chessboard_mm(7, 10, 12.0)
-    (tmp_path / "photographs").mkdir()
-    taken(tmp_path / "photographs", sheet, (first_mm, first_mm), np.array([54.0, 36.0, 0.0]), 10)
-    (tmp_path / "board.toml").write_text(CHESSBOARD, encoding="utf-8")
-    assert "photographs differ" in assert_true_camera(stcal_sfm, tmp_path, "board.toml")
-
-
 def test_corners_are_dots_without_extent():
     grid = corner_grid(ChessboardDesign(4, 6, 25.0, 0.02))
     assert (grid.rows, grid.columns, grid.pitch_mm, grid.sigma_mm) == (4, 6, 25.0, 0.02)
     with fails_with("E-BOARD-TYPE … tags"):
         corner_grid(TagLayout((("DICT_4X4_50", 1),), np.zeros((1, 4, 2))))
-
-
-def test_a_folder_without_the_board(tmp_path):
-    with fails_with("E-IMAGES-FOLDER … does not exist"):
-        calibrate_camera_by_corners(tmp_path / "none", ChessboardDesign(7, 10, 12.0))
 
 
 @pytest.mark.slow

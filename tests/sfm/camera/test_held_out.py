@@ -1,21 +1,92 @@
-"""Views held out from a calibration, and the lens model that they choose."""
+"""Corners that are errors, views held out from a calibration, and the lens model that they choose."""
 
 import re
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.sfm.camera import checks
-from stcal.sfm.camera.calibrate import judged, of_chosen_model, require_model
-from stcal.sfm.camera.checks import choose_model, held_out, of_lens_model
-from stcal.sfm.camera.file import CalibrationFile
+from stcal.io.images import ImageFile, Skipped
+from stcal.labels import DotLabel, unseen_lines
+from stcal.sfm.camera import calibrate as calibration
+from stcal.sfm.camera.calibrate import (
+    MAX_RESIDUAL_PX,
+    choose_model,
+    held_out,
+    judged,
+    of_chosen_model,
+    of_lens_model,
+    require_determined,
+    require_views,
+    residual_rms_px,
+)
+from stcal.sfm.camera.camera_report import calibration_file, calibration_report
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
-from stcal.sfm.camera.report import calibration_report
+from stcal.workflows.board_views import without_gross_errors
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of, with_a_field
+
+
+def moved(view, rows, by_px):
+    """The view with some of its points elsewhere."""
+    centre = view.centre_px.copy()
+    centre[rows] += by_px
+    return replace(view, centre_px=centre)
+
+
+def test_gross_errors_are_left_out_and_other_points_stay():
+    """Three points of one view at 40 px pull its pose, so that others look wrong, too."""
+    views = views_of(np.random.default_rng(4), count=10)
+    spoiled = [*views]
+    spoiled[3] = moved(views[3], [0, 1, 2], [40.0, -25.0])
+    result = calibrated(spoiled)
+    assert residual_rms_px(result) > MAX_RESIDUAL_PX
+    require_determined(result, spoiled, BOARD)  # a few do not refuse all
+    kept, skipped, (warning,) = without_gross_errors(spoiled, BOARD, result)
+    assert skipped == []
+    assert kept[3].labels == views[3].labels[3:]
+    assert [len(view) for view in kept] == [len(view) - 3 * (i == 3) for i, view in enumerate(views)]
+    assert f"3 corners in 1 views are left out, first {views[3].name} {views[3].labels[0]}" in warning
+
+
+@pytest.mark.slow
+def test_a_view_of_gross_errors_is_skipped_and_views_without_stay_as_they_are():
+    views = views_of(np.random.default_rng(5), count=10)
+    kept, skipped, warnings = without_gross_errors(views, BOARD, calibrated(views))
+    assert all(a is b for a, b in zip(kept, views, strict=True))
+    assert skipped == warnings == []
+    spoiled, rng = [*views], np.random.default_rng(6)
+    wrong = np.arange(len(views[7]))[: int(0.8 * len(views[7]))]
+    spoiled[7] = moved(views[7], wrong, rng.uniform(-60, 60, (len(wrong), 2)))
+    kept, skipped, _ = without_gross_errors(spoiled, BOARD, calibrated(spoiled))
+    assert [each.name for each in skipped] == [views[7].name]
+    assert len(kept) == 9
+
+
+def test_the_reason_for_no_board_is_that_of_an_image():
+    files = [ImageFile(Path("a.png"), "a.png", ".")]
+    skipped = [Skipped("board.yaml", "not an image file"), Skipped("a.png", "no board of dots recognised", "board")]
+    with fails_with("E-BOARD-NOT-FOUND … a.png: no board of dots"):
+        require_views([], files, skipped)
+
+
+@pytest.mark.parametrize(("rows", "columns", "said"), [(4, 5, []), (5, 5, ["row 4"]), (4, 7, ["column 5, 6"])])
+def test_rows_and_columns_that_no_image_shows(rows, columns, said):
+    labels = [DotLabel(row, column) for row in range(4) for column in range(5)]
+    assert [note.split(":")[0] for note in unseen_lines(labels, rows, columns)] == [f"board {each}" for each in said]
+
+
+@pytest.mark.slow
+def test_a_row_too_many_is_a_warning_of_the_calibration():
+    views = views_of(np.random.default_rng(8), count=6)
+    longer = replace(BOARD, rows=BOARD.rows + 1)
+    warnings = judged(calibrated(views), views, (), 1, True, longer).warnings
+    assert any(f"board row {BOARD.rows}: not seen in any image" in warning for warning in warnings)
+
 
 FISHEYE = Camera(2592, 1728, [1100.0, 1098.0], [1301.0, 859.0], [0.02, -0.01, 0, 0, 0.003, 0, 0, 0], True)
 RADIAL = Camera(2592, 1728, [2790.0, 2790.0], [1301.0, 859.0], [-0.06, 0, 0, 0, 0, 0, 0, 0])
@@ -56,11 +127,6 @@ def test_a_dot_that_is_wrong_does_not_count():
     assert held_out(calibrated(views), views, BOARD).rms_px() < 1.05 * before
 
 
-def test_too_few_views_are_not_held_out():
-    views = views_of(np.random.default_rng(3), count=3)
-    assert held_out(calibrated(views), views, BOARD) is None
-
-
 def known_of(views, truth):
     model = "OPENCV_FISHEYE" if truth.fisheye else "OPENCV"
     start = closed_form(views, BOARD, start_camera(truth.width, truth.height, model))
@@ -85,13 +151,13 @@ def test_the_model_of_the_lens_is_chosen(truth, wanted):
     views = views_of(np.random.default_rng(4), count=16, camera=truth)
     chosen, rows = choose_model(views, BOARD, known_of(views, truth), 2)
     assert chosen in wanted
-    assert [row.model for row in rows] == list(checks.CANDIDATES)
+    assert [row.model for row in rows] == list(calibration.CANDIDATES)
     assert min(row.worse for row in rows if row.worse is not None) == 0
     assert all(row.why for row in rows if row.worse is None)
 
 
 def few(monkeypatch):
-    monkeypatch.setattr(checks, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
+    monkeypatch.setattr(calibration, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
 
 
 @pytest.mark.full
@@ -110,31 +176,33 @@ def test_as_good_and_simpler_is_taken(monkeypatch):
 def test_a_model_that_fails_says_why(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(6), count=12)
-    own = checks.adjust_intrinsics
+    own = calibration.adjust_intrinsics
 
     def failing(views, board, start, model, *more):
         if model == "PINHOLE":
             raise DegenerateError("E-TEST", "no minimum")
         return own(views, board, start, model, *more)
 
-    monkeypatch.setattr(checks, "adjust_intrinsics", failing)
+    monkeypatch.setattr(calibration, "adjust_intrinsics", failing)
     chosen, rows = choose_model(views, BOARD, known_of(views, TRUE), 1)
     assert chosen == "OPENCV"
     assert (rows[0].why, rows[0].rms_px) == ("no minimum", None)
 
 
 @pytest.mark.slow
-def test_too_few_views_to_choose(monkeypatch):
+def test_of_too_few_views_none_is_held_out_and_no_model_chosen(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(3), count=3)
+    known = known_of(views, TRUE)
+    assert held_out(known, views, BOARD) is None
     with fails_with("E-CALIBRATE-FEW-VIEWS … --model … 3 … 4 … --model"):
-        choose_model(views, BOARD, known_of(views, TRUE), 1)
+        choose_model(views, BOARD, known, 1)
 
 
 @pytest.mark.full
 def test_where_no_perspective_lens_fits_the_wide_one_begins(monkeypatch):
     few(monkeypatch)
-    monkeypatch.setattr(checks, "CANDIDATES", ("OPENCV_FISHEYE",))
+    monkeypatch.setattr(calibration, "CANDIDATES", ("OPENCV_FISHEYE",))
     views = views_of(np.random.default_rng(7), count=10, camera=FISHEYE)
     asked = []
 
@@ -158,22 +226,17 @@ def test_where_neither_fits_the_first_reason_is_given():
         of_chosen_model(calibrate, BOARD, 1)
 
 
-def test_unknown_models_are_refused():
-    with fails_with("E-CAMERA-MODEL … BEST … auto"):
-        require_model("BEST")
-
-
 @pytest.fixture(scope="module")
 def result():
     views = views_of(np.random.default_rng(8), count=12)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checks, "CANDIDATES", ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"))
+        patch.setattr(calibration, "CANDIDATES", ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"))
         return of_chosen_model(lambda model: judged(calibrated(views, model), views, (), 1, True, BOARD), BOARD, 1)
 
 
 @pytest.mark.slow
 def test_text_page_and_file_have_all_models(result):
-    summary = CalibrationFile.of(result)
+    summary = calibration_file(result)
     report = calibration_report(result, summary, "images")
     text, page = report.text(), report.page()
     assert re.search(r"views held out, 5 parts: residual RMS 0\.0\d+ px after their poses were fitted", text)
@@ -190,7 +253,7 @@ def test_a_lens_model_too_small_is_named_and_no_larger_one_for_other_errors():
     bent = Camera(2592, 1728, TRUE.focal, TRUE.centre, [-0.06, 0.045, 0, 0, 0.3, 0, 0, 0])
     views = views_of(np.random.default_rng(9), count=12, camera=bent)
     (warning,) = of_lens_model(calibrated(views), views, BOARD)
-    assert "the lens model is too small; use --model FULL_OPENCV" in warning
+    assert "OPENCV is too small; use --model FULL_OPENCV" in warning
     rng = np.random.default_rng(10)
     for other in (views_of(rng, 12), with_a_field(views_of(rng, 12), rng, 0.04)):
         assert of_lens_model(calibrated(other), other, BOARD) == []

@@ -26,8 +26,7 @@ from stcal.sfm.make import (
     size_of,
     unnamed_cases,
 )
-from stcal.sfm.planning.bodies import plan
-from stcal.sfm.planning.session import PlanOptions
+from stcal.sfm.planning.session import PlanOptions, plan
 from stcal.synthetic.designs import face_of_drawing, second_design
 from tests.outcome import fails_with
 

@@ -1,8 +1,12 @@
-"""The live view and the app that answers images: poses, the page, who is refused, and sources that give no picture."""
+"""The live view and the app that answers images: poses, the page, who is refused, and sources without pictures."""
 
 import base64
+import http.client
 import json
 import re
+import signal
+import socket
+import subprocess
 import sys
 import zlib
 from importlib import import_module
@@ -17,10 +21,10 @@ from stcal.cli.main import app
 from stcal.io.cameras.read import read_camera
 from stcal.io.device import pictures_of
 from stcal.sfm import MeasureOptions, measure
-from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of
-from stcal.sfm.measurement.report import poses_file
-from stcal.sfm.measurement.target import read_target
-from stcal.sfm.measurement.tracker import Tracker
+from stcal.sfm.measurement.known_target import read_target
+from stcal.sfm.measurement.live import WIDEST_PX, LiveService, line_of, served
+from stcal.sfm.measurement.measure_images import Tracker
+from stcal.sfm.measurement.pose_report import poses_file
 from tests.outcome import fails_with
 from tests.sfm.truth import true_poses
 
@@ -202,23 +206,84 @@ def test_pictures_of_a_folder_or_a_video_of_odd_size(small_run, small_dataset, t
 @pytest.mark.parametrize(
     ("words", "code"),
     [
-        ([], "E-LIVE-SOURCE … --camera-index 0"),
-        (["http://127.0.0.1:9/clip"], "E-LIVE-SOURCE … http://127.0.0.1:9/clip"),
-        (["--strict"], "E-OPTION-CONFLICT … --strict"),
-        (["--json", "poses.json"], "E-OPTION-CONFLICT … --json -"),
-        (["--out", "clip.csv"], "E-OPTION-CONFLICT … --out … --json -"),
+        (["--live"], "E-LIVE-SOURCE … --camera-index 0"),
+        (["--live", "http://127.0.0.1:9/clip"], "E-LIVE-SOURCE … http://127.0.0.1:9/clip"),
+        (["--live", "--strict"], "E-OPTION-CONFLICT … --strict"),
+        (["--live", "--json", "poses.json"], "E-OPTION-CONFLICT … --json -"),
+        (["--live", "--out", "clip.csv"], "E-OPTION-CONFLICT … --out … --json -"),
+        (["--serve", "images"], "E-OPTION-CONFLICT … IMAGES: images come"),
+        (["--serve", "--previous"], "E-OPTION-CONFLICT … --previous: images come"),
+        (["--serve", "--workers", "2"], "E-OPTION-CONFLICT … --workers: images come"),
+        (["--serve", "--live"], "E-OPTION-CONFLICT … --serve: images come"),
+        (["clip.avi"], "E-IMAGES-FOLDER … clip.avi: a file, and no image … --live --json -"),
     ],
 )
-def test_what_cannot_be_shown_ends_in_one_line(small_run, words, code):
-    faces = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
+def test_what_cannot_be_shown_ends_in_one_line(small_run, tmp_path, monkeypatch, words, code):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clip.avi").write_bytes(b"RIFF")
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json", "--port", "0"]
     with fails_with(code):
-        CliRunner().invoke(
-            app, ["sfm", "measure", "--live", *map(str, faces), "--port", "0", *words], catch_exceptions=False
-        )
+        CliRunner().invoke(app, ["sfm", "measure", *map(str, files), *words], catch_exceptions=False)
 
 
-def test_a_video_without_live_is_told_how_it_is_measured(small_run, tmp_path):
-    (clip := tmp_path / "clip.avi").write_bytes(b"RIFF")
-    faces = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
-    with fails_with("E-IMAGES-FOLDER … clip.avi: a file, and no image … --live --json -"):
-        CliRunner().invoke(app, ["sfm", "measure", str(clip), *map(str, faces)], catch_exceptions=False)
+PATIENCE_S = 60.0
+
+
+def asked(port, method, place, body=None) -> tuple[int, dict]:
+    line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    line.request(method, place, body)
+    with line.getresponse() as answer:
+        found = answer.status, json.loads(answer.read())
+    line.close()
+    return found
+
+
+@pytest.mark.slow
+def test_the_command_answers_this_machine_until_interrupted(small_run, small_dataset):
+    photograph = min((small_dataset / "images" / "12").iterdir())
+    files = ["--camera", small_run / "inputs/cameras.txt", "--faces", small_run / "faces.json"]
+    files += ["--target", small_run / "inputs/target.toml"]
+    words = ["measure", "--serve", "--port", 0, "--max-megabytes", 4, *files]
+    program = [sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()", *map(str, words)]
+    with subprocess.Popen(program, stdout=-1, stderr=-1, text=True) as running:
+        line = running.stdout.readline()
+        assert line.startswith("answering POST http://127.0.0.1:")
+        port = int(line.partition("/pose")[0].rpartition(":")[2])
+        code, content = asked(port, "POST", f"/pose?name={photograph.name}", photograph.read_bytes())
+        assert asked(port, "POST", "/pose", iter([bytes(4_000_001)]))[0] == 413
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=PATIENCE_S)
+    assert (running.returncode, out, err.splitlines()[-1]) == (130, "", "interrupted")
+    assert (code, content["images"][0]["image"]) == (200, photograph.name)
+
+
+def test_pages_get_the_newest_picture_and_the_last_one_before_the_end():
+    service = LiveService(None, live=True)
+    service.newest = {"picture": 1}
+    with served(service, port=0) as url:
+        line = http.client.HTTPConnection(url.removeprefix("http://"), timeout=PATIENCE_S)
+        line.request("GET", "/events")
+        stream = line.getresponse()
+        assert stream.readline() == b'data: {"picture": 1}\n'
+        service.newest = {"picture": 2}
+    assert stream.read() == b'\ndata: {"picture": 2}\n\nevent: ended\ndata: {}\n\n'
+    line.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "code"),
+    [("0.0.0.0", "E-OPTION-NEEDS … --host 0.0.0.0 … --token"), ("999.1.1.1", "E-SERVICE-ADDRESS … --host 999.1.1.1")],
+)
+def test_addresses_at_which_none_listens(host, code):
+    with fails_with(code), served(LiveService(None), host, 0):
+        pass
+
+
+def test_a_port_that_is_taken_and_other_machines_with_a_token():
+    with served(LiveService(None, token="word"), "0.0.0.0", 0) as url:
+        port = int(url.rpartition(":")[2])
+        assert asked(port, "POST", "/pose", b"x")[0] == 401
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with fails_with("E-SERVICE-ADDRESS … Address already in use"), served(LiveService(None), port=port):
+            pass

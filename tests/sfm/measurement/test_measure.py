@@ -1,9 +1,8 @@
-"""The calibrated target at work: poses of single images, their covariances, and the two-fold ambiguity."""
+"""The calibrated target at work: poses of single images, their covariances, common errors, two-fold ambiguity."""
 
 import csv
 import json
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -19,10 +18,11 @@ from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
-from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
-from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
-from stcal.sfm.measurement.report import poses_file
-from stcal.sfm.measurement.target import TargetCircles, read_target
+from stcal.sfm.detect.labelling import LabelledImage
+from stcal.sfm.measurement.known_target import TargetCircles, read_target
+from stcal.sfm.measurement.measure_images import MeasureOptions, measure, measure_labelled
+from stcal.sfm.measurement.pose import MOST, NO_FACE, PoseOptions, common_errors, pose_from_circles, resolved
+from stcal.sfm.measurement.pose_report import poses_csv, poses_file
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import FULL
 from tests.outcome import fails_with, refuses
@@ -51,6 +51,10 @@ def one_view(scene, rng, faces, noise_px, tilt_deg, distance_mm):
         image = see(scene, truth, faces, noise_px, rng)
         if len(image) >= 8 * len(faces):
             return truth, towards, image
+
+
+def measured_from(images, *more):
+    return measure_labelled([LabelledImage(image, ()) for image in images], *more)
 
 
 def pose_of(image, target, camera, **more):
@@ -132,7 +136,7 @@ def test_images_are_resolved_in_order_of_their_names(scene, known):
         replace(see(scene, truth, ("1", "2", "4") if i == 0 else ("1",), 0.5, rng), name=f"a/{i}", group="a")
         for i in range(3)
     ]
-    asked = measure_labelled(images[::-1], scene.camera, known.truth, MeasureOptions(previous=True))
+    asked = measured_from(images[::-1], scene.camera, known.truth, MeasureOptions(previous=True))
     assert [(i.name, i.pose.status) for i in asked.images] == [
         ("a/0", "certain"),
         ("a/1", "resolved"),
@@ -140,7 +144,7 @@ def test_images_are_resolved_in_order_of_their_names(scene, known):
     ]
     for each in asked.images:
         assert np.linalg.norm(pose_error(each.pose.camera_from_target, truth)[:3]) < 0.1
-    plain = measure_labelled(images, scene.camera, known.truth)
+    plain = measured_from(images, scene.camera, known.truth)
     assert [i.pose.status for i in plain.images] == ["certain", "ambiguous", "ambiguous"]
     content = poses_file(plain).content()
     assert content["images"][0]["alternative"] is None
@@ -262,16 +266,6 @@ def test_faces_json_holds_the_covariance_of_all_circles_together(small_run):
     assert np.trace(across) > 1e-7  # neighbours err together
 
 
-@pytest.fixture(scope="module")
-def measured(small_run, small_dataset, tmp_path_factory):
-    """One of the run's own images measured, without a word about the board in it."""
-    images = tmp_path_factory.mktemp("measured")
-    (images / "12").mkdir()
-    own_copy(small_dataset / "images/12/IMG_1000.jpg", images / "12")
-    files = small_dataset / "cameras.txt", small_run / "faces.json", small_dataset / "target.toml"
-    return measure(images, *files, options=MeasureOptions(workers=1))
-
-
 @pytest.mark.full
 def test_the_shared_rendered_set(shared_data, tmp_path):
     """The whole chain on images of another program: calibrated, then measured. Its README says that one face in eight
@@ -391,20 +385,19 @@ def test_what_the_covariance_lacks_is_said(small_run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "code"),
     [
-        ("image,x_mm\n12/IMG_1000.jpg,1\n", "column x_mm is an output of this command"),
-        ("image,q1_deg\nIMG_1000.jpg,1\n", "none of its images was measured; names are like 12/IMG_1000.jpg"),
+        ("image,x_mm\na.jpg,1\n", "E-TABLE-COLUMNS-CONFLICT … x_mm"),
+        ("image,q1_deg\nb.jpg,1\n", "E-IMAGES-UNMATCHED … a.jpg"),
+        ("image,q1_deg\na.jpg,1\na.jpg,2\n", "E-TABLE-ROW-REPEATED … a.jpg"),
     ],
 )
-def test_other_joints_are_refused(stcal_sfm, small_dataset, small_run, tmp_path, measured, monkeypatch, text, message):
-    """Of images that were measured already."""
-    monkeypatch.setattr(import_module("stcal.sfm.measurement.images"), "measure", lambda *_, **__: measured)
-    joints = tmp_path / "joints.csv"
-    joints.write_text(text)
-    code, _, err = stcal_sfm(*command(small_dataset, small_run, tmp_path, "--joints", joints))
-    assert (code, message in err, len(err.strip().splitlines())) == (2, True, 1), err
-    assert not (tmp_path / "poses.csv").exists()
+def test_other_joints_are_refused(scene, known, tmp_path, text, code):
+    _, _, image = one_view(scene, np.random.default_rng(9), ("2",), NOISE_PX, (20, 40), (900, 1000))
+    result = measured_from([replace(image, name="a.jpg")], scene.camera, known.truth)
+    (tmp_path / "joints.csv").write_text(text)
+    with fails_with(code):
+        poses_csv(result, read_table(tmp_path / "joints.csv", "joints"))
 
 
 def test_images_without_a_face_are_an_error_together(stcal_sfm, small_dataset, small_run, tmp_path):
@@ -428,13 +421,34 @@ def test_a_face_that_was_not_calibrated_is_left_out(scene, known):
     part = TargetCircles(
         tuple(truth.labels[i] for i in keep), truth.xyz[keep], truth.radius[keep], truth.covariance[np.ix_(rows, rows)]
     )
-    result = measure_labelled([image], scene.camera, part)
+    result = measured_from([image], scene.camera, part)
     assert result.images == ()
     assert result.left_out[0].reason == "face 2 is not calibrated"
     empty = ImageObservations(
         "a", ".", (), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2))
     )
-    assert measure_labelled([empty], scene.camera, truth).left_out[0].reason == NO_FACE
+    assert measured_from([empty], scene.camera, truth).left_out[0].reason == NO_FACE
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda camera: replace(camera, focal=camera.focal / 2, centre=(camera.centre + 0.5) / 2 - 0.5), "half"),
+        (lambda camera: replace(camera, centre=camera.centre + 150), "cut out"),
+        (lambda camera: replace(camera, focal=1.1 * camera.focal), None),
+    ],
+)
+def test_what_is_mistaken_in_the_camera_file(scene, known, change, said):
+    rng = np.random.default_rng(2)
+    images = [
+        replace(see(scene, view(faces_view(scene, ("1", "2")), 0.2, 700, rng), ("1", "2"), NOISE_PX, rng), name=name)
+        for name in "abc"
+    ]
+    true = replace(scene.camera, centre=np.array([scene.camera.width - 1, scene.camera.height - 1]) / 2)
+    shifted = [replace(i, centre_px=i.centre_px + true.centre - scene.camera.centre) for i in images]
+    assert measured_from(shifted, true, known.truth).mistakes == ()
+    found = measured_from(shifted, change(true), known.truth).mistakes
+    assert found == () if said is None else said in found[0].replace("0.5 times", "half")
 
 
 def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_dataset, small_run, stcal_sfm, tmp_path):
@@ -445,3 +459,48 @@ def test_strict_ends_as_failed_where_residuals_are_beyond_their_sigma(small_data
     assert code == 4
     assert "error: --strict: failed: χ² of " in err
     assert (tmp_path / "poses.csv").exists()
+
+
+SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])  # of intrinsics: fx, fy, cx, cy, k1, k2, p1, p2
+
+
+def test_what_is_common_is_less_than_the_whole(scene, known):
+    """Of a pose whose covariance is smaller than the target's part of it, as a curved likelihood may have it."""
+    rng = np.random.default_rng(1)
+    images = [see(scene, view(faces_view(scene, ("1", "2")), 0.2, 900, rng), ("1", "2"), NOISE_PX, rng) for _ in "abc"]
+    poses = [pose_of(image, known.truth, scene.camera) for image in images]
+    poses[1] = replace(poses[1], covariance=0.3 * poses[1].parts["target"] + 1e-3 * poses[1].parts["image"])
+    common = common_errors(poses, known.truth, None)
+    for pose, own in zip(poses, common, strict=True):
+        root = np.linalg.inv(np.linalg.cholesky(pose.covariance))
+        left = np.linalg.eigvalsh(np.eye(6) - root @ own @ own.T @ root.T)
+        assert left[0] > 5e-4
+
+
+@pytest.mark.parametrize(
+    ("with_camera", "draws"), [(True, 4), *(pytest.param(own, 20, marks=pytest.mark.full) for own in (True, False))]
+)
+def test_poses_err_together_as_stated(scene, known, with_camera, draws):
+    """Without noise in the images all errors are common ones: z of each direction, from the errors of all poses, has
+    mean square 1, to 1.4 / √(directions × draws)."""
+    rng = np.random.default_rng(0)
+    faces = [("1", "2"), ("1", "4"), ("1", "5"), ("2", "3")] * 3
+    truths = [view(faces_view(scene, f), np.radians(15), rng.uniform(700, 1200), rng) for f in faces]
+    images = [see(scene, truth, f, 0.0, rng) for truth, f in zip(truths, faces, strict=True)]
+    images = [replace(i, covariance_px2=np.tile(NOISE_PX**2 * np.eye(2), (len(i), 1, 1))) for i in images]
+    prior = CameraPrior(scene.camera.colmap_model, np.diag(SIGMA**2)) if with_camera else None
+    exact = [pose_of(image, known.truth, scene.camera, prior=prior) for image in images]
+    common = common_errors(exact, known.truth, prior)
+    assert 6 <= common.shape[2] <= MOST
+    own = np.linalg.cholesky([pose.covariance for pose in exact])
+    felt = np.linalg.pinv(np.linalg.solve(own, common).reshape(6 * len(images), -1))
+    z = []
+    for _ in range(draws):
+        target, camera = known.measured(rng), scene.camera
+        if with_camera:
+            away = intrinsic_basis(scene.camera.colmap_model) @ (SIGMA * rng.standard_normal(8))
+            camera = camera.with_parameters(camera.parameters() + away)
+        poses = [pose_of(image, target, camera, prior=prior) for image in images]
+        error = [pose_error(p.camera_from_target, t) for p, t in zip(poses, truths, strict=True)]
+        z.append(felt @ np.linalg.solve(own, np.array(error)[:, :, None]).ravel())
+    assert np.mean(np.square(z)) == pytest.approx(1, abs=3 * np.sqrt(2 / np.size(z)))

@@ -9,13 +9,14 @@ from stcal.errors import InputError
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import MeasureOptions, Tracker, measure
 from stcal.sfm.detect.predict import common_shift
-from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.measurement.known_target import TargetCircles
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 from tests.support.film import filmed
 
+pytestmark = pytest.mark.slow
 IMAGES = 6
 OTHER_BAND = 1.0
 """σ by which a pose may move when the bands of the same rims, mostly the same pixels, lie about another start: two fits
@@ -47,13 +48,10 @@ def target(film):
 @pytest.fixture(scope="module")
 def model(film, tmp_path_factory):
     folder = tmp_path_factory.mktemp("film") / "set"
-    write_dataset(folder, film_of(film, IMAGES), RenderOptions(noise=0.01), image_format="png", workers=2)
-    return folder, read_camera(folder / "cameras.txt")
-
-
-def film_of(film, images):
     own = film.groups["12"]
-    return replace(film, groups={"12": replace(own, camera_from_target=own.camera_from_target[:images])})
+    short = replace(film, groups={"12": replace(own, camera_from_target=own.camera_from_target[:IMAGES])})
+    write_dataset(folder, short, RenderOptions(noise=0.01), image_format="png", workers=2)
+    return folder, read_camera(folder / "cameras.txt")
 
 
 def off_sigmas(pose, other):
@@ -63,7 +61,6 @@ def off_sigmas(pose, other):
     return np.abs(np.r_[step[:3], other.camera_from_target.translation - pose.camera_from_target.translation] / sigma)
 
 
-@pytest.mark.slow
 def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
     follower, searcher = (Tracker(target, model[1], film.board) for _ in range(2))
     for i in range(IMAGES):
@@ -78,7 +75,6 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
         assert error @ np.linalg.solve(own.covariance, error) < 28  # χ² of 6, one in 10 000
 
 
-@pytest.mark.slow
 def test_what_jumps_is_searched_and_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     truth = film.groups["12"].camera_from_target
@@ -88,7 +84,6 @@ def test_what_jumps_is_searched_and_found(film, frames, target, model):
         assert np.linalg.norm(pose.camera_from_target.translation - truth[i].translation) < 1
 
 
-@pytest.mark.slow
 def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     seen = tracker.locate(frames[0])
@@ -108,7 +103,6 @@ def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     assert any(note.startswith(f"face {face}: {face}:1 and 9 more should be in view") for note in tracker.notes)
 
 
-@pytest.mark.slow
 def test_an_image_without_the_target_is_an_error_and_the_next_is_searched(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     tracker.locate(frames[0])
@@ -118,7 +112,6 @@ def test_an_image_without_the_target_is_an_error_and_the_next_is_searched(film, 
     assert tracker.searched
 
 
-@pytest.mark.slow
 def test_the_common_shift_is_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     pose = tracker.locate(frames[0])
@@ -130,7 +123,6 @@ def test_the_common_shift_is_found(film, frames, target, model):
     assert not common_shift(np.zeros_like(frames[0]), predicted).any()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "image", [np.zeros((864, 1296, 3), np.uint8), np.zeros((864, 1296)), np.zeros((10, 10), np.uint8)]
 )
@@ -145,7 +137,6 @@ def test_a_target_without_design_is_refused(target, model):
         Tracker(bare, model[1])
 
 
-@pytest.mark.slow
 def test_measure_follows_a_folder(film, target, model):
     folder, camera = model
     together = measure(folder / "images", camera, target, film.target, film.board, MeasureOptions(sequence=True))

@@ -18,8 +18,8 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjusted, unmoved
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
-from stcal.sfm.planning import bodies, session, views
-from stcal.sfm.planning.advise import Known, advise, known_of
+from stcal.sfm.planning import session
+from stcal.sfm.planning.advise import KnownRun, PlannedView, advise, candidates, known_of, known_scene
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
     CONTRAST,
@@ -37,19 +37,16 @@ from stcal.sfm.planning.forecast import (
     variance_shares,
 )
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
-from stcal.sfm.planning.session import plan_with_board as make_plan
-from stcal.sfm.planning.views import PlannedView, candidates, known_scene
+from stcal.sfm.planning.session import plan as make_plan
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
 from tests.outcome import fails_with
 from tests.shared import unsealed_copy
 
-NOISE = CentreNoise(0.1, 3.0)
-"""Of centres: about 0.013 px, so that image and a board of 20 µm matter alike."""
+NOISE = CentreNoise(0.1, 3.0)  # of centres: about 0.013 px, so that image and a board of 20 µm matter alike
 SLOW = pytest.mark.slow
-CHANCE = 1e-4
-"""Of a sound forecast to fall outside the bounds of a χ² test, on either side."""
+CHANCE = 1e-4  # of a sound forecast to fall outside the bounds of a χ² test, on either side
 SMALL = SceneOptions(
     seed=4, width=2592, height=1728, images_per_group=3, groups=(("1", "2"), ("1", "4")), circle_sigma_mm=0.0
 )
@@ -176,14 +173,14 @@ def test_centre_noise_is_found_again(exact):
     assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
 
 
-def known_from(scene: Scene) -> Known:
+def known_from(scene: Scene) -> KnownRun:
     setup, models = setup_of(scene, 0.005), tuple(models_of(scene))
     joint = unmoved(models, setup.board, setup.camera).result(1.0)
-    return Known(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
+    return KnownRun(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
 
 
 @pytest.fixture(scope="module")
-def known(exact) -> Known:
+def known(exact) -> KnownRun:
     return known_from(exact)
 
 
@@ -192,7 +189,7 @@ def advice(known):
     return advise(known, 2)
 
 
-def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
+def after(known: KnownRun, views: list[PlannedView], now: Forecast) -> Forecast:
     models = {model.group: model for model in known.models}
     for view in views:
         models[view.group] = models[view.group].plus(view.model)
@@ -253,7 +250,7 @@ def test_an_advised_view_beats_a_random_one(known, advice):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    monkeypatch.setattr(views, "GRID_DEG", 50.0)
+    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", 50.0)
 
 
 @pytest.mark.slow
@@ -283,7 +280,7 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
 @pytest.mark.parametrize(("grid_deg", "least"), [(25.0, 4), pytest.param(10.0, 20, marks=SLOW)])
 def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch, grid_deg, least):
     """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
-    monkeypatch.setattr(views, "GRID_DEG", grid_deg)
+    monkeypatch.setattr("stcal.sfm.planning.advise.GRID_DEG", grid_deg)
     for model, own in offered(known):
         assert len(own) > least
         for view in own:
@@ -315,7 +312,7 @@ def test_a_plan_takes_a_camera_as_its_file():
     for given in (camera, model_of(camera)):
         assert session._scene(PlanOptions(images=2, camera=given), target, board, None).camera.same_as(camera)
         near = PlanOptions(images=20, distance_mm=300.0, camera=given)
-        assert bodies.planned_photographs(near, cube)[0].camera.same_as(camera)
+        assert session.planned_photographs(near, cube)[0].camera.same_as(camera)
 
 
 def test_advice_holds_the_sigma_of_estimated_rims(small_run):
@@ -435,9 +432,8 @@ def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
         nominal_poses(target, path if faces else None)
 
 
-@pytest.mark.parametrize("size", [(None, None), (2592, None)])
-def test_plan_needs_the_size_of_the_camera(size):
-    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", *size, "f")
+def test_plan_needs_the_size_of_the_camera():
+    camera = CameraModel(np.array([2800.0, 2800.0]), np.array([1296.0, 864.0]), np.zeros(8), "PINHOLE", 2592, None, "f")
     with fails_with("E-CAMERA-SIZE"):
         PlanOptions(camera=camera)
 

@@ -8,7 +8,7 @@ import pytest
 
 from stcal.io.images import chosen_images
 from stcal.sfm.checks.verdict import Check, ranked
-from stcal.sfm.measurement.target import read_target
+from stcal.sfm.measurement.known_target import read_target
 from stcal.sfm.report.judgement import _first
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error, fails_with

@@ -16,7 +16,7 @@ from stcal.io.files import BOARD, CAMERA, DATABASE, TARGET
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.measurement.target import read_target
+from stcal.sfm.measurement.known_target import read_target
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder

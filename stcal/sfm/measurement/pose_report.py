@@ -17,7 +17,7 @@ from stcal.report.document import Answer, Document, Printed, Section, legend, pa
 from stcal.report.document import Table as ShownTable
 from stcal.report.svg import COLOURS, Axes, Drawing, round_below
 from stcal.report.text import number
-from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
+from stcal.sfm.measurement.measure_images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import TargetPose, fit_verdict
 
 
@@ -87,10 +87,8 @@ class PosesFile(ResultFile):
 
 
 IMAGE = "image"
-COMMON_SHARE = 0.5
-"""Share of the variance from which on it is told that poses err in common."""
-MOST_LISTED = 20
-"""Largest number of images for which the terminal has a line each."""
+COMMON_SHARE = 0.5  # share of the variance from which on it is told that poses err in common
+MOST_LISTED = 20  # largest number of images for which the terminal has a line each
 
 
 @require_arguments
@@ -119,30 +117,27 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
     """
     header = [IMAGE, "faces", "circles", "status", *POSE, *COVARIANCE, "rms_px", "chi2_per_dof"]
     common = common_columns(result.common.shape[2])
-    where, joint_columns, rows = "", [], None
-    if joints is not None:
-        where, (joint_columns, rows) = joints.where, _joint_cells(joints, header + common)
-    table: list[Sequence] = [header + joint_columns + common]
+    further, joined = ([], {}) if joints is None else _joint_cells(joints, header + common)
+    table: list[Sequence] = [header + further + common]
     unmatched = []
     for image, common_error in zip(result.images, result.common, strict=True):
-        if rows is not None and image.name not in rows:
-            unmatched.append(f"{image.name}: measured, but not in {where}")
+        if joints is not None and image.name not in joined:
+            unmatched.append(f"{image.name}: measured, but not in {joints.where}")
             continue
         pose = image.pose
         table.append(
             [image.name, "+".join(pose.faces), len(pose.labels), pose.status]
             + pose_cells(pose.camera_from_target, pose.covariance)
-            + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_redundancy():.4f}"]
-            + (rows[image.name] if rows is not None else [])
+            + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_redundancy():.4f}", *joined.get(image.name, ())]
             + [f"{v:.7g}" for v in common_error.T.ravel()]
         )
-    if rows is not None:
+    if joints is not None:
         names = {image.name for image in result.images}
-        unmatched += [f"{name}: in {where}, but without a pose" for name in rows if name not in names]
-        if len(rows.keys() & names) == 0:
+        unmatched += [f"{name}: in {joints.where}, but without a pose" for name in joined if name not in names]
+        if not joined.keys() & names:
             raise InputError(
                 "E-IMAGES-UNMATCHED",
-                f"{where}: none of its images was measured; names are like {result.images[0].name}",
+                f"{joints.where}: none of its images was measured; names are like {result.images[0].name}",
             )
     return csv_text(table), tuple(unmatched)
 
@@ -177,42 +172,31 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
 
 
 def poses_file(result: MeasureResult) -> PosesFile:
-    """Returns the content of ``--json``."""
-    return PosesFile.model_validate(
-        {
-            "format": "stcal poses 1",
-            "unit": "mm",
-            "sigma_factor": result.sigma_factor,
-            "intrinsics_held": result.intrinsics_held,
-            "notes": list(result.notes),
-            "images": [_image_pose(image) for image in result.images],
-            "left_out": result.left_out,
-        }
+    return PosesFile(
+        format="stcal poses 1",
+        unit="mm",
+        sigma_factor=result.sigma_factor,
+        intrinsics_held=result.intrinsics_held,
+        notes=list(result.notes),
+        images=[_image_pose(image.pose, image=image.name, notes=image.notes) for image in result.images],
+        left_out=[NamedReason.model_validate(each) for each in result.left_out],
     )
 
 
-def _image_pose(each: MeasuredImage) -> dict:
-    pose = each.pose
+def _image_pose(pose: TargetPose, **named) -> ImagePose:
     circles = zip(pose.labels, pose.residuals_px, pose.weights.tolist(), strict=True)
-    return {
-        "image": each.name,
-        "faces": list(pose.faces),
-        "status": pose.status,
-        "camera_from_target": pose.camera_from_target,
-        "covariance": pose.covariance,
+    named |= {
         "covariance_parts": pose.parts,
         "alternative": pose.second,
-        "delta_chi2": pose.delta_chi2,
         "delta_chi2_needed": pose.needed_chi2,
         "rms_px": pose.rms_px(),
-        "chi2": pose.chi2,
         "dof": pose.redundancy,
         "p_value": pose.p_value(),
         "fit": fit_verdict(pose),
-        "circles": [{"label": label, "residual_px": px, "weight": weight} for label, px, weight in circles],
-        "outliers": pose.outliers,
-        "notes": each.notes,
+        "circles": [CircleRow(label=label, residual_px=px, weight=weight) for label, px, weight in circles],
     }
+    alike = {name: getattr(pose, name) for name in ImagePose.model_fields.keys() - named}
+    return ImagePose.model_validate({name: (named | alike)[name] for name in ImagePose.model_fields})
 
 
 def summary(result: MeasureResult) -> list[str]:
@@ -246,105 +230,82 @@ def summary(result: MeasureResult) -> list[str]:
         )
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     if failed:
+        remedy = result.remedy("check that camera file, faces.json and images belong together")
         lines.append(
             f"χ² failed in {len(failed)} images, first {failed[0]}: residuals beyond their σ by chance in one image of "
-            "100 000; check that camera file, faces.json and images belong together"
+            f"100 000; {remedy}"
         )
     return [*lines, *result.notes]
 
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
-ELLIPSE_SHARE = 0.06
-"""Length with which the largest σ is drawn, as a share of the plot's width."""
+ELLIPSE_SHARE = 0.06  # length with which the largest σ is drawn, as a share of the plot's width
 HEADS = ("<image", "<faces", "circles", "<status", "x mm", "y", "z", "σ µm", "σ mdeg", "RMS px", "χ²/dof", "<fit")
 
 
 def measure_report(result: MeasureResult, where: str, every: bool = False) -> Document:
-    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images, not only for
-    those that need a look."""
-    at = np.array([image.pose.camera_from_target.translation for image in result.images])
-    largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in result.images))
+    """Returns the report of ``measure``; ``every`` : whether its text has a line for each of many images."""
+    images, left_out = result.images, [[each.name, each.reason] for each in result.left_out]
+    at = np.array([image.pose.camera_from_target.translation for image in images])
+    largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in images))
     times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
-    statuses = {image.pose.status for image in result.images}
-    colours = legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {})
+    statuses = {image.pose.status for image in images}
     counts, *remarks = summary(result)
-    every = every or len(result.images) <= MOST_LISTED
-    listed = result.images if every else [image for image in result.images if not _is_sound(image.pose)][:MOST_LISTED]
-    figures = (
-        [] if every else ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), _figures(result)).lines()
-    )
+    every = every or len(images) <= MOST_LISTED
+    doubtful = [image for image in images if not _is_sound(image.pose)]
+    listed = images if every else doubtful[:MOST_LISTED]
+    figures = ShownTable((f"<{len(at)} poses", "median", "worst", "<in image"), _figures(images)).lines()
     rest = f"{len(listed)} of them need a look; the table that is written has all, and --verbose prints them"
     outliers = [
         [image.name, outlier.label, number(outlier.residual_px, 3), number(outlier.limit_px, 3)]
-        for image in result.images
+        for image in images
         for outlier in image.pose.outliers
     ]
     views = [
         plot(partial(_view, result, at, 0, j, times), f"path of the target {seen}", seen.capitalize(), "")
         for j, seen in ((1, "as the camera sees it"), (2, "from above, the camera below"))
     ]
+    poses = [
+        *remarks,
+        Printed([] if every else [*figures, rest]),
+        Printed(ShownTable(HEADS, [_row(image) for image in listed]).lines() if listed else []),
+        page_only(
+            "σ: the largest of the three axes, of position and of rotation",
+            ShownTable(HEADS, [_row(image) for image in images]),
+        ),
+    ]
+    path = [
+        f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
+        "Lines join the images of a folder by name",
+        legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {}),
+        plots(*views),
+    ]
+    out = [
+        ShownTable(["<image or file", "<reason"], left_out, css="text"),
+        f"{len(outliers)} circles contradict the others of their image" if outliers else "",
+        ShownTable(["<image", "<circle", "residual px", "limit px"], outliers),
+    ]
+    count, sound = len(images), len(images) - len(doubtful)
+    asked = count + sum(each.gate == "pose" for each in result.left_out)
+    usable = "yes" if sound == asked else "part" if sound else "no"
     return Document(
         "Poses of the target",
         f"{where}: {counts}",
         [
-            Section(
-                "Poses",
-                [
-                    *remarks,
-                    Printed(figures),
-                    Printed([] if every else [rest]),
-                    Printed(ShownTable(HEADS, [_row(image) for image in listed]).lines() if listed else []),
-                    page_only(
-                        "σ: the largest of the three axes, of position and of rotation",
-                        ShownTable(HEADS, [_row(image) for image in result.images]),
-                    ),
-                ],
-                terminal=True,
-            ),
-            Section(
-                "Path in the camera frame",
-                [
-                    f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
-                    "Lines join the images of a folder by name",
-                    colours,
-                    plots(*views),
-                ],
-            ),
-            Section(
-                "Left out",
-                [
-                    ShownTable(
-                        ["<image or file", "<reason"], [[e.name, e.reason] for e in result.left_out], css="text"
-                    ),
-                    f"{len(outliers)} circles contradict the others of their image" if outliers else "",
-                    ShownTable(["<image", "<circle", "residual px", "limit px"], outliers),
-                ],
-                terminal=True,
-            ),
+            Section("Poses", poses, terminal=True),
+            Section("Path in the camera frame", path),
+            Section("Left out", out, terminal=True),
         ],
-        [_verdict(result)],
+        [Answer(usable, f"{sound} of {asked} images give a certain pose that fits")],
     )
 
 
-def _verdict(result: MeasureResult) -> Answer:
-    """Returns which poses may be used: those that are certain, and fit."""
-    count, sound = len(result.images), sum(map(_is_sound, (image.pose for image in result.images)))
-    without = sum(each.gate == "pose" for each in result.left_out)
-    what = f"{sound} of {count + without} images give a certain pose that fits"
-    return Answer("yes" if sound == count + without else "part" if sound else "no", what)
-
-
-def _figures(result: MeasureResult) -> list[list[str]]:
-    """Returns rows with the median and the worst figure of all images."""
-    sigma = np.array([_largest_sigma(image.pose) for image in result.images])
-    columns = {
-        "σ position µm": sigma[:, 0],
-        "σ rotation mdeg": sigma[:, 1],
-        "residuals RMS px": np.array([image.pose.rms_px() for image in result.images]),
-    }
+def _figures(images: Sequence[MeasuredImage]) -> list[list[str]]:
+    values = np.array([(*_largest_sigma(image.pose), image.pose.rms_px()) for image in images]).T
+    names = "σ position µm", "σ rotation mdeg", "residuals RMS px"
     return [
-        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", result.images[int(v.argmax())].name]
-        for what, v in columns.items()
+        [what, f"{np.median(v):.4g}", f"{v.max():.4g}", images[int(v.argmax())].name]
+        for what, v in zip(names, values, strict=True)
     ]
 
 
@@ -355,7 +316,6 @@ def _largest_sigma(pose: TargetPose) -> tuple[float, float]:
 
 
 def _is_sound(pose: TargetPose) -> bool:
-    """Returns True if a pose is certain, fits, and has no outlier."""
     return pose.status == "certain" and fit_verdict(pose) == "passed" and not pose.outliers
 
 

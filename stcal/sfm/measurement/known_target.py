@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stcal.boards.target_file import load_target
 from stcal.design import FaceDesign, TargetDesign
@@ -19,9 +20,7 @@ from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 
-SAME_DESIGN_MM = 0.5
-"""Largest RMS deviation of a face's circles from the design. Faces are made to a tenth of that; another design is off
-by far more."""
+SAME_DESIGN_MM = 0.5  # largest RMS deviation of a face from the design; another design is off by far more
 SAME_RADIUS_MM = 1e-6
 
 
@@ -146,35 +145,26 @@ def _covariance(
     labels, joint: np.ndarray | None, single: Mapping[Any, np.ndarray]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
     """Returns the most complete covariance (3c, 3c) available, and notes on missing parts."""
-    notes: tuple[str, ...] = ()
-    if joint is None:
-        joint = np.zeros((3 * len(labels), 3 * len(labels)))
-        for i, label in enumerate(labels if single else ()):
-            joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = single[label]
-        missing = "covariances between circles" if single else "covariances of its circles"
-        notes = (f"the target states no {missing}: they are taken as zero in the poses' covariances",)
-    return joint, notes
+    if joint is not None:
+        return joint, ()
+    parts = [single[label] if single else np.zeros((3, 3)) for label in labels]
+    missing = "covariances between circles" if single else "covariances of its circles"
+    note = f"the target states no {missing}: they are taken as zero in the poses' covariances"
+    return np.asarray(block_diag(*parts)), (note,)
 
 
 def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> None:
-    radius, where = design.radius_of(), f"faces {path}"
+    radius, faults = design.radius_of(), []
     for label, own in zip(target.labels, target.radius, strict=True):
         if label not in radius:
-            raise InputError(
-                "E-FACES-DESIGN", f"{where}: circle {label} is not in target {design.name}; give its own --target"
-            )
-        if abs(own - radius[label]) > SAME_RADIUS_MM:
-            raise InputError(
-                "E-FACES-DESIGN",
-                f"{where}: circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}; give "
-                "the target.toml of that run",
-            )
-    for face in design.faces:
+            faults.append(f"circle {label} is not in target {design.name}")
+        elif abs(own - radius[label]) > SAME_RADIUS_MM:
+            faults.append(f"circle {label} has radius {own:g} mm, {radius[label]:g} mm in target {design.name}")
+    for face in () if faults else design.faces:
         xyz, flat = target.of_face(face)
         off_mm = 0.0 if len(xyz) < 3 else np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean())
         if off_mm > SAME_DESIGN_MM:
-            raise InputError(
-                "E-FACES-DESIGN",
-                f"{where}: face {face.id} is {off_mm:.3g} mm RMS off that of target {design.name}, "
-                f"{SAME_DESIGN_MM:g} mm allowed; give the target.toml of that run",
-            )
+            allowed = f"{SAME_DESIGN_MM:g} mm allowed"
+            faults.append(f"face {face.id} is {off_mm:.3g} mm RMS off that of target {design.name}, {allowed}")
+    if faults:
+        raise InputError("E-FACES-DESIGN", f"faces {path}: {faults[0]}; give the target.toml of that run as --target")

@@ -1,4 +1,4 @@
-"""Result files and text of plans and advice."""
+"""Plans and advice as result files and as text."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,15 +11,13 @@ from stcal.design import faces_of_known_shape
 from stcal.io.json import ByFace, Part, Pose, ResultFile
 from stcal.report.text import join, number, text_table
 from stcal.sfm.planning.advise import Advice, NewGroup
-from stcal.sfm.planning.forecast import Forecast
+from stcal.sfm.planning.forecast import Forecast, worst_of
 from stcal.sfm.planning.session import Plan, Remedy
 
 MICRO = 1e3
 PPM = 1e6
-LEAST_SHARE = 0.005
-"""Least share of a variance that is printed."""
-USUAL_FOCAL_MM = 24.0
-"""Focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide."""
+LEAST_SHARE = 0.005  # least share of a variance that is printed
+USUAL_FOCAL_MM = 24.0  # focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,37 +46,24 @@ class ForecastPart(Part):
 
     @classmethod
     def of(cls, forecast: Forecast, shares: dict[str, dict[str, float]]) -> "ForecastPart":
-        """Returns the faces, the worst face and the scale of a forecast."""
-        faces = {}
+        faces, position_mm = {}, forecast.position_sigma_mm()
         for face, covariance in forecast.face_covariance.items():
             sigma = MICRO * np.sqrt(np.diag(covariance))
-            circles = {label: own for label, own in forecast.circle_sigma_mm.items() if label.face == face}
-            worst = max(circles, key=circles.__getitem__)
-            faces[face] = FaceForecast(
-                sigma[3:].tolist(),
-                np.degrees(sigma[:3]).tolist(),
-                MICRO * forecast.position_sigma_mm()[face],
-                worst,
-                MICRO * circles[worst],
-                shares[face],
-            )
-        name, sigma_mm = forecast.worst()
+            worst, circle_mm = worst_of({c: own for c, own in forecast.circle_sigma_mm.items() if c.face == face})
+            rows = sigma[3:].tolist(), np.degrees(sigma[:3]).tolist(), MICRO * position_mm[face]
+            faces[face] = FaceForecast(*rows, worst, MICRO * circle_mm, shares[face])
+        name, sigma_mm = worst_of(position_mm)
         scale_ppm = PPM * forecast.scale_sigma
         return cls(worst_face=name, worst_sigma_um=MICRO * sigma_mm, scale_sigma_ppm=scale_ppm, faces=faces)
 
     def table(self) -> list[str]:
-        """Returns the lines of a table with one row for each face."""
         rows = [["<face", "σ x, µm", "y", "z", "all", "σ about x, mdeg", "y", "z", "<worst point", "µm", "<variance"]]
         for face, row in self.faces.items():
             shares = sorted(row.variance_shares.items(), key=lambda item: -item[1])
-            told = join(
-                f"{source.removeprefix('image ')} {100 * share:.0f} %"
-                for source, share in shares
-                if share > LEAST_SHARE
-            )
+            said = [f"{name.removeprefix('image ')} {100 * own:.0f} %" for name, own in shares if own > LEAST_SHARE]
             sigma = [*row.translation_sigma_um, row.position_sigma_um, *row.rotation_sigma_mdeg]
             worst = [row.worst_circle, number(row.worst_circle_sigma_um, 2)]
-            rows.append([face, *(number(s, 2) for s in sigma), *worst, told])
+            rows.append([face, *(number(s, 2) for s in sigma), *worst, join(said)])
         return text_table(rows)
 
 
@@ -110,7 +95,6 @@ class PlanFile(ResultFile):
 
     @classmethod
     def of_plan(cls, plan: Plan) -> "PlanFile":
-        """Returns the file of a plan."""
         return cls(
             format="stcal plan 1",
             images_per_group=plan.options.images,
@@ -173,7 +157,6 @@ class AdviceFile(ResultFile):
 
     @classmethod
     def of_advice(cls, advice: Advice) -> "AdviceFile":
-        """Returns the file of an advice."""
         return cls(
             format="stcal advice 1",
             now=ForecastPart.of(advice.now, advice.shares),
@@ -221,7 +204,6 @@ def plan_text(plan: Plan, noise: str) -> str:
 
 
 def _photographs_said(plan: Plan) -> str:
-    """Returns what is photographed, and what tells its size."""
     options, camera, board = plan.options, plan.setup.camera, plan.setup.board
     size = f"{camera.width}×{camera.height} px, {options.distance_mm:g} mm away"
     if not board.rows:
@@ -266,10 +248,10 @@ def advice_text(advice: Advice) -> str:
         lines.append("none: no other view within ±50° shows the whole board and a face")
     lines.append(HOW_TO_GO if advice.has_board else HOW_TO_TURN)
     ways = [(better_um, "a board of half the σ" if advice.has_board else "print and size of half the σ")]
-    if advice.choices:
-        count = len(advice.choices)
-        words = f"the {count} views together" if count > 1 else "the one view"
-        ways.append((MICRO * advice.choices[-1].sigma_mm, words))
+    if count := len(advice.choices):
+        ways.append(
+            (MICRO * advice.choices[-1].sigma_mm, f"the {count} views together" if count > 1 else "the one view")
+        )
     for pair in advice.new_groups:
         words = f"{pair.images} images of faces {join(pair.faces)} with the board next to them, a new group"
         ways.append((MICRO * pair.sigma_mm, words))
@@ -278,7 +260,6 @@ def advice_text(advice: Advice) -> str:
 
 
 def _views(advice: Advice) -> Iterator[list[str]]:
-    """Yields the rows of further views: where to go, what is then seen, and the worst face before and after."""
     face, sigma = advice.now.worst()
     for choice in advice.choices:
         view = choice.view
