@@ -12,7 +12,7 @@ from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit, robust_sigma
 from stcal.io.cameras.model import CameraPrior
-from stcal.labels import CircleLabel, Label
+from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.verdict import (
@@ -27,6 +27,7 @@ from stcal.sfm.checks.verdict import (
     culprits_by_score,
     impossible,
     judge,
+    on_face,
     without_image,
 )
 from stcal.sfm.data.model import ImageObservations, Outlier
@@ -245,16 +246,16 @@ def moved_check(networks: Sequence[Network]) -> Check:
     tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in networks:
         model = network.model
-        on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
-        if on_face.all() or not on_face.any():
+        of_faces = on_face(model)
+        if of_faces.all() or not of_faces.any():
             continue
-        columns = _motion(network, on_face)
+        columns = by_motion(network, model.xyz_model[of_faces].mean(0))
         normal, right = network.score_by_image(columns)
         redundancy = float(network.redundancy.sum())
         square = float((network.residual**2).sum())
         tested = []
         for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
-            faces = on_face[model.point_index[rows]].sum()
+            faces = of_faces[model.point_index[rows]].sum()
             if min(faces, len(rows) - faces) < MIN_CIRCLES:
                 continue
             test = solve_score(normal[i], right[i])
@@ -285,12 +286,23 @@ def moved_check(networks: Sequence[Network]) -> Check:
     return with_culprits(check, guilt, remedy, causes)
 
 
-def _motion(network: Network, on_face: np.ndarray) -> np.ndarray:
-    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together, of points (p,) ``on_face``."""
+def by_motion(network: Network, centre: np.ndarray) -> np.ndarray:
+    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together about a ``centre`` (3,)."""
     model = network.model
-    arm = model.xyz_model[model.point_index] - model.xyz_model[on_face].mean(0)
+    arm = model.xyz_model[model.point_index] - centre
     motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-    return network.by_point @ (motion * on_face[model.point_index][:, None, None])
+    return network.by_point @ (motion * on_face(model)[model.point_index][:, None, None])
+
+
+NO_ELLIPSES = (
+    "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
+    "values or of contours need another correction"
+)
+
+
+def by_eccentricity(network: Network) -> np.ndarray:
+    """Returns the derivatives (n, 2, 1) over σ by a factor on the eccentricity."""
+    return network.model.whiten(network.model.shift_px[:, :, None])
 
 
 def with_culprits(check: Check, guilt: Sequence[Guilt], remedy: str, causes: str) -> Check:

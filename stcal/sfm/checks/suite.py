@@ -37,6 +37,8 @@ from stcal.sfm.checks.board import (
 from stcal.sfm.checks.causes import whole_set_cause
 from stcal.sfm.checks.faces import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
 from stcal.sfm.checks.images import (
+    NO_ELLIPSES,
+    by_eccentricity,
     camera_check,
     evenness_check,
     field_check,
@@ -203,29 +205,19 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
         return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
-    test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
+    test = solve_score(*summed(networks, by_eccentricity))
     if not test.freedom:
         return impossible(key, CONTROL, "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy = sum(n.redundancy.sum() for n in networks)
-    remedy = (
-        "the measured centres do not move as those of ellipses: check radii, polarity and exposure; centroids of grey "
-        "values or of contours need another correction"
-    )
-    trial = Trial(
-        "share of the eccentricity found, minus 1",
-        float(test.estimate[0]),
-        "",
-        test.statistic,
-        test.freedom,
-        redundancy,
-    )
-    check = judge(key, CONTROL, [trial], "corrections", remedy)
+    share = float(test.estimate[0])
+    trial = Trial("share of the eccentricity found, minus 1", share, "", test.statistic, test.freedom, redundancy)
+    check = judge(key, CONTROL, [trial], "corrections", NO_ELLIPSES)
     try:
         whole = evidence.calibration.target.target_from_face
         message, measured = _control(evidence) if whole else ("no face that it could move", ())
     except StcalError as error:
         message, measured = f"no uncorrected result ({error})", ()
-    reason = f"{1 + test.estimate[0]:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {message}"
+    reason = f"{1 + share:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {message}"
     return replace(check, reason=reason, measured=check.measured + measured)
 
 

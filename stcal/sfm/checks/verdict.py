@@ -21,7 +21,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import WorldModel
+from stcal.sfm.data.model import GroupModel, WorldModel
 from stcal.sfm.report.judgement import CAUSE, not_first
 from stcal.sfm.report.sections import ORDER
 
@@ -282,13 +282,23 @@ def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None
     return Guilt(where, tuple(names[i] for i in out))
 
 
+def on_face(model: GroupModel) -> np.ndarray:
+    """Returns which points of a model are those of faces, (p,)."""
+    return np.array([isinstance(label, CircleLabel) for label in model.labels])
+
+
+def apart(network: Network, columns: np.ndarray) -> np.ndarray:
+    """Returns columns (n, 2, q) of parameters with separate ones for each image, (n, 2, mq)."""
+    n, _, q = columns.shape
+    by_image = np.zeros((n, 2, len(network.model.images), q))
+    by_image[np.arange(n), :, network.model.image_index] = columns
+    return by_image.reshape(n, 2, -1)
+
+
 def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[int], count: int, where: str) -> Guilt:
     """Returns the images that further parameters, ``columns`` (n, 2, q) over σ, cure, of ``count`` values tested."""
-    n, _, q = columns.shape
-    images, place = len(network.model.images), network.model.image_index
-    apart = np.zeros((n, 2, images, q))
-    apart[np.arange(n), :, place] = columns
-    normal, right = network.score(apart.reshape(n, 2, images * q))
+    q = columns.shape[2]
+    normal, right = network.score(apart(network, columns))
     redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
 
     def of(out: Collection[int]) -> np.ndarray:
@@ -322,12 +332,12 @@ def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[
 def moved_apart(model: WorldModel, camera: Camera, target: TargetDesign, board: BoardDesign) -> bool:
     """Whether contradicting observations of a group agree if faces and board are taken by themselves: then the camera
     is right, and target and board moved relative to each other."""
-    on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])[model.point_index]
+    of_faces = on_face(model)[model.point_index]
     try:
         radius = {**target.radius_of(), **board.radius_of()}
         shift = eccentricity_px(model, camera, radius, find_scale(model, board).mm_per_unit)
         corrected = replace(model, shift_px=shift)
-        parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (on_face, ~on_face)]
+        parts = [free_network(adjust(corrected.without(drop), camera), camera) for drop in (of_faces, ~of_faces)]
     except (StcalError, ValueError, np.linalg.LinAlgError):
         return False
     return all(n.redundancy.sum() > MIN_REDUNDANCY and n.noise() < MOST_SIGMAS**2 for n in parts)
