@@ -1,6 +1,5 @@
 from .budget.page import uncertainty_budget as uncertainty_budget
 from .camera.calibrate import calibrate_camera as calibrate_camera
-from .checks.verdict import Check as Check
 from .checks.verdict import Trial as Trial
 from .checks.verdict import judge as judge
 from .detect.labels import Detection as Detection
@@ -25,6 +24,7 @@ from .planning.advise import noise_of_run as noise_of_run
 from .planning.bodies import plan as plan
 from .planning.forecast import CentreNoise as CentreNoise
 from .planning.session import PlanOptions as PlanOptions
+from .report.check import Check as Check
 from .report.compare import compare as compare
 from .report.compare import compare_poses as compare_poses
 from .runs.crosscheck import Tolerances as Tolerances

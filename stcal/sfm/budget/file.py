@@ -15,7 +15,7 @@ from stcal.report.text import join
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row, View
 from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
-from stcal.sfm.report.judgement import invalidated
+from stcal.sfm.report.check import invalidated
 from stcal.sfm.runs.saved import SavedRun, Verified
 
 MICRO = 1e3

@@ -15,8 +15,9 @@ from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
-from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.verdict import Trial, assess
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, Measured, impossible
 
 EDGE_BIAS_PX = 0.05
 """σ of the bias that light, lens and threshold add to all radii alike; it moves no centre."""
@@ -117,8 +118,8 @@ def radius_checks(radii: Radii) -> list[Check]:
         "both files are of this body, measure a circle, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
-        judge("radius", "Radius of each circle against others of its design radius", single, "circles", single_remedy),
-        judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
+        assess("radius", single, "circles", single_remedy),
+        assess("radius-design", whole, "kinds of circle", class_remedy),
     ]
 
 
@@ -140,12 +141,11 @@ def rim_check(
     has_circles: bool = True,
 ) -> Check:
     """Tests whether circles lie behind a rim, from the change of their radii with tilt."""
-    key, title = "rim", "Rim in front of the circles"
     if not has_circles:
-        return impossible(key, title, "corners alone, which have no rim", "")
+        return impossible("rim", "corners alone, which have no rim", "")
     if not rims:
-        return impossible(key, title, "too few different tilts of circles", "photograph faces from several angles")
-    measured, names, reasons, settled = [], [], [], []
+        return impossible("rim", "too few different tilts of circles", "photograph faces from several angles")
+    measured, names, reasons, settled, title = [], [], [], [], CHECKS["rim"][0]
     for kind, rim in rims.items():
         limit = rim_limit_mm(rim, sigma_mm)
         allowed = allowed_mm.get(kind, 0.0)
@@ -163,12 +163,12 @@ def rim_check(
     if not names:
         deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
         flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
-        return Check(key, title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
+        return Check("rim", title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
     remedy = (
         "faces are where their circles appear; for the luminous surface, run without --no-rim, or state rim_mm in "
         "target.toml, of dots in board.toml"
     )
-    return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
+    return Check("rim", title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
 
 
 def size_by_radii(radii: Radii) -> Size | None:
@@ -192,7 +192,6 @@ def size_by_radii(radii: Radii) -> Size | None:
 DESIGN_SCALE = 1e-4
 """Relative σ of the target's size against its design: the effect of 4 K on aluminium, or of a printer on a film."""
 MIN_DOTS = 4
-PITCH = "Scale of the board against the target's design"
 
 
 def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]:
@@ -212,10 +211,9 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
         lines += _lines(name, gap, weight, cells, board, max(1.0, square / freedom), redundancy)
     remedy = "a bent, swollen or badly printed board, or a stated σ too small: measure it, state its σ in board.toml"
     of_line = "check this line of the board for damage, and rows, columns and pitch in board.toml"
-    scale = "Scale of each row and column of the board against the rest"
     return [
-        judge("board", "Board against its stated σ", whole, "groups", remedy),
-        judge("board-lines", scale, lines, "rows and columns", of_line),
+        assess("board", whole, "groups", remedy),
+        assess("board-lines", lines, "rows and columns", of_line),
     ]
 
 
@@ -263,13 +261,13 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     """Tests the measured size of the target, by positions and by radii of circles, against its design, with its own σ
     of 100 ppm: no residual shows a wrong pitch. Radii that contradict the positions are left out."""
     if target.up_to_scale:
-        return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
+        return impossible("pitch", "the drawing defines the size", "state a known distance with scale")
     positions, of_radii = _size_by_positions(calibrated, target), size_by_radii(radii)
     measures = [m for m in (positions, of_radii) if m is not None]
     if not measures:
         reason = f"no face with {MIN_DOTS} circles, and no circles of two sizes"
         has_circles = any(face.printed is None for face in target.faces)
-        return impossible("pitch", PITCH, reason, "add views of the faces" if has_circles else "")
+        return impossible("pitch", reason, "add views of the faces" if has_circles else "")
     shown = measures
     if positions and of_radii and _contradict(positions, of_radii):
         measures = [positions]
@@ -287,7 +285,7 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     trial = Trial(
         "board pitch" if has_board else "size of the circles' faces", 1e6 * size, "ppm", size**2 / variance, 1, freedom
     )
-    check = judge("pitch", PITCH, [trial], "boards", remedy)
+    check = assess("pitch", [trial], "boards", remedy)
     single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
     reason = check.reason if measures == shown else f"{check.reason}; by positions alone, which radii contradict"
     return replace(check, reason=reason, measured=check.measured + single)

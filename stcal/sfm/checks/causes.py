@@ -18,9 +18,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.images import NO_ELLIPSES, by_eccentricity, by_motion
-from stcal.sfm.checks.verdict import FAILED, MOVED, MOVED_REMEDY, SUSPICIOUS, Check, Measured, apart
+from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, apart
 from stcal.sfm.data.as_drawn import FAR_DEG, turned_faces
-from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+from stcal.sfm.report.check import CAUSE, FAILED, OF_WHOLE_SET, SUSPICIOUS, Check, Measured
 
 EXPLAINS = 0.8
 """Smallest share of what the best hypothesis explains that another one with fewer parameters must explain."""

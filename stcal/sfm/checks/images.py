@@ -1,5 +1,6 @@
 """Checks of images, labels, single observations and camera from the residuals of the free networks."""
 
+import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -16,21 +17,18 @@ from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.verdict import (
+    FREE,
     MOST_SIGMAS,
     SHOWN,
-    SUSPICIOUS,
-    Check,
     Guilt,
-    Measured,
     Trial,
+    assess,
     culprits,
     culprits_by_score,
-    impossible,
-    judge,
     on_face,
-    without_image,
 )
 from stcal.sfm.data.model import ImageObservations, Outlier
+from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, Measured, impossible
 
 MIN_CIRCLES = 3
 """Smallest number of circles of the faces, and of the board, in an image that can show motion between both."""
@@ -56,10 +54,9 @@ def camera_check(
 ) -> Check:
     """Tests whether the intrinsics are those of the images: in the residuals of all free networks (score test) if they
     are as given, by their distance from the given ones if they were refined."""
-    key, title = "camera", "Intrinsics against the images"
     if not given:
         reason = "no camera file, or a rough one as from EXIF: the intrinsics were found from these photographs"
-        return impossible(key, title, reason, "")
+        return impossible("camera", reason, "")
     remedy = (
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
         "--refine-camera, or calibrate the camera again"
@@ -78,7 +75,7 @@ def camera_check(
         test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
         estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(richest)
     rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
-    check = judge(key, title, [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
+    check = assess("camera", [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
         Measured(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
         for name, value, s in zip(names, estimate, sigma, strict=True)
@@ -119,7 +116,6 @@ def tested(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
 
 def field_check(networks: Sequence[Network], camera: Camera) -> Check:
     """Tests for a residual field that is the same in all images, cubics in x and y that no intrinsics explain."""
-    key, title = "residual-field", "Residuals over the image"
 
     def columns(network: Network) -> np.ndarray:
         size = np.array([camera.width, camera.height])
@@ -140,22 +136,21 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
         "a distortion that the camera model cannot follow, or wrong intrinsics: calibrate with a richer model "
         "(FULL_OPENCV), and keep focus and aperture as they were then"
     )
-    return judge(key, title, [trial], "residual fields", remedy)
+    return assess("residual-field", [trial], "residual fields", remedy)
 
 
 def sigma_check(networks: Sequence[Network], factor: float) -> Check:
     """Tests σ₀ of the images alone; the σ of the result include it, so that only a large factor is a fault."""
-    key, title = "centres", "Residuals against the centres' own σ"
     low, high = SIGMA_LIMITS
     verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
     redundancy = sum(n.redundancy.sum() for n in networks)
     if redundancy < 1:
-        return impossible(key, title, "free poses and points explain the images, whatever they show", "add images")
+        return impossible("centres", FREE, "add images")
     reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
     remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
     measured = (Measured("all images", factor, low, "×", None),)
     names = () if verdict == "passed" else ("all images",)
-    return Check(key, title, verdict, reason, measured, 1, names, remedy if names else "")
+    return Check("centres", CHECKS["centres"][0], verdict, reason, measured, 1, names, remedy if names else "")
 
 
 def image_check(networks: Sequence[Network]) -> Check:
@@ -177,7 +172,7 @@ def image_check(networks: Sequence[Network]) -> Check:
     for name, ratio, own, others in found:
         freedom = max(round(own / fewer), 1)
         trials.append(Trial(name, float(np.sqrt(ratio)), "×", ratio * freedom, freedom, others / fewer))
-    check = judge("image-residuals", "Residuals of each image against its group", trials, "images", "")
+    check = assess("image-residuals", trials, "images", "")
     remedy = "a blurred image, or one in which something had moved: look at its overlay, leave it out, and run again"
     return _take_out(check, remedy)
 
@@ -195,7 +190,7 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
         blur |= {name: float(value - np.median(list(log_blur.values()))) for name, value in log_blur.items()}
     remedy = "blurred, out of focus or dark: take the image again; its centres have little weight and do no harm"
     trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
-    return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
+    return assess("sharpness", trials, "values", remedy, "suspicious")
 
 
 def evenness_check(
@@ -203,9 +198,8 @@ def evenness_check(
 ) -> Check:
     """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe. Their
     centres would be off alike in all views; a value is the error that the wider model avoids, µm at the circle."""
-    key, title = "evenness", "Brightness within the circles"
     if not round_:
-        return impossible(key, title, "corners alone, which have no rim", "")
+        return impossible("evenness", "corners alone, which have no rim", "")
     uneven = {image.name: image.uneven_px for image in images}
     shifts_of_label: dict[str, list[float]] = {}
     for network in networks:
@@ -223,7 +217,7 @@ def evenness_check(
         "one side of these circles is darker or brighter, in most views: clean them, shade them from glare, check "
         "their light; their centres are measured by a wider model, with a larger σ"
     )
-    return judge(key, title, trials, "circles", remedy, "suspicious")
+    return assess("evenness", trials, "circles", remedy, "suspicious")
 
 
 def _dull(values: dict[str, float], unit: str) -> list[Trial]:
@@ -270,7 +264,7 @@ def moved_check(networks: Sequence[Network]) -> Check:
                 trials.append(Trial(name, shift_um, "µm", statistic, test.freedom, redundancy - test.freedom))
                 tested.append(i)
         tested_by_group[model.group] = network, columns, tested
-    check = judge("moved", "Target against board, image by image", trials, "images", "")
+    check = assess("moved", trials, "images", "")
     if not check.names or len(check.names) > max(NEARLY_ALL * check.tested, 1):
         return _take_out(check, "")
     guilt = [
@@ -303,6 +297,11 @@ NO_ELLIPSES = (
 def by_eccentricity(network: Network) -> np.ndarray:
     """Returns the derivatives (n, 2, 1) over σ by a factor on the eccentricity."""
     return network.model.whiten(network.model.shift_px[:, :, None])
+
+
+def without_image(name: str) -> str:
+    """Returns the option that excludes an image from a run."""
+    return f"--exclude {shlex.quote(name)}"
 
 
 def with_culprits(check: Check, guilt: Sequence[Guilt], remedy: str, causes: str) -> Check:
@@ -344,7 +343,7 @@ def labels_check(
         "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
         "that was left out does no harm where other images show it"
     )
-    check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
+    check = assess("labels", _trials(networks), "centres", remedy, "suspicious")
     swapped = _exchanged(networks, outliers, images, camera)
     guilt = _images_of_outliers(networks, outliers)
     lost = tuple(name for own in guilt for name in own.culprits)

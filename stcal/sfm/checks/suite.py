@@ -49,20 +49,15 @@ from stcal.sfm.checks.images import (
     sigma_check,
     summed,
 )
-from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.verdict import Trial, assess
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
+from stcal.sfm.report.check import CHECKS, Check, Measured, impossible
 
-JOINT = (
-    ("agreement", "Groups, board and faces against one another"),
-    ("halves", "Two halves of the images against each other"),
-    ("groups", "The result without each group"),
-    ("loops", "Ways to a face through different groups"),
-)
+JOINT = ("agreement", "halves", "groups", "loops")
 """Checks that need the joint result and its covariances."""
-CONTROL = "Uncorrected control"
-GROUPS, BESIDE_A_GROUP = "groups", 0.9
-"""Check that names a group without which all is well, and largest factor on the residuals that a cause of the whole set
-may leave to be named in place of that group."""
+BESIDE_A_GROUP = 0.9
+"""Largest factor on the residuals that a cause of the whole set may leave to be named in place of a group without which
+all is well."""
 MICRO = 1e3
 IN_PAIRS = 2
 """Number of functions that make two checks each: of the board, and of the radii."""
@@ -168,7 +163,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     failed = any(check.verdict == "failed" for check in checks)
     moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
     # A group without which all is well is the cause, unless another one explains far more than chance of the residuals.
-    of_group = any(check.key == GROUPS and check.verdict == "failed" and len(check.names) == 1 for check in checks)
+    of_group = any(check.key == "groups" and check.verdict == "failed" and len(check.names) == 1 for check in checks)
     most_left = BESIDE_A_GROUP if of_group else 1.0
     cause = evidence.cause
     if cause is None and any(check.verdict in ("failed", "suspicious") for check in checks):
@@ -180,10 +175,10 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
 def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[[], Check]]:
     joint = evidence.calibration.joint
     if not evidence.calibration.target.target_from_face:
-        return [partial(impossible, key, title, "the board alone, no face", "") for key, title in JOINT]
+        return [partial(impossible, key, "the board alone, no face", "") for key in JOINT]
     if joint is None:
         reason = "needs the covariances of the joint adjustment"
-        return [partial(impossible, key, title, reason, "run with --solve joint") for key, title in JOINT]
+        return [partial(impossible, key, reason, "run with --solve joint") for key in JOINT]
     again = Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
     linked = {model.group for model in joint.models}
     linked_networks = [n for n in networks if n.model.group in linked]
@@ -198,20 +193,19 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
 def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     """Compares the run with a control without eccentricity, chained with three-point frames, and tests the correction:
     a factor on it is 1 up to chance, and 0 if the centres are not those of ellipses."""
-    key = "control"
     if not evidence.radius_mm():
-        return impossible(key, CONTROL, "corners alone, which have no eccentricity", "")
+        return impossible("control", "corners alone, which have no eccentricity", "")
     if not evidence.options.eccentricity:
-        return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
+        return impossible("control", "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
-        return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
+        return impossible("control", "no circle is in the result", "add views of the faces with circles")
     test = solve_score(*summed(networks, by_eccentricity))
     if not test.freedom:
-        return impossible(key, CONTROL, "poses and circles explain any eccentricity", "add tilted views of the faces")
+        return impossible("control", "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy = sum(n.redundancy.sum() for n in networks)
     share = float(test.estimate[0])
     trial = Trial("share of the eccentricity found, minus 1", share, "", test.statistic, test.freedom, redundancy)
-    check = judge(key, CONTROL, [trial], "corrections", NO_ELLIPSES)
+    check = assess("control", [trial], "corrections", NO_ELLIPSES)
     try:
         whole = evidence.calibration.target.target_from_face
         message, measured = _control(evidence) if whole else ("no face that it could move", ())
@@ -259,7 +253,7 @@ class _Source:
 
 def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: float) -> Check:
     """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
-    key, title = "scales", "Scales against one another"
+    title = CHECKS["scales"][0]
     remedy = (
         "one print, distance or board has another size than stated: measure a side of each print and correct "
         "target.toml, or state size_sigma_mm"
@@ -271,10 +265,10 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
             name, times = alone
             reason = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
             size = Measured(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
-            return Check(key, title, "failed", reason, (size, measured), 1, (name,), f"correct the size of {name}")
+            return Check("scales", title, "failed", reason, (size, measured), 1, (name,), f"correct the size of {name}")
         why = "the size or drawing of the print is another one, or its σ too small"
         reason = f"{measured.name} at {measured.words()}: {why}"
-        return Check(key, title, "suspicious", reason, (measured,), 1, (measured.name,), remedy)
+        return Check("scales", title, "suspicious", reason, (measured,), 1, (measured.name,), remedy)
     trials: list[Trial] = []
     for network in networks:
         sources = _sources(network, board, print_factor)
@@ -293,8 +287,8 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
             if variance > 0:
                 trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
     if not trials:
-        return impossible(key, title, "only one source of the scale", "state a known distance with scale")
-    check = judge(key, title, trials, "sources of the scale", remedy)
+        return impossible("scales", "only one source of the scale", "state a known distance with scale")
+    check = assess("scales", trials, "sources of the scale", remedy)
     if check.names and (alone := _alone(networks, board)):
         name, times = alone
         size = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"

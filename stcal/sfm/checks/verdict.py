@@ -4,17 +4,15 @@ the number of values tested (Bonferroni). One sound run in seventy shows somethi
 A culprit is named only if leaving it out cures the result, and leaving out another one does not.
 """
 
-import shlex
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
-from stcal.geometry.arrays import Brief, require_arguments, require_fields
+from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import ratio_limit
 from stcal.labels import CircleLabel
@@ -22,14 +20,8 @@ from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_sco
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import GroupModel, WorldModel
-from stcal.sfm.report.judgement import CAUSE, not_first
-from stcal.sfm.report.sections import ORDER
+from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, Measured, Verdict
 
-Verdict = Literal["passed", "suspicious", "failed", "not possible"]
-SUSPICIOUS = 1e-3
-FAILED = 1e-5
-"""Limits of the probability that, among all values of a check, one is as large or larger by chance."""
-BY_CHANCE = f"a check is suspicious by chance in one run in {1 / SUSPICIOUS:,.0f}, failed in one in {1 / FAILED:,.0f}"
 KNOWN = 1e9
 """Degrees of freedom of a σ that is stated, not estimated."""
 MOST_ENLARGED = 3.0
@@ -37,71 +29,10 @@ MOST_ENLARGED = 3.0
 between laboratories are (Birge 1932, Phys. Rev. 40); beyond it something is wrong."""
 MOST_SIGMAS = 4.0
 """Residuals over the centres' own σ from which the model does not describe the images."""
+FREE = "free poses and points explain the images, whatever they show"
+"""Why too few images test nothing."""
 SHOWN = 8
 """Number of measurements that a check lists, the worst first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """One tested value."""
-
-    name: str  # image, label, face, group, row …
-    value: float
-    limit: float | None  # in ``unit``; beyond it the value is suspicious
-    unit: str
-    probability: float | None  # of as much or more by chance, None if the value is not tested
-
-    def words(self) -> str:
-        """Returns value and limit as text."""
-        unit = f" {self.unit}" if self.unit else ""
-        limit = "" if self.limit is None else f", limit {_digits(self.limit)}"
-        return f"{_digits(self.value)}{unit}{limit}"
-
-
-def _digits(value: float) -> str:
-    """Returns a value to three digits, a large one without an exponent."""
-    text = f"{value:.3g}"
-    return f"{float(text):.0f}" if "e+" in text else text
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class Check(Brief):
-    """Result of a check.
-
-    Parameters
-    ----------
-    key : str
-        Short name by which files and programs know the check.
-    title : str
-        Its name for people.
-    verdict : {"passed", "suspicious", "failed", "not possible"}
-        A failed check makes the answer of the run "no".
-    reason : str
-        The verdict in words.
-    measured : tuple of Measured
-        Values, the worst first.
-    tested : int
-        Number of values tested.
-    names : tuple of str
-        Names of the values beyond their limits, the worst first.
-    remedy : str
-        What to do about it; empty if there is nothing to do.
-    enlarges : float
-        Factor on the σ of the result by which they cover what the check found; 1 if it found nothing, or too much.
-    """
-
-    key: str
-    title: str
-    verdict: Verdict
-    reason: str
-    measured: tuple[Measured, ...]
-    tested: int
-    names: tuple[str, ...]
-    remedy: str
-    enlarges: float = 1.0
-
-    def __post_init__(self):
-        require_fields(self, f"check {self.key}", tested=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,11 +111,10 @@ def judge(
     Check
         "not possible" without trials.
     """
-    if not trials:
-        return impossible(key, title, f"no {what} to test", "")
-    trials = [trial for trial in trials if trial.redundancy > 0]
-    if not trials:
-        return impossible(key, title, "free poses and points explain the images, whatever they show", "add images")
+    if not (usable := [trial for trial in trials if trial.redundancy > 0]):
+        reason, advice = (FREE, "add images") if trials else (f"no {what} to test", "")
+        return Check(key, title, "not possible", reason, (), 0, (), advice)
+    trials = usable
     count = len(trials)
     statistic, freedom, redundancy = np.array([(t.statistic, t.freedom, t.redundancy) for t in trials], float).T
     probability = fdtrc(freedom, redundancy, statistic / freedom)
@@ -212,26 +142,9 @@ def judge(
     return Check(key, title, verdict, reason, measured, count, names, remedy if significant else "", enlarges)
 
 
-def without_image(name: str) -> str:
-    """Returns the option that excludes an image from a run."""
-    return f"--exclude {shlex.quote(name)}"
-
-
-def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
-    """Returns the checks in the order in which to read them: the worst first, and of equal verdicts the cause of the
-    whole set, then those that name an image, last those that cannot name the cause."""
-    later = {verdict: not_first(check.key for check in checks if check.verdict == verdict) for verdict in ORDER}
-
-    def place(check: Check) -> tuple:
-        named = not images.isdisjoint(check.names)
-        return ORDER.index(check.verdict), check.key != CAUSE, not named, check.key in later[check.verdict]
-
-    return sorted(checks, key=place)
-
-
-def impossible(key: str, title: str, reason: str, remedy: str) -> Check:
-    """Returns the result of a check that this run cannot make."""
-    return Check(key, title, "not possible", reason, (), 0, (), remedy)
+def assess(key: str, trials: Sequence[Trial], what: str, remedy: str, *more: Verdict, covered: bool = False) -> Check:
+    """Returns :func:`judge` of a check that the package makes, by its title in :data:`CHECKS`."""
+    return judge(key, CHECKS[key][0], trials, what, remedy, *more, covered=covered)
 
 
 MOST = 0.5

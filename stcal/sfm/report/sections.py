@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from stcal.labels import parse_label
 from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
 from stcal.report.text import NONE, cells, join, number
+from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, Measured, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
-from stcal.sfm.report.judgement import CHANCE, SIZES, Judgement, applies
+from stcal.sfm.report.judgement import SIZES, Judgement
 
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
@@ -186,69 +187,50 @@ def _face_row(check: dict, face: str) -> list[str]:
     return row
 
 
-ORDER = ("failed", "suspicious", "passed", "not possible")
-NOT_APPLICABLE = "not applicable"
-"""What is told of checks that what was photographed has nothing for, such as those of circles where it shows tags."""
 FIRST_NAMES = 6
 """Number of names that a row has room for."""
 
 
-def count_verdicts(verdicts: list[tuple[str, str]]) -> str:
-    """Number of checks (verdict, remedy) by verdict, the worst first; one that does not apply is left out."""
-    told = [verdict if applies(verdict, remedy) else NOT_APPLICABLE for verdict, remedy in verdicts]
-    return ", ".join(f"{told.count(v)} {v}" for v in (*ORDER, NOT_APPLICABLE) if v in told) or "none"
-
-
-def checks_section(checks: list[dict]) -> list[Block]:
+def checks_section(rows: list[dict]) -> list[Block]:
     """Returns the checks that did not pass; the others, and what all of them measured, folded."""
+    checks = sorted(map(Check.read, rows), key=lambda check: ORDER.index(check.verdict))
     heads = ["<Check", "<Verdict", "Value", "Limit", "<Named", "<Found", "<What to do"]
-    ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
-    open_ = [_check_row(check) for check in ranked if check["verdict"] in ("failed", "suspicious")]
-    others = [_check_row(check) for check in ranked if check["verdict"] not in ("failed", "suspicious")]
+    is_open = [check.verdict in ("failed", "suspicious") for check in checks]
+    open_, others = ([_check_row(c) for c, own in zip(checks, is_open, strict=True) if own is k] for k in (True, False))
     measured = [
-        [check["title"], m["name"], *_number(m), NONE if m["probability"] is None else f"{m['probability']:.1g}"]
-        for check in ranked
-        for m in check["measured"]
+        [check.title, m.name, *_number(m), NONE if m.probability is None else f"{m.probability:.1g}"]
+        for check in checks
+        for m in check.measured
     ]
-    counts = count_verdicts([(check["verdict"], check["remedy"]) for check in checks])
-    columns_measured = ["<Check", "<What", "Value", "Limit", "Probability by chance"]
     return [
-        f"Checks: {counts}. Each tests what small residuals do not prove. {CHANCE} That holds for one check, however "
-        f"many images or points it tested",
+        f"Checks: {count_verdicts(checks)}. Each tests what small residuals do not prove; {BY_CHANCE}, however many "
+        "images or points it tested",
         Table(heads, open_, css="text"),
         fold(
             f"{len(others)} checks that passed, were not possible or not applicable", Table(heads, others, css="text")
         ),
-        fold("What was measured", Table(columns_measured, measured, css="text")),
+        fold(
+            "What was measured",
+            Table(["<Check", "<What", "Value", "Limit", "Probability by chance"], measured, css="text"),
+        ),
     ]
 
 
-def _check_row(check: dict) -> list:
-    return [
-        check["title"],
-        Verdict(check["verdict"] if applies(check["verdict"], check["remedy"]) else NOT_APPLICABLE),
-        *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
-        _names(check),
-        check["reason"],
-        check["remedy"],
-    ]
+def _check_row(check: Check) -> list:
+    surplus = len(check.names) - FIRST_NAMES
+    names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
+    value = _number(check.measured[0]) if check.measured else [NONE, NONE]
+    return [check.title, Verdict(check.told()), *value, names, check.reason, check.remedy]
 
 
-def _number(measured: dict) -> list[str]:
+def _number(measured: Measured) -> list[str]:
     """Returns value and limit with their unit."""
-    unit = f" {measured['unit']}" if measured["unit"] else ""
-    return [_short(measured["value"]) + unit, NONE if measured["limit"] is None else _short(measured["limit"]) + unit]
 
+    def short(value: float) -> str:
+        return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
 
-def _short(value: float) -> str:
-    """Returns the value with about three digits."""
-    return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
-
-
-def _names(check: dict) -> str:
-    names = check["names"]
-    surplus = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
-    return ", ".join(names[:FIRST_NAMES]) + surplus if names else NONE
+    unit = f" {measured.unit}" if measured.unit else ""
+    return [short(measured.value) + unit, NONE if measured.limit is None else short(measured.limit) + unit]
 
 
 def published_section(comparison: dict) -> list[Block]:

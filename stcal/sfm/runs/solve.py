@@ -45,7 +45,6 @@ from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
-from stcal.sfm.report.judgement import OF_WHOLE_SET
 from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.transaction import RunFolder
 
@@ -366,7 +365,7 @@ def explained(images: Sequence[ImageObservations], camera: Camera, board: BoardD
         yield
     except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
         if LIKELY not in str(error) and (cause := wrong_file(images, camera, board)):
-            name = cause.title.removeprefix(OF_WHOLE_SET)
+            name = cause.cause
             error.append(f"{LIKELY}{name} ({cause.reason}): {cause.remedy}")
         raise
 
