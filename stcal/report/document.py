@@ -174,23 +174,23 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer at the head of a report. ``word`` : yes, with care, part or no; ``why`` : in one sentence."""
+    """The answer at the head of a report. ``word`` : yes, with care, part or no; ``why`` : in one sentence; ``said`` :
+    both, if not as ``Word: why``."""
 
     word: str
-    why: str
+    why: str = ""
+    question: str = "May I use it?"
+    said: str = ""
 
     def lines(self) -> list[str]:
         """Return the answer as a line."""
-        return [f"{USABLE} {self._said()}"]
+        return [f"{self.question} {self._said()}"]
 
     def __html__(self) -> str:
-        return _macro("answers", [(USABLE, self._said())], tone_of(self.word))
+        return _macro("answers", [(self.question, self._said())], tone_of(self.word))
 
     def _said(self) -> str:
-        return sentence(f"{self.word.capitalize()}: {self.why}")
-
-
-USABLE = "May I use it?"
+        return self.said or sentence(f"{self.word.capitalize()}: {self.why}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row, View
 from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
 from stcal.sfm.report.check import invalidated
+from stcal.sfm.report.judgement import Judgement, judgement_of
 from stcal.sfm.runs.saved import SavedRun, Verified
 
 MICRO = 1e3
@@ -98,28 +99,6 @@ class StatedRow:
     origin: str
 
 
-class LengthRow(Part):
-    circles: tuple[str, ...]
-    measured_mm: float
-    reference_mm: float
-    error_um: float
-    expanded_um: float | None
-    e_n: Finite
-
-
-class LengthTestPart(Part):
-    """Length test against one reference."""
-
-    reference: str
-    lengths: list[LengthRow]
-    largest_e_n: Finite
-    beyond: int | None
-    limit: float
-    agrees: bool | None
-    verdict: str
-    notes: tuple[str, ...]
-
-
 class BudgetFile(ResultFile):
     """The JSON file of ``budget``."""
 
@@ -136,7 +115,8 @@ class BudgetFile(ResultFile):
         "calibration), `traceability` and others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
-    use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
+    use: str = Field(description='the run\'s own answer to "May I use it?"')
+    reserved: bool = Field(False, description="whether that answer is to use it with care, also as a part")
     usable: bool = Field(
         description="false where that answer is no or a check has failed: no uncertainty is given, `faces` and "
         "`distances` are empty"
@@ -192,7 +172,7 @@ class BudgetFile(ResultFile):
         "combined standard uncertainties of x, y, z, `position_xyz_um`; empty where the size is not known or the run "
         "must not be used",
     )
-    length_tests: list[LengthTestPart] = Field(
+    length_tests: list[LengthTest] = Field(
         description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
         "`measured_mm` (corrected) and `reference_mm`, length measurement error `error_um` (VDI/VDE 2634), U of both "
         "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); `largest_e_n`, how many "
@@ -248,7 +228,8 @@ class BudgetFile(ResultFile):
             ),
             fields=budget.statement.fields,
             reference_face=budget.reference_face,
-            use=(run.report.get("judgement") or {}).get("use", ""),
+            use=(answer := answer_of(run)).use,
+            reserved=answer.reserved,
             usable=not refused,
             size_known=known,
             reference_temperature_c=conditions.temperature_c,
@@ -264,7 +245,7 @@ class BudgetFile(ResultFile):
             faces={} if refused else faces,
             distances=[] if refused or not known else distances,
             circles={} if refused or not known else circles,
-            length_tests=[LengthTestPart.model_validate(test) for test in tests],
+            length_tests=[asdict(test) for test in tests],
             notes=notes_of(budget, verified, run),
         )
 
@@ -302,18 +283,24 @@ def _definitions(run: SavedRun) -> list[str]:
     ]
 
 
+def answer_of(run: SavedRun) -> Judgement:
+    """Returns a run's answer to "May I use it?"; that of today's rules where an older version did not say it all."""
+    stated = run.report.get("judgement") or {}
+    return Judgement.model_validate(stated) if "reserved" in stated else judgement_of(run.report)
+
+
 def is_refused(run: SavedRun) -> bool:
     """Whether a run says that it must not be used, so that no uncertainty of it holds."""
-    return bool(run.failed_checks()) or (run.report.get("judgement") or {}).get("verdict") == "no"
+    return bool(run.failed_checks()) or answer_of(run).verdict == "no"
 
 
-def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[str]:
+def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTest]) -> list[str]:
     """Returns why a budget must not be used, in words: the answer of each run, and length tests that differ."""
     reasons = []
     for run in filter(is_refused, runs):
-        answer = run.report.get("judgement") or {}
+        answer = answer_of(run)
         failed = "failed: " + "; ".join(check["title"] for check in run.failed_checks())
-        own = answer["use"].removesuffix(".") if answer.get("verdict") == "no" else failed
+        own = answer.use.removesuffix(".") if answer.verdict == "no" else failed
         reasons.append(f"may run {run.folder} be used? {own}")
     return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
 
@@ -348,7 +335,7 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
             f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given"
         )
     elif is_refused(run):
-        notes.append(f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
+        notes.append(f"may the run be used? {answer_of(run).use} No uncertainty of it is given")
     if not conditions.size_known:
         notes.append(f"{conditions.words}; lengths of the run are in the unit of the drawing")
     if unknown := [source.title for source in budget.sources if source.origin == "not stated"]:

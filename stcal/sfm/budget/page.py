@@ -7,21 +7,20 @@ from pathlib import Path
 from stcal.errors import InputError
 from stcal.geometry.arrays import Brief, require_arguments
 from stcal.report.document import (
+    Answer,
     Block,
     Document,
     Notes,
-    Printed,
     Section,
     Table,
     bullets,
-    macro,
     page_only,
     subheading,
     tiles,
 )
 from stcal.report.text import NONE, join, number, significant
 from stcal.sfm.budget.combine import Budget, budget_of_run
-from stcal.sfm.budget.file import BudgetFile, LengthTestPart, Uncertainty, refusals
+from stcal.sfm.budget.file import BudgetFile, Uncertainty, refusals
 from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated, common_views
 from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run, verify
@@ -60,7 +59,6 @@ variance up to which a source is not among those that limit a result."""
 
 def budget_report(file: BudgetFile) -> Document:
     """Returns the report of ``budget``: expanded uncertainties, inputs, contributions, and tests of lengths."""
-    tone = "failed" if not file.usable else "care" if _is_reserved(file) else "passed"
     hashes = [
         ["folder of the run", Path(file.run.folder).name],
         ["folder of the photographs", Path(file.run.images).name],
@@ -89,7 +87,7 @@ def budget_report(file: BudgetFile) -> Document:
             Section("Signature", [RELATES, signature] if certifies(file) else []),
         ],
         banner=[
-            macro("answers", [("May the run be used?", file.use)], tone) if file.use else None,
+            _answer(file),
             Table(["<Field", "<"], fields, css="text facts"),
         ],
     )
@@ -100,7 +98,7 @@ def budget_in_brief(file: BudgetFile) -> str:
     tests = [f"lengths against {test.reference}: {test.verdict}" for test in file.length_tests]
     lines = [
         _about(file),
-        f"May the run be used? {file.use}" if file.use else "",
+        *_answer(file).lines(),
         *(f"{value} {unit}: {words}".replace(" :", ":") for value, unit, words in _headline(file)),
         *tests,
         _no_certificate(file) if _is_valid(file) and not certifies(file) else "",
@@ -108,6 +106,11 @@ def budget_in_brief(file: BudgetFile) -> str:
         f"inputs, contributions and {len(file.notes)} notes: -v, or --report FILE.html",
     ]
     return "\n".join(filter(None, lines))
+
+
+def _answer(file: BudgetFile) -> Answer:
+    word = "no" if not file.usable else "with care" if file.reserved else "yes"
+    return Answer(word, question="May the run be used?", said=file.use)
 
 
 def _about(file: BudgetFile) -> str:
@@ -166,7 +169,6 @@ def _result(file: BudgetFile) -> list[Block]:
         tiles(_headline(file) + tests),
         WHAT_U_IS.format(k=file.coverage_factor) if file.faces else None,
         Notes([*([_no_certificate(file)] if _is_valid(file) and not certifies(file) else []), *file.notes]),
-        Printed([f"May the run be used? {file.use}"] if file.use else []),
         file.holds if file.size_known else None,
         Table(_heads("position of face", "mm", "µm"), positions),
         Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
@@ -239,7 +241,7 @@ def _table(title: str, unit: str, columns: dict[str, Uncertainty], file: BudgetF
     )
 
 
-def _length_test(test: LengthTestPart) -> list[Block]:
+def _length_test(test: LengthTest) -> list[Block]:
     """Returns the verdict of a length test, and its lengths."""
     rows = [
         [
@@ -265,12 +267,7 @@ def _length_test(test: LengthTestPart) -> list[Block]:
 
 def certifies(file: BudgetFile) -> bool:
     """Returns whether the page is a certificate: the run may be used, inputs and required fields are stated."""
-    return _is_valid(file) and not _unstated(file) and not _is_reserved(file)
-
-
-def _is_reserved(file: BudgetFile) -> bool:
-    """Returns whether the run's own answer has a reservation, which no certificate can have."""
-    return file.use.startswith(("With care", "Part, with care"))
+    return _is_valid(file) and not _unstated(file) and not file.reserved
 
 
 def _is_valid(file: BudgetFile) -> bool:
@@ -285,7 +282,7 @@ def _unstated(file: BudgetFile) -> list[str]:
 
 
 def _no_certificate(file: BudgetFile) -> str:
-    if _is_reserved(file):
+    if file.reserved:
         return "this is not a certificate: the run says that it is to be used with care; clear that up, and run again"
     unstated = _unstated(file)
     camera = ", and σ of the intrinsics in the camera file" if "intrinsics" in unstated else ""
