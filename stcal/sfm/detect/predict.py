@@ -202,21 +202,26 @@ def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], c
 
 
 def missed_notes(missed: dict[Label, str]) -> list[str]:
-    """Returns one note for each face, and one for the board, on circles that were expected in view and not measured."""
+    """Returns notes on circles that were expected in view and not measured."""
+    return _by_plane(missed, "should be in view and not measured")
+
+
+def contradicted_notes(found: dict[Label, str]) -> list[str]:
+    """Returns notes on circles that contradict the others."""
+    return _by_plane(found, "left out, partly hidden or something else")
+
+
+def _by_plane(reasons: dict[Label, str], what: str) -> list[str]:
+    """Returns one note for each face, and one for the board, on circles with the reason of the first one."""
     planes: dict[str, list[tuple[Label, str]]] = {}
-    for label, reason in missed.items():
+    for label, reason in reasons.items():
         planes.setdefault(label.plane, []).append((label, reason))
     notes = []
     for plane, rows in planes.items():
         place, (first, reason) = "board" if plane == BOARD else f"face {plane}", rows[0]
         others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-        notes.append(f"{place}: {first}{others} should be in view and not measured; {first}: {reason}")
+        notes.append(f"{place}: {first}{others} {what}; {first}: {reason}")
     return notes
-
-
-def contradicted_notes(found: dict[Label, str]) -> list[str]:
-    """Returns one note for each circle."""
-    return [f"{label}: {reason}; partly hidden or something else, left out" for label, reason in found.items()]
 
 
 SEARCH = 5.0
