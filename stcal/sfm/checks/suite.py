@@ -1,6 +1,7 @@
 """All checks of a run. Each tests for an error that small residuals may hide."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -59,8 +60,6 @@ BESIDE_A_GROUP = 0.9
 """Largest factor on the residuals that a cause of the whole set may leave to be named in place of a group without which
 all is well."""
 MICRO = 1e3
-IN_PAIRS = 2
-"""Number of functions that make two checks each: of the board, and of the radii."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,20 +152,19 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     )
     if isinstance(board, ScaleReference):  # the target tells its size itself
         makers += (lambda: scales_check(networks, board, factors[0]),)
-    step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
+    step = counted(progress or (lambda *_: None), "check", len(makers))
     checks: list[Check] = []
     for make in makers:
         result = make()
-        for check in [result] if isinstance(result, Check) else result:
-            checks.append(check)
-            step(None)
-    failed = any(check.verdict == "failed" for check in checks)
-    moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
-    # A group without which all is well is the cause, unless another one explains far more than chance of the residuals.
-    of_group = any(check.key == "groups" and check.verdict == "failed" and len(check.names) == 1 for check in checks)
-    most_left = BESIDE_A_GROUP if of_group else 1.0
+        checks += [result] if isinstance(result, Check) else result
+        step(None)
+    failed = {check.key: check for check in checks if check.verdict == "failed"}
     cause = evidence.cause
     if cause is None and any(check.verdict in ("failed", "suspicious") for check in checks):
+        moved = "moved" in failed and not failed["moved"].names
+        # A group without which all is well is the cause, unless another one explains far more of the residuals.
+        of_group = "groups" in failed and len(failed["groups"].names) == 1
+        most_left = BESIDE_A_GROUP if of_group else 1.0
         cause = whole_set_cause(networks, camera, moved, evidence.camera_given, most_left)
         cause = replace(cause, verdict="failed" if failed else "suspicious") if cause else None
     return (cause, *checks) if cause else tuple(checks)
@@ -241,58 +239,45 @@ MOST_PRINT_FACTOR = 10.0
 """Corners about the design over their stated σ from which on the design, or a stated size, is another one."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Source:
-    """A source of the scale."""
-
-    name: str
-    log_scale: float  # of the model over the known size
-    gradient: np.ndarray  # (3p,) of ``log_scale`` by the points
-    variance: float  # of the known size
-
-
 def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: float) -> Check:
     """Tests each source of the scale against the mean of all in the free network of a group, which has one scale."""
-    title = CHECKS["scales"][0]
+    key, (title, _) = "scales", CHECKS["scales"]
     remedy = (
         "one print, distance or board has another size than stated: measure a side of each print and correct "
         "target.toml, or state size_sigma_mm"
     )
+    name, times = _alone(networks, board) or ("", 1.0)
+    fits = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
     if print_factor > MOST_PRINT_FACTOR:
         # σ that have grown so much would hide the contradiction that made them grow.
-        measured = Measured("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
-        if alone := _alone(networks, board):
-            name, times = alone
-            reason = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
+        grown = Measured("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
+        if name:
             size = Measured(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
-            return Check("scales", title, "failed", reason, (size, measured), 1, (name,), f"correct the size of {name}")
+            return Check(key, title, "failed", fits, (size, grown), 1, (name,), f"correct the size of {name}")
         why = "the size or drawing of the print is another one, or its σ too small"
-        reason = f"{measured.name} at {measured.words()}: {why}"
-        return Check("scales", title, "suspicious", reason, (measured,), 1, (measured.name,), remedy)
+        reason = f"{grown.name} at {grown.words()}: {why}"
+        return Check(key, title, "suspicious", reason, (grown,), 1, (grown.name,), remedy)
     trials: list[Trial] = []
     for network in networks:
-        sources = _sources(network, board, print_factor)
-        if len(sources) < 2:
+        names, log_scale, gradient, variance = _sources(network, board, print_factor)
+        if len(names) < 2:
             continue
-        gradient = np.array([source.gradient for source in sources])
-        value = np.array([source.log_scale for source in sources])
-        own = np.diag([source.variance for source in sources])
-        covariance = gradient @ network.covariance_mm2 @ gradient.T + own
+        covariance = gradient @ network.covariance_mm2 @ gradient.T + np.diag(variance)
         weight = np.linalg.inv(covariance)
-        mean = float(weight.sum(0) @ value / weight.sum())
-        away = value - mean
+        away = log_scale - float(weight.sum(0) @ log_scale / weight.sum())
         spread = np.diag(covariance) - 1 / weight.sum()
         freedom = float(network.redundancy.sum())
-        for source, off, variance in zip(sources, away.tolist(), spread.tolist(), strict=True):
-            if variance > 0:
-                trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
+        trials += [
+            Trial(source, PPM * off, "ppm", off**2 / own, 1, freedom)
+            for source, off, own in zip(names, away.tolist(), spread.tolist(), strict=True)
+            if own > 0
+        ]
     if not trials:
-        return impossible("scales", "only one source of the scale", "state a known distance with scale")
-    check = assess("scales", trials, "sources of the scale", remedy)
-    if check.names and (alone := _alone(networks, board)):
-        name, times = alone
-        size = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
-        return replace(check, reason=f"{size}; {check.reason}", names=(name,), remedy=f"correct the size of {name}")
+        return impossible(key, "only one source of the scale", "state a known distance with scale")
+    check = assess(key, trials, "sources of the scale", remedy)
+    if check.names and name:
+        reason = f"{fits}; {check.reason}"
+        return replace(check, reason=reason, names=(name,), remedy=f"correct the size of {name}")
     return check
 
 
@@ -300,10 +285,9 @@ def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float]
     """Returns the one source that contradicts all others, which agree, and its size over the stated one."""
     off: dict[str, list[float]] = {}
     for network in networks:
-        sources = _sources(network, board, 1.0)
-        middle = float(np.median([source.log_scale for source in sources])) if sources else 0.0
-        for source in sources:
-            off.setdefault(source.name, []).append(source.log_scale - middle)
+        names, log_scale, *_ = _sources(network, board, 1.0)
+        for name, value in zip(names, (log_scale - np.median(log_scale)).tolist() if names else (), strict=True):
+            off.setdefault(name, []).append(value)
     ratio = {name: float(np.median(values)) for name, values in off.items()}
     if len(ratio) < LEAST_AGREEING + 1:
         return None
@@ -312,7 +296,11 @@ def _alone(networks: Sequence[Network], board: BoardDesign) -> tuple[str, float]
     return (name, float(np.exp(ratio[name]))) if abs(ratio[name]) > max(ALONE, FAR * others) else None
 
 
-def _sources(network: Network, board: BoardDesign, print_factor: float) -> list[_Source]:
+def _sources(
+    network: Network, board: BoardDesign, print_factor: float
+) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the s sources of the scale: their names, the logarithm of the model's scale over the known size (s,), its
+    gradient by the points (s, 3p), and the variance of the known size (s,)."""
     model = network.model
     parts = [
         (f"face {face.id}", members, face.places_mm(model.labels[i].circle for i in members),
@@ -322,28 +310,27 @@ def _sources(network: Network, board: BoardDesign, print_factor: float) -> list[
     dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     if len(dots) >= MIN_DOTS:
         parts.append(("board", dots, board.places_mm(model.labels[i] for i in dots), board.sigma_mm, 0.0))
-    sources = []
+    names, values, gradients = [], [], []
     for name, members, design, sigma_mm, size_sigma in parts:
-        try:
+        with suppress(DegenerateError):
             found = align_similarity(model.xyz_model[members], design)
-        except DegenerateError:
-            continue
-        middle = design - design.mean(0)
-        square = float((middle**2).sum())
-        gradient = np.zeros((len(model.labels), 3))
-        gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
-        variance = sigma_mm**2 / square + size_sigma**2
-        sources.append(_Source(name, float(np.log(found.scale)), gradient.ravel(), variance))
+            middle = design - design.mean(0)
+            square = float((middle**2).sum())
+            gradient = np.zeros((len(model.labels), 3))
+            gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
+            names.append(name)
+            values.append((np.log(found.scale), sigma_mm**2 / square + size_sigma**2))
+            gradients.append(gradient.ravel())
     place = {label: i for i, label in enumerate(model.labels)}
     for known in known_distances(board):
         if known.first in place and known.second in place:
             i, j = place[known.first], place[known.second]
             apart = model.xyz_model[i] - model.xyz_model[j]
-            length = float(np.linalg.norm(apart))
             gradient = np.zeros((len(model.labels), 3))
-            gradient[i], gradient[j] = apart / length**2, -apart / length**2
-            name = f"distance {known.first} to {known.second}"
-            sources.append(
-                _Source(name, float(np.log(length / known.mm)), gradient.ravel(), (known.sigma_mm / known.mm) ** 2)
-            )
-    return sources
+            gradient[i] = apart / float(apart @ apart)
+            gradient[j] = -gradient[i]
+            names.append(f"distance {known.first} to {known.second}")
+            values.append((np.log(np.linalg.norm(apart) / known.mm), (known.sigma_mm / known.mm) ** 2))
+            gradients.append(gradient.ravel())
+    log_scale, variance = np.array(values).reshape(-1, 2).T
+    return names, log_scale, np.array(gradients), variance

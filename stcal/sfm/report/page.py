@@ -12,7 +12,6 @@ from stcal.report.document import (
     Document,
     Html,
     Section,
-    Swatch,
     Table,
     alarms,
     columns,
@@ -24,6 +23,7 @@ from stcal.report.document import (
     plot,
     plots,
     subheading,
+    swatch,
     tone_of,
 )
 from stcal.report.text import cells, join, number
@@ -291,7 +291,7 @@ def _residuals(report: dict, colours: dict[str, str]) -> list[Block]:
         [
             i,
             row["image"],
-            Swatch(row["group"], colours.get(row["group"], "")),
+            swatch(row["group"], colours.get(row["group"], "")),
             *cells(row, "observations rms_px:4 max_px:4 worst"),
         ]
         for i, row in enumerate(report["residuals_by_image"], 1)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from stcal.labels import parse_label
-from stcal.report.document import Block, Table, Verdict, alarms, fold, subheading
+from stcal.report.document import Block, Table, alarms, fold, subheading, verdict_word
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, Measured, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
@@ -220,7 +220,7 @@ def _check_row(check: Check) -> list:
     surplus = len(check.names) - FIRST_NAMES
     names = join(check.names[:FIRST_NAMES]) + (f" and {surplus} more" if surplus > 0 else "")
     value = _number(check.measured[0]) if check.measured else [NONE, NONE]
-    return [check.title, Verdict(check.told()), *value, names, check.reason, check.remedy]
+    return [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
 
 
 def _number(measured: Measured) -> list[str]:
