@@ -15,6 +15,7 @@ from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
+from stcal.sfm.checks.images import MAD_EFFICIENCY
 from stcal.sfm.checks.verdict import Trial, assess
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, Measured, impossible
@@ -27,8 +28,6 @@ RADIUS_TOLERANCE = 2e-3
 """Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5
 """Smallest number of circles of one design radius that are compared with each other."""
-MAD_EFFICIENCY = 0.37
-"""Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,12 +83,8 @@ def measure_radii(
             faded = common_dome(views.domes[own])[0] * views.by_dome_mm[own] / design_mm[label]
             ratio.setdefault(label, []).append(views.ratio[own] + hidden + faded)
             size.setdefault(label, []).append(views.size_px[own])
-    return Radii(
-        tuple(ratio),
-        np.array([design_mm[label] for label in ratio]),
-        np.array([np.median(np.concatenate(values)) for values in ratio.values()]),
-        np.array([np.median(np.concatenate(values)) for values in size.values()]),
-    )
+    medians = (np.array([np.median(np.concatenate(v)) for v in each.values()]) for each in (ratio, size))
+    return Radii(tuple(ratio), np.array([design_mm[label] for label in ratio]), *medians)
 
 
 def radius_checks(radii: Radii) -> list[Check]:
@@ -242,16 +237,17 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
 def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redundancy: float) -> list[Trial]:
     """Tests the stretch of each row along X and of each column along Y, in ppm."""
     trials = []
-    for kind, across, axis in (("row", 0, 0), ("column", 1, 1)):
-        for line in np.unique(cells[:, across]):
-            members = np.flatnonzero(cells[:, across] == line)
+    for axis, kind in enumerate(("row", "column")):
+        for line in np.unique(cells[:, axis]):
+            members = np.flatnonzero(cells[:, axis] == line)
             if len(members) < 3:
                 continue
             pattern = np.zeros((len(cells), 3))
             place = board.places_mm([DotLabel(*cell) for cell in cells[members].tolist()])[:, axis]
             pattern[members, axis] = place - place.mean()
-            information = float(pattern.ravel() @ weight @ pattern.ravel())
-            stretch = float(pattern.ravel() @ weight @ gap) / information
+            weighted = pattern.ravel() @ weight
+            information = float(weighted @ pattern.ravel())
+            stretch = float(weighted @ gap) / information
             statistic = stretch**2 * information / inflation
             trials.append(Trial(f"{name} {kind} {line}", 1e6 * stretch, "ppm", statistic, 1, redundancy))
     return trials
@@ -269,8 +265,10 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
         has_circles = any(face.printed is None for face in target.faces)
         return impossible("pitch", reason, "add views of the faces" if has_circles else "")
     shown = measures
-    if positions and of_radii and _contradict(positions, of_radii):
-        measures = [positions]
+    if positions and of_radii:
+        square = (positions.size - of_radii.size) ** 2 / (positions.sigma**2 + of_radii.sigma**2)
+        if fdtrc(1, min(positions.freedom, of_radii.freedom), square) < SUSPICIOUS:  # they contradict each other
+            measures = [positions]
     weight = np.array([1 / m.sigma**2 for m in measures])
     size = float(weight @ [m.size for m in measures] / weight.sum())
     variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
@@ -289,12 +287,6 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
     reason = check.reason if measures == shown else f"{check.reason}; by positions alone, which radii contradict"
     return replace(check, reason=reason, measured=check.measured + single)
-
-
-def _contradict(a: Size, b: Size) -> bool:
-    """Whether two sizes differ by more than chance."""
-    square = (a.size - b.size) ** 2 / (a.sigma**2 + b.sigma**2)
-    return float(fdtrc(1, min(a.freedom, b.freedom), square)) < SUSPICIOUS
 
 
 def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Size | None:

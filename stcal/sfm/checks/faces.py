@@ -87,6 +87,13 @@ def _difference(a: Rigid, b: Rigid) -> np.ndarray:
     return np.concatenate([Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.translation - b.translation])
 
 
+def _face_trial(name: str, a: Rigid, b: Rigid, covariance: np.ndarray, redundancy: float) -> Trial:
+    """Returns the trial of two independent poses of a face; ``covariance`` : (6, 6) of their difference."""
+    apart = _difference(a, b)
+    statistic = float(apart @ np.linalg.solve(covariance, apart))
+    return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
+
+
 def halves_check(again: Again) -> Check:
     """Compares two halves of the images, alternate ones of every group; the board's deviations are common to both."""
     models, reference = again.joint.models, again.calibration.target.reference_face
@@ -101,21 +108,21 @@ def halves_check(again: Again) -> Check:
     except StcalError as error:
         return impossible("halves", f"half of the images do not determine the result ({error})", "add images")
     redundancy = joint.redundancy + second_joint.redundancy
-    trials = []
-    for face in faces[1:]:
-        difference = _difference(first.target_from_face[face], second.target_from_face[face])
-        covariance = first.face_covariance[face] + second.face_covariance[face]
-        trials.append(_face_trial(f"face {face}", difference, covariance, redundancy))
+    trials = [
+        _face_trial(
+            f"face {face}",
+            first.target_from_face[face],
+            second.target_from_face[face],
+            first.face_covariance[face] + second.face_covariance[face],
+            redundancy,
+        )
+        for face in faces[1:]
+    ]
     remedy = (
         "images of one group contradict one another more than their residuals show: look for images in which something "
         "moved, or that are blurred; trust no σ below this difference"
     )
     return assess("halves", trials, "faces", remedy, covered=True)
-
-
-def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy: float) -> Trial:
-    statistic = float(apart @ np.linalg.solve(covariance, apart))
-    return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
 
 
 def groups_check(again: Again, networks: Sequence[Network]) -> Check:
@@ -156,15 +163,15 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
     if not check.names:
         return check
     curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
-    guilt = Guilt("groups", tuple(curing) if len(curing) == 1 else (), tuple(curing))
-    if guilt.culprits:
+    if len(curing) == 1:
         remedy = f"group {curing[0]} contradicts the others: was target or board moved in it, or the focus changed?"
         return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
     remedy = (
         "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
         "the faces in further groups, which show which one is wrong"
     )
-    return replace(check, reason=f"{check.reason}; {guilt.words()}", names=(), remedy=remedy)
+    words = Guilt("groups", rivals=tuple(curing)).words()
+    return replace(check, reason=f"{check.reason}; {words}", names=(), remedy=remedy)
 
 
 def _agree(joint: JointResult, networks: Sequence[Network]) -> bool:
@@ -197,11 +204,9 @@ def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, re
 def _linked(members: list[set[str]], start: str) -> set[str]:
     """Returns the faces that the groups link to ``start``."""
     reached = {start}
-    while True:
-        linked = set().union(*(faces for faces in members if faces & reached)) - reached
-        if not linked:
-            return reached
+    while linked := set().union(*(faces for faces in members if faces & reached)) - reached:
         reached |= linked
+    return reached
 
 
 def loops_check(again: Again) -> Check:
@@ -226,12 +231,11 @@ def loops_check(again: Again) -> Check:
     redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
     for face, first, second in pairs:
         try:
-            ends = [_along(step_of, way) for way in (first, second)]
+            (one, of_one), (other, of_other) = (_along(step_of, way) for way in (first, second))
         except StcalError:
             continue
-        difference = _difference(ends[0][0], ends[1][0])
         name = f"face {face} by groups {' '.join(first.groups)} and {' '.join(second.groups)}"
-        trials.append(_face_trial(name, difference, ends[0][1] + ends[1][1], redundancy))
+        trials.append(_face_trial(name, one, other, of_one + of_other, redundancy))
     if not trials:
         reason = "no face is reached in two ways that share no group"
         return impossible("loops", reason, again.loop_remedy())
@@ -239,11 +243,7 @@ def loops_check(again: Again) -> Check:
     return assess("loops", trials, "loops", remedy, covered=True)
 
 
-Step = Callable[[str, str, str], tuple[Rigid, np.ndarray]]
-"""Returns a_from_b by a group alone, and its covariance (6, 6), from the names of group, face a and face b."""
-
-
-def _along(step_of: Step, way: FaceChain) -> tuple[Rigid, np.ndarray]:
+def _along(step_of: Callable[[str, str, str], tuple[Rigid, np.ndarray]], way: FaceChain) -> tuple[Rigid, np.ndarray]:
     """Returns reference_from_face along a way, with each group adjusted alone, and its covariance (6, 6)."""
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):

@@ -65,15 +65,16 @@ def camera_check(
         change = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
         change = change @ (calibration.camera.parameters() - camera.parameters())
         gained = prior.covariance - calibration.joint.camera_covariance
-        estimate, sigma = change, np.sqrt(np.diag(prior.covariance))
+        model, estimate, sigma = prior.colmap_model, change, np.sqrt(np.diag(prior.covariance))
         test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ change)
-        names, redundancy = _names(prior.colmap_model), sum(n.redundancy.sum() for n in networks)
+        redundancy = sum(n.redundancy.sum() for n in networks)
     else:
-        richest = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
-        richest = "THIN_PRISM_FISHEYE" if camera.fisheye else richest
-        basis, found = intrinsic_basis(richest), calibration.camera
+        model = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
+        model = "THIN_PRISM_FISHEYE" if camera.fisheye else model
+        basis, found = intrinsic_basis(model), calibration.camera
         test, redundancy = tested(networks, lambda n: n.model.whiten(n.model.by_parameters(found) @ basis))
-        estimate, sigma, names = test.estimate, np.sqrt(np.diag(test.covariance)), _names(richest)
+        estimate, sigma = test.estimate, np.sqrt(np.diag(test.covariance))
+    names = [PARAMETER_NAMES[i] for i in intrinsic_basis(model).argmax(0)]
     rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
     check = assess("camera", [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
@@ -83,11 +84,6 @@ def camera_check(
     values = ", ".join(f"{m.name} {m.value:+.2g}" for m in single if abs(m.value) > (m.limit or 0))
     reason = f"{check.reason}; the images suggest {values}" if check.names and values else check.reason
     return replace(check, reason=reason, measured=check.measured + single)
-
-
-def _names(colmap_model: str) -> list[str]:
-    basis = intrinsic_basis(colmap_model)
-    return [PARAMETER_NAMES[i] for i in basis.argmax(0)]
 
 
 def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -107,9 +103,9 @@ def tested(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]
             own = solve_score(normal, right - normal @ test.estimate)
             scatter, freedom = scatter + own.statistic, freedom + own.freedom
     redundancy = float(sum(n.redundancy.sum() for n in networks))
-    times = scatter / freedom if freedom > 0 else 1.0
-    if times <= 1:
+    if freedom <= 0 or scatter <= freedom:
         return test, redundancy
+    times = scatter / freedom
     fewer = replace(test, covariance=times * test.covariance, statistic=test.statistic / times)
     return fewer, min(redundancy, float(freedom))
 
@@ -265,7 +261,7 @@ def moved_check(networks: Sequence[Network]) -> Check:
                 tested.append(i)
         tested_by_group[model.group] = network, columns, tested
     check = assess("moved", trials, "images", "")
-    if not check.names or len(check.names) > max(NEARLY_ALL * check.tested, 1):
+    if not check.names or _nearly_all(check):
         return _take_out(check, "")
     guilt = [
         culprits_by_score(network, columns, tested, check.tested, f"group {group}")
@@ -319,9 +315,13 @@ NEARLY_ALL = 0.7
 """Share of the images beyond which a check that names them names none."""
 
 
+def _nearly_all(check: Check) -> bool:
+    return len(check.names) > max(NEARLY_ALL * check.tested, 1)
+
+
 def _take_out(check: Check, remedy: str) -> Check:
     """Returns the check with the remedy and the option that excludes the worst image, if it names one."""
-    if len(check.names) > max(NEARLY_ALL * check.tested, 1):
+    if _nearly_all(check):
         common = "nearly all images, so do not leave any out: look for what they have in common, first the camera"
         return replace(check, names=(), remedy=common)
     return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check
@@ -343,19 +343,25 @@ def labels_check(
         "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
         "that was left out does no harm where other images show it"
     )
-    check = assess("labels", _trials(networks), "centres", remedy, "suspicious")
+    trials = []
+    for network in networks:
+        model, total = network.model, float(network.redundancy.sum())
+        square, freedom = network.squares_of_observations()
+        for k in np.flatnonzero(freedom):
+            name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
+            length = float(np.linalg.norm(network.residual[k]))
+            trials.append(Trial(name, length, "σ", float(square[k]), int(freedom[k]), total))
+    check = assess("labels", trials, "centres", remedy, "suspicious")
+    if not outliers:
+        return check
     swapped = _exchanged(networks, outliers, images, camera)
     guilt = _images_of_outliers(networks, outliers)
     lost = tuple(name for own in guilt for name in own.culprits)
-    if not outliers:
-        return check
     named = tuple(f"{o.image} {o.label}" for o in outliers)
     measured = tuple(
         Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
     )
-    first = f"{named[0]}: {outliers[0].residual_px:.3g} px, limit {outliers[0].limit_px:.3g}"
-    reason = f"{len(outliers)} left out, first {first}"
-    verdict = "suspicious"
+    verdict, reason = "suspicious", f"{len(outliers)} left out, first {named[0]}: {measured[0].words()}"
     if guilt:
         verdict = "failed"
         words = [f"{MANY} or more of image {', '.join(lost)}"] * bool(lost) + [w for own in guilt if (w := own.words())]
@@ -370,15 +376,8 @@ def labels_check(
         verdict = "failed"
         reason = f"labels exchanged: {swapped[0]}"
         remedy = "these labels are wrong: check the circles' positions and radii in target.toml, look at the overlay"
-    shown = (*measured, *check.measured)[:SHOWN]
-    return replace(
-        check,
-        verdict=verdict,
-        reason=reason,
-        measured=shown,
-        names=(*swapped, *lost, *named, *check.names),
-        remedy=remedy,
-    )
+    shown, names = (*measured, *check.measured)[:SHOWN], (*swapped, *lost, *named, *check.names)
+    return replace(check, verdict=verdict, reason=reason, measured=shown, names=names, remedy=remedy)
 
 
 def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]) -> list[Guilt]:
@@ -396,18 +395,6 @@ def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]
         if worst(()) is not None:
             found.append(culprits(names, worst, f"group {network.model.group}"))
     return found
-
-
-def _trials(networks: Sequence[Network]) -> list[Trial]:
-    trials = []
-    for network in networks:
-        model, total = network.model, float(network.redundancy.sum())
-        square, freedom = network.squares_of_observations()
-        for k in np.flatnonzero(freedom):
-            name = f"{model.images[model.image_index[k]]} {model.labels[model.point_index[k]]}"
-            length = float(np.linalg.norm(network.residual[k]))
-            trials.append(Trial(name, length, "σ", float(square[k]), int(freedom[k]), total))
-    return trials
 
 
 def _exchanged(
