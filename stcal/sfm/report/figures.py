@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import chain, groupby
+from itertools import chain
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from stcal.report.svg import (
     SMALL,
     Axes,
     Drawing,
-    Space,
     arrows,
     mixed_names,
     round_below,
@@ -80,24 +79,6 @@ def _points(places: Iterable) -> np.ndarray:
 def _length(share: float, points: np.ndarray) -> float:
     """Returns a share of the largest extent of points along an axis, mm; 1 if there are none."""
     return share * float(np.ptp(points, axis=0).max()) if len(points) else 1.0
-
-
-def still(parts: list[dict], azimuth: float) -> Drawing:
-    """Draws the parts of the scene from one side; sheets lie below all else."""
-    drawing = Drawing(5.4, 4.9)
-    space = Space(drawing, np.vstack([_points(part["xyz"]) for part in parts] or [np.zeros((1, 3))]), 24, azimuth)
-    for part in sorted(parts, key=lambda part: part["kind"] != "sheet"):
-        places, colour = space.at(_points(part["xyz"])), part["colour"]
-        if part["kind"] == "sheet":
-            drawing.lines([places], fill=colour, opacity=0.16)
-        elif part["kind"] == "line":
-            drawing.lines([places], colour, part["size"])
-        elif part["kind"] == "text":
-            drawing.words(places[0], part["name"], 11, colour=colour, weight="bold")
-    points = (part for part in parts if part["kind"] == "point")
-    for (size, colour), alike in groupby(points, lambda part: (part["size"], part["colour"])):
-        drawing.marks(space.at(_points(part["xyz"][0] for part in alike)), "dot", size, colour)
-    return drawing
 
 
 def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:

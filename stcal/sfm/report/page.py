@@ -16,7 +16,6 @@ from stcal.report.document import (
     alarms,
     columns,
     fold,
-    html,
     legend,
     macro,
     page_only,
@@ -39,8 +38,6 @@ from stcal.sfm.report.sections import (
     trust,
 )
 
-SIDES = {-58: "", 122: ", from the other side"}
-"""Azimuths from which target and cameras are drawn."""
 BY_ROWS = (2, 3, 4)
 """Columns of the scales that only a board has."""
 PUBLISHED = (
@@ -139,14 +136,7 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     others = [face for face in report["faces"] if face != report["reference_face"]]
     with_it = "boards and cameras" if words.board else "cameras"
     origin = "origin circle" if words.point == "circle" else "origin"
-    parts, stills = space_parts(report, colours), []
-    own = [part for part in parts if part.get("target")]
-    for azimuth, side in SIDES.items():
-        for shown, text in (
-            (parts, f"Target and {with_it}"),
-            (own, f"{words.points.capitalize()} and frames of faces"),
-        ):
-            stills.append(plot(partial(figures.still, shown, azimuth), f"{text}{side}", css=""))
+    parts = space_parts(report, colours)
     space = [
         macro(
             "turned",
@@ -171,7 +161,6 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
         else "",
         faces_table(report["faces"], report["reference_face"]),
         columns(space, use) if others else page_only(*space),
-        macro("group", "plots still", lambda: [html(*stills)]),
     ]
 
 

@@ -8,8 +8,6 @@ from html.parser import HTMLParser
 
 import pytest
 
-from stcal.report.svg import Drawing
-from stcal.sfm.report import figures
 from stcal.sfm.report.page import report_html
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
@@ -218,7 +216,7 @@ def test_the_page_is_whole_and_stands_alone(page):
 
 def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     plots = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", joint)
-    assert len(plots) == 1 + 4  # board of the one group, four views in space
+    assert len(plots) == 1  # board of the one group
     for plot in plots:
         references = re.findall(r'(?:href|src)="([^"]*)"', base64.b64decode(plot).decode())
         assert all(reference.startswith(("#", "data:image/png")) for reference in references)
@@ -269,18 +267,6 @@ def test_left_out_with_reasons():
     assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
     assert ["a/1.jpg", "board of 20 dots left out"] in rows
     assert ["1", "group a: face <6> has no frame"] in rows
-
-
-def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
-    """Their numbers are coordinates; only the scene that turns stands as the cameras did."""
-    drawn = []
-    monkeypatch.setattr(figures, "still", lambda parts, azimuth: drawn.append(parts) or Drawing(1, 1))
-    report = make()
-    report_html(report, {NASTY: JPEG})
-    assert len(drawn) == 4
-    for parts in drawn:
-        places = {part["name"]: part["xyz"] for part in parts if part["kind"] == "point" and "name" in part}
-        assert places == {label: [xyz] for label, xyz in report["scene"]["circles"].items()}
 
 
 def test_sigma0_is_what_the_certificate_says(joint):
