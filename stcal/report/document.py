@@ -302,7 +302,7 @@ def html(*blocks: Block):
 
 def sentence(text: str) -> str:
     """Return a message as a sentence; symbols, file names and what ends in a colon keep their small letters."""
-    first = re.split(r"[\s,]", text, maxsplit=1)[0]
+    first = re.split(r"[\s,;]", text, maxsplit=1)[0]
     start = text[0].upper() if first.isascii() and first.isalpha() else text[0]
     return start + text[1:] + ("" if text[-1] in ".!?:)" else ".")
 

@@ -1,6 +1,7 @@
 """Sections of a run's page: how far to trust it, its settings, its checks, the cross-check and the published method."""
 
 from dataclasses import dataclass
+from itertools import product
 
 from stcal.labels import parse_label
 from stcal.report.document import Block, Table, alarms, fold, subheading, verdict_word
@@ -40,10 +41,8 @@ class Words:
 def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
     """Returns for what σ hold, and the worst value of each kind."""
     summary, options = report["summary"], report["options"]
-    size = " and ".join(SIZES[source] for source in summary.get("scale_from", ["board"]))
-    pitch = "the pitch as a whole (100 ppm is 4 K on aluminium)"
-    others = {"faces", "distances"} & set(summary.get("scale_from", []))
-    stated = ". The σ stated of the size are in them" if others else ""
+    sources = summary.get("scale_from", ["board"])
+    size = " and ".join(SIZES[source] for source in sources)
     if options["solve"] != "joint":
         scope = (
             "No σ were computed, because the groups were solved one by one; look at the chains. All results hold for "
@@ -51,37 +50,28 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
         )
     elif judgement.verdict == "no":
         scope = "No σ are shown, as they would not be valid: they do not include the error that made the checks fail"
-    elif options.get("refine_camera", False):
-        scope = f"σ hold for {size}; the intrinsics were adjusted, and their σ are in them{stated}" + (
-            f". An error of {pitch} is not in them" if words.board else ""
-        )
     else:
-        scope = (
-            f"σ hold for the given intrinsics and {size}{stated}. An error of the camera calibration"
-            + (f", or of {pitch}," if words.board else "")
-            + " is not in them"
+        refined = options.get("refine_camera", False)
+        scope = f"σ hold for {'' if refined else 'the given intrinsics and '}{size}"
+        scope += "; the intrinsics were adjusted, and their σ are in them" if refined else ""
+        scope += ". The σ stated of the size are in them" if {"faces", "distances"} & set(sources) else ""
+        absent = [] if refined else ["the camera calibration"]
+        absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if words.board else []
+        scope += (
+            f". An error of {', or of '.join(absent)} is not in them, and residuals hardly show it" if absent else ""
         )
-    factor = f"group by group, {factor_in_words(summary['sigma_factor'])}"
-    if summary["sigma0"] is not None:
-        factor += (
-            ". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = "
-            f"{summary['sigma0']:.2f}; near 1, all observations agree with one another. The σ of the faces include "
-            "that factor, and σ₀ too where it is above 1: small residuals make no σ smaller. `budget` states the "
-            f"latter as {max(1.0, summary['sigma0']):.3f}"
+    factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
+    larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
+    of_groups = f"group by group, residuals are {larger} the centres' own σ"
+    if sigma0 is not None:
+        of_groups += (
+            f". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = {sigma0:.2f}; near 1, "
+            "all observations agree with one another. The σ of the faces include that factor, and σ₀ too where it is "
+            f"above 1: small residuals make no σ smaller. `budget` states the latter as {max(1.0, sigma0):.3f}"
         )
     single = [face for face, chains in report["chains"].items() if len(chains) == 1]
     one_way = "reached by only one chain, so that no second chain confirms them: face"
-    return [
-        f"{scope}, and residuals hardly show it" if scope.endswith("not in them") else scope,
-        factor,
-        f"{one_way} {join(single)}" if single else "",
-    ]
-
-
-def factor_in_words(factor: float) -> str:
-    if 0.95 <= factor <= 1.05:
-        return "residuals are as large as the centres' own σ"
-    return f"residuals are {factor:.1f} times the centres' own σ"
+    return [scope, of_groups, f"{one_way} {join(single)}" if single else ""]
 
 
 def settings(report: dict, words: Words) -> list[list[str]]:
@@ -129,22 +119,20 @@ LIMITS = (
     ("camera_um", "µm", "of cameras"),
     ("camera_mdeg", "mdeg", "of cameras"),
 )
-COMPARISONS = ("mapping", "result", "plain")
 
 
 def crosscheck_section(check: dict) -> list[Block]:
     """Returns the section on the cross-check with the native COLMAP."""
     limits, mapping = check["tolerances"], check["mapping"]
-    allowed = [f"{limits[key]:g} {unit} {object_name}" for key, unit, object_name in LIMITS if limits[key] is not None]
+    allowed = [f"{limits[key]:g} {unit} {what}" for key, unit, what in LIMITS if limits[key] is not None]
     faces: dict[str, list[tuple[float, str]]] = {}
     for label, value in mapping["circles_um"].items():
         faces.setdefault(parse_label(label).plane, []).append((value, label))
-    programs = {
-        "native": f"COLMAP {check['native']}",
-        "pycolmap": f"pycolmap {check['pycolmap']}",
-        "run": "this result",
-    }
-    models = [[name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs.items()]
+    names = (f"COLMAP {check['native']}", f"pycolmap {check['pycolmap']}", "this result")
+    models = [
+        [name, check["images"][key], number(check["residual_rms_px"][key], 4)]
+        for key, name in zip(("native", "pycolmap", "run"), names, strict=True)
+    ]
     circles = [
         [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
         for face, rows in sorted(faces.items())
@@ -152,6 +140,10 @@ def crosscheck_section(check: dict) -> list[Block]:
     largest = ""
     if worst := max(mapping["cameras"], key=lambda row: row["sigmas"], default=None):
         largest = f"; the largest is {worst['sigmas']:.2f} σ, {worst['position_um']:.1f} µm, at {worst['image']}"
+    rows = [[face] for face in mapping["faces"]]
+    for row, key in product(rows, ("mapping", "result", "plain")):
+        entry = check[key]["faces"].get(row[0])
+        row += [*cells(entry, "translation_um:3 rotation_mdeg:3 sigmas:2")] if entry else [NONE] * 3
     over = [("", 1), ("Native – pycolmap", 3), ("Native, adjusted – result", 3), ("Native – result", 3)]
     return [
         f"Native COLMAP {check['native']} and pycolmap {check['pycolmap']} on the same database (schema "
@@ -163,11 +155,7 @@ def crosscheck_section(check: dict) -> list[Block]:
         "this result, after our own adjustment and without it. σ is the difference in the run's own standard "
         f"deviations. Allowed in the first two: {', '.join(allowed)}; the third shows what weights and the joint "
         "adjustment are worth",
-        Table(
-            ["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3,
-            [_face_row(check, f) for f in mapping["faces"]],
-            over,
-        ),
+        Table(["<Face"] + ["Position (µm)", "Rotation (mdeg)", "σ"] * 3, rows, over),
         subheading("Circles"),
         "Native against pycolmap",
         Table(["<Face", "Circles", "Mean (µm)", "Max (µm)", "<Worst"], circles),
@@ -176,15 +164,6 @@ def crosscheck_section(check: dict) -> list[Block]:
         f"move with them, which the table of faces shows{largest}",
         *check["notes"],
     ]
-
-
-def _face_row(check: dict, face: str) -> list[str]:
-    """Returns the row of a face: position, rotation and σ of each comparison."""
-    row = [face]
-    for key in COMPARISONS:
-        entry = check[key]["faces"].get(face)
-        row += [*cells(entry, "translation_um:3 rotation_mdeg:3"), number(entry["sigmas"], 2)] if entry else [NONE] * 3
-    return row
 
 
 FIRST_NAMES = 6
