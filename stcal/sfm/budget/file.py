@@ -327,8 +327,10 @@ def _unusual(statement: Statement) -> list[str]:
 
 def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
-    notes, statement, conditions = [], budget.statement, budget.conditions
-    if failed := run.failed_checks():
+    statement, conditions, has_board = budget.statement, budget.conditions, bool(run.board_design.rows)
+    failed, unknown = run.failed_checks(), [source.title for source in budget.sources if source.origin == "not stated"]
+    notes = []
+    if failed:
         invalid = join(invalidated(check["key"] for check in failed))
         notes.append(
             f"failed checks of the run: {len(failed)}, first {failed[0]['title']}; what they found is not among the "
@@ -336,28 +338,22 @@ def notes_of(budget: Budget, verified: Verified, run: SavedRun) -> list[str]:
         )
     elif is_refused(run):
         notes.append(f"may the run be used? {answer_of(run).use} No uncertainty of it is given")
-    if not conditions.size_known:
-        notes.append(f"{conditions.words}; lengths of the run are in the unit of the drawing")
-    if unknown := [source.title for source in budget.sources if source.origin == "not stated"]:
-        notes.append(
-            f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
-            "are"
-        )
-    if conditions.size_known and conditions.correction and not is_refused(run):
-        notes.append(
-            f"for the stated expansion, lengths in faces.json are still to be changed by "
-            f"{PPM * conditions.correction:+.1f} ppm; the tables here have them changed, and U holds for these"
-        )
-    if not run.board_design.rows and statement.board != StatedSize():
-        notes.append("no board was in view: what is stated of [board] is not used")
+    corrected = conditions.size_known and conditions.correction and not is_refused(run)
     both = statement.board.temperature_sigma_k and statement.target.temperature_sigma_k
-    if run.board_design.rows and both and not statement.one_thermometer:
-        notes.append(
-            "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured "
-            "both (one_thermometer of the statement), U is too large"
-        )
+    told = {
+        f"{conditions.words}; lengths of the run are in the unit of the drawing": not conditions.size_known,
+        f"taken as exact, since nothing is stated of them: {join(unknown)}; the uncertainties hold as far as these "
+        "are": unknown,
+        f"for the stated expansion, lengths in faces.json are still to be changed by "
+        f"{PPM * conditions.correction:+.1f} ppm; the tables here have them changed, and U holds for these": corrected,
+        "no board was in view: what is stated of [board] is not used": not has_board
+        and statement.board != StatedSize(),
+        "errors of the temperatures of board and target are taken as uncorrelated; where one thermometer measured both "
+        "(one_thermometer of the statement), U is too large": has_board and both and not statement.one_thermometer,
+    }
     return [
         *notes,
+        *(note for note, applies in told.items() if applies),
         *_unusual(statement),
         *verified.notes(),
         "the reference face's frame is the target frame and carries no uncertainty; that of how its own points define "

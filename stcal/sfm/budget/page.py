@@ -20,7 +20,7 @@ from stcal.report.document import (
 )
 from stcal.report.text import NONE, join, number, significant
 from stcal.sfm.budget.combine import Budget, budget_of_run
-from stcal.sfm.budget.file import BudgetFile, Uncertainty, refusals
+from stcal.sfm.budget.file import BudgetFile, SourceRow, Uncertainty, refusals
 from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated, common_views
 from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run, verify
@@ -150,14 +150,10 @@ def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
 
 def _result(file: BudgetFile) -> list[Block]:
     """Returns headline, notes, and the tables of positions, rotations and distances with their U."""
-    lengths = [
-        [
-            "–".join(e.circles),
-            *(as_exact(v, 1e-3 * e.distance_um.expanded) for v in (e.length_mm, e.corrected_mm)),
-            significant(e.distance_um.expanded),
-        ]
-        for e in file.distances
-    ]
+    lengths = []
+    for own in file.distances:
+        exact = [as_exact(v, 1e-3 * own.distance_um.expanded) for v in (own.length_mm, own.corrected_mm)]
+        lengths.append(["–".join(own.circles), *exact, significant(own.distance_um.expanded)])
     positions = [
         [face, *_with_u(e.position_mm, e.position_um.axes, file)]
         for face, e in file.faces.items()
@@ -208,51 +204,48 @@ def _contributions(file: BudgetFile) -> list[Block]:
         ("rotations of faces, x, y, z together", "mdeg", rotations),
         ("longest distances", "µm", distances),
     )
-    return [_table(title, unit, columns, file) for title, unit, columns in kinds if columns]
+    return [
+        Table(
+            [f"<{title}, {unit}", f"sensitivity, {next(iter(columns))}", *columns],
+            [
+                *(_source_row(source, unit, columns) for source in file.sources),
+                ["combined standard uncertainty u", "", *(number(u.standard, 2) for u in columns.values())],
+                [f"expanded uncertainty U, k = {file.coverage_factor:g}", "",
+                 *(significant(u.expanded) for u in columns.values())],
+                ["coverage of U, simulated, %", "", *(number(100 * u.coverage, 1) for u in columns.values())],
+                ["effective degrees of freedom", "",
+                 *(f"{u.degrees_of_freedom:.0f}" if (u.degrees_of_freedom or MANY) < MANY else "∞"
+                   for u in columns.values())],
+            ],
+        )
+        for title, unit, columns in kinds
+        if columns
+    ]  # fmt: skip
 
 
-def _table(title: str, unit: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Table:
-    """Returns contributions by input, with the sensitivity of the first measurand, then the sums."""
-    name, first = next(iter(columns.items()))
-    rows = []
-    for source in file.sources:
-        own = {column: u.contributions[source.key] for column, u in columns.items()}
-        visible = source.sigma and first.standard and own[name] / first.standard > NEGLIGIBLE
-        slope = f"{own[name] / source.sigma:.3g} {unit}/{source.unit}" if visible and source.sigma else NONE
-        parts = [number(contribution, 2) for contribution in own.values()]
-        if source.origin == "not stated":
-            parts = [NONE] * len(parts)
-        elif (source.key, source.origin) == ("intrinsics", "estimated") and all(
-            own[column] <= IN_OTHERS * u.standard for column, u in columns.items()
-        ):  # what they do is in the rows of the centres, with which they were adjusted
-            parts = ["in the other rows"] * len(parts)
-        rows.append([source.title, slope, *parts])
-    every = columns.values()
-    freedom = [u.degrees_of_freedom or MANY + 1 for u in every]
-    return Table(
-        [f"<{title}, {unit}", f"sensitivity, {name}", *columns],
-        [
-            *rows,
-            ["combined standard uncertainty u", "", *(number(u.standard, 2) for u in every)],
-            [f"expanded uncertainty U, k = {file.coverage_factor:g}", "", *(significant(u.expanded) for u in every)],
-            ["coverage of U, simulated, %", "", *(number(100 * u.coverage, 1) for u in every)],
-            ["effective degrees of freedom", "", *("∞" if own > MANY else f"{own:.0f}" for own in freedom)],
-        ],
-    )
+def _source_row(source: SourceRow, unit: str, columns: dict[str, Uncertainty]) -> list[str]:
+    """Returns the contributions of an input, with the sensitivity of the first measurand."""
+    own = [u.contributions[source.key] for u in columns.values()]
+    first, slope = next(iter(columns.values())), NONE
+    if source.sigma and first.standard and own[0] / first.standard > NEGLIGIBLE:
+        slope = f"{own[0] / source.sigma:.3g} {unit}/{source.unit}"
+    parts = [number(contribution, 2) for contribution in own]
+    in_others = all(part <= IN_OTHERS * u.standard for part, u in zip(own, columns.values(), strict=True))
+    if source.origin == "not stated":
+        parts = [NONE] * len(parts)
+    elif (source.key, source.origin) == ("intrinsics", "estimated") and in_others:
+        # What they do is in the rows of the centres, with which they were adjusted.
+        parts = ["in the other rows"] * len(parts)
+    return [source.title, slope, *parts]
 
 
 def _length_test(test: LengthTest) -> list[Block]:
     """Returns the verdict of a length test, and its lengths."""
     rows = [
-        [
-            "–".join(length.circles),
-            *(number(v, 4) for v in (length.measured_mm, length.reference_mm)),
-            number(length.error_um, 2),
-            significant(length.expanded_um),
-            number(length.e_n, 2),
-        ]
-        for length in test.lengths
-    ]
+        ["–".join(own.circles), number(own.measured_mm, 4), number(own.reference_mm, 4), number(own.error_um, 2),
+         significant(own.expanded_um), number(own.e_n, 2)]
+        for own in test.lengths
+    ]  # fmt: skip
     return [
         subheading(f"Against {test.reference}"),
         f"length test against {test.reference}: {test.verdict}",

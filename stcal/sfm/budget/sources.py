@@ -36,14 +36,11 @@ DEFAULT = "; the default, which `design` writes too: measure it and state it"
 """Words for a σ that nobody has changed."""
 
 
-def _written(value: object) -> object:
-    """Returns a date or time of TOML as its text."""
-    if isinstance(value, datetime):
-        return value.isoformat(" ")
-    return value.isoformat() if isinstance(value, date | time) else value
-
-
-Text = Annotated[str, BeforeValidator(_written), Field(max_length=LONGEST)]
+Text = Annotated[
+    str,
+    BeforeValidator(lambda value: str(value) if isinstance(value, date | time) else value),  # as TOML has them
+    Field(max_length=LONGEST),
+]
 FieldName = Annotated[str, Field(min_length=1, max_length=60)]
 
 
@@ -330,18 +327,17 @@ def conditions_of(statement: Statement, board: BoardDesign) -> Conditions:
     photographed = "the temperature at which the target was photographed"
     if target.temperature_c is not None:
         photographed = f"{target.temperature_c:g} °C, at which the target was photographed"
-    held = f"Lengths and positions hold at {photographed}"
+    words = f"Lengths and positions hold at {photographed}"
     if of_board is not None:
-        corrected = f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
-        words = f"{held}{corrected}: expansion and temperature of the target are not both stated"
-        return Conditions(True, of_board, target.temperature_c, words)
-    words = (
-        f"{held}, as far as the board's grid had the size of its file there: its expansion and temperature are not "
-        "both stated"
-    )
-    if of_target is not None:
-        words += ", and without them the target's are not corrected for"
-    return Conditions(True, 0.0, target.temperature_c, words)
+        words += f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
+        words += ": expansion and temperature of the target are not both stated"
+    else:
+        words += (
+            ", as far as the board's grid had the size of its file there: its expansion and temperature are not both "
+            "stated"
+        )
+        words += ", and without them the target's are not corrected for" if of_target is not None else ""
+    return Conditions(True, of_board or 0.0, target.temperature_c, words)
 
 
 def _growth(stated: StatedSize) -> float | None:
