@@ -214,30 +214,21 @@ def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[
     normal, right = network.score(apart(network, columns))
     redundancy, square = float(network.redundancy.sum()), float((network.residual**2).sum())
 
-    def of(out: Collection[int]) -> np.ndarray:
-        return (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
-
-    def test(image: int, out: Collection[int]) -> ScoreTest:
-        own, held = of([image]), of(out)
-        if not len(held):
-            return solve_score(normal[np.ix_(own, own)], right[own])
-        away = normal[np.ix_(own, held)] @ np.linalg.pinv(normal[np.ix_(held, held)], hermitian=True)
-        return solve_score(normal[np.ix_(own, own)] - away @ normal[np.ix_(held, own)], right[own] - away @ right[held])
+    def explained(out: Collection[int]) -> ScoreTest:
+        own = (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
+        return solve_score(normal[np.ix_(own, own)], right[own])
 
     def worst(out: Collection[int]) -> int | None:
-        tests = {i: test(i, out) for i in suspects if i not in out}
-        taken = solve_score(normal[np.ix_(of(out), of(out))], right[of(out)]) if out else None
-        total, freedom = square, redundancy
-        if taken is not None:
-            total, freedom = square - taken.statistic, redundancy - taken.freedom
-        chance = {}
-        for i, t in tests.items():
-            if t.freedom:
-                rest = max(freedom - t.freedom, 1.0)
-                noise = max((total - t.statistic) / rest, 1.0)
-                chance[i] = fdtrc(t.freedom, rest, t.statistic / noise / t.freedom)
-        guilty = [i for i, probability in chance.items() if probability * count < SUSPICIOUS]
-        return max(guilty, key=lambda i: tests[i].statistic, default=None)
+        taken, gains = explained(out), {}
+        for i in (i for i in suspects if i not in out):
+            both = explained([*out, i])
+            gain, free = both.statistic - taken.statistic, both.freedom - taken.freedom
+            if free > 0:
+                rest = max(redundancy - both.freedom, 1.0)
+                noise = max((square - both.statistic) / rest, 1.0)
+                if fdtrc(free, rest, gain / noise / free) * count < SUSPICIOUS:
+                    gains[i] = gain
+        return max(gains, key=lambda i: gains[i], default=None)
 
     return culprits(network.model.images, worst, where)
 

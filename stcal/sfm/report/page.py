@@ -65,7 +65,7 @@ def report_html(
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
     shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
     pictures = [
-        macro("photographs", shown, rest, words) if shown.each else "" if gone else "There are none",
+        macro("photographs", shown, rest, words) if shown["each"] else "" if gone else "There are none",
         f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
         if gone
         else "",
