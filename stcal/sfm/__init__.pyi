@@ -1,7 +1,7 @@
-from .budget.page import uncertainty_budget as uncertainty_budget
+from .budget.budget_page import uncertainty_budget as uncertainty_budget
 from .camera.calibrate import calibrate_camera as calibrate_camera
-from .checks.verdict import Trial as Trial
-from .checks.verdict import judge as judge
+from .checks.significance import Trial as Trial
+from .checks.significance import judge as judge
 from .detect.labels import Detection as Detection
 from .detect.labels import detect_circles as detect_circles
 from .interop.crosscheck import crosscheck as crosscheck

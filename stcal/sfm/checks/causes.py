@@ -17,10 +17,10 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
-from stcal.sfm.checks.images import NO_ELLIPSES, by_eccentricity, by_motion
-from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, apart
+from stcal.sfm.checks.image_checks import NO_ELLIPSES, by_eccentricity, by_motion
+from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, apart
 from stcal.sfm.data.as_drawn import FAR_DEG, turned_faces
-from stcal.sfm.report.check import CAUSE, FAILED, OF_WHOLE_SET, SUSPICIOUS, Check, Measured
+from stcal.sfm.report.check import CAUSE, FAILED, OF_WHOLE_SET, SUSPICIOUS, Check, TestedValue
 
 EXPLAINS = 0.8
 """Smallest share of what the best hypothesis explains that another one with fewer parameters must explain."""
@@ -65,13 +65,8 @@ class Hypothesis:
         return network.score(apart(network, columns) if self.scope == "image" else columns)
 
 
-def of_file(cause: Hypothesis) -> bool:
-    """Whether a hypothesis says that the camera file is wrong."""
-    return cause.scope == "all" and not callable(cause.by)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
+class FittedCause:
     """A hypothesis with its parameters; ``left`` : squared residuals per degree of freedom that it leaves;
     ``probability`` : of what it explains by chance."""
 
@@ -82,8 +77,8 @@ class Fitted:
 
 
 def _named(
-    fitted: Sequence[Fitted], misfit: Callable[[Fitted], float], most: float, alike: float = 1.0
-) -> tuple[list[Fitted], Check | None]:
+    fitted: Sequence[FittedCause], misfit: Callable[[FittedCause], float], most: float, alike: float = 1.0
+) -> tuple[list[FittedCause], Check | None]:
     """Returns the hypotheses with the fewest free parameters that explain the data, motions last; and their check."""
     candidates = (
         Candidate(f.cause.name, lambda f=f: f, (f.cause.by is _by_motion, f.test.freedom - f.cause.whole))
@@ -107,7 +102,7 @@ def whole_set_cause(
 ) -> Check | None:
     """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals. What
     is beyond chance is what the most flexible hypothesis explains."""
-    possible = [cause for cause in _hypotheses(camera) if from_file or not of_file(cause)]
+    possible = [cause for cause in _hypotheses(camera) if from_file or cause.scope != "all" or callable(cause.by)]
     fitted = [f for cause in possible if (f := _fit(cause, networks, camera)) is not None]
     if not fitted:
         return None
@@ -117,7 +112,7 @@ def whole_set_cause(
     by_chance = 2 * richest.left * np.sqrt(2 * richest.test.freedom)  # two σ of what its parameters fit by chance
     enough = max(EXPLAINS * most, EXPLAINS_ALL * most - by_chance)
 
-    def misfit(own: Fitted) -> float:
+    def misfit(own: FittedCause) -> float:
         is_possible = moved or own.cause.by is not _by_motion
         is_certain = own.probability * len(fitted) < FAILED
         return own.left if is_possible and is_certain and _applies(own, networks, camera) else np.inf
@@ -140,7 +135,7 @@ def whole_set_cause(
         f"{after:.2f} times as large"
     )
     measured = tuple(
-        Measured(f.cause.name, share[id(f)], None, "% explained", f.probability)
+        TestedValue(f.cause.name, share[id(f)], None, "% explained", f.probability)
         for f in sorted(fitted, key=lambda f: (f is not first, f.test.freedom))
     )
     return replace(check, reason=reason, measured=measured)
@@ -154,19 +149,19 @@ def cause_of_file(camera: Camera, found: Camera, covariance: np.ndarray, colmap_
     square = float(off @ weight @ off)
     fitted = []
     for cause in _hypotheses(camera):
-        if of_file(cause):
+        if cause.scope == "all" and not callable(cause.by):  # what says that the file is wrong
             along = to_model @ cause.by
             test = solve_score(along.T @ weight @ along, along.T @ weight @ off)
-            fitted.append(Fitted(cause, test, square - test.statistic))
+            fitted.append(FittedCause(cause, test, square - test.statistic))
 
-    def misfit(own: Fitted) -> float:
+    def misfit(own: FittedCause) -> float:
         within = FILE_WITHIN + 3 * np.sqrt(own.test.covariance[0, 0])
         return np.inf if own.cause.whole and abs(own.test.estimate[0] - 1) > within else own.left
 
     best, check = _named(fitted, misfit, (1 - EXPLAINS_ALL) * square)
     if check is None:
         return None
-    share = Measured(best[0].cause.name, 100 * best[0].test.statistic / square, None, "% explained", None)
+    share = TestedValue(best[0].cause.name, 100 * best[0].test.statistic / square, None, "% explained", None)
     return replace(check, measured=(share,))
 
 
@@ -226,7 +221,7 @@ def _square(networks: Sequence[Network]) -> float:
     return sum(float((n.residual**2).sum()) for n in networks)
 
 
-def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> Fitted | None:
+def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> FittedCause | None:
     """Returns the hypothesis fitted to all networks; None if it cannot be."""
     if cause.scope == "image" and max(len(n.model.images) for n in networks) > MOST_IMAGES:
         return None
@@ -238,7 +233,7 @@ def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> Fitt
         tests = [solve_score(*own) for own in equations]
         test = ScoreTest(
             np.concatenate([t.estimate for t in tests]),
-            block_diag(*(t.covariance for t in tests)),
+            np.asarray(block_diag(*(t.covariance for t in tests))),
             sum(t.statistic for t in tests),
             sum(t.freedom for t in tests),
         )
@@ -247,10 +242,10 @@ def _fit(cause: Hypothesis, networks: Sequence[Network], camera: Camera) -> Fitt
     left = (_square(networks) - test.statistic) / rest if rest > 0 else 0.0
     if not test.freedom or left <= 0 or test.freedom > MOST_SHARE * redundancy:
         return None
-    return Fitted(cause, test, left, float(fdtrc(test.freedom, rest, test.statistic / test.freedom / left)))
+    return FittedCause(cause, test, left, float(fdtrc(test.freedom, rest, test.statistic / test.freedom / left)))
 
 
-def _applies(fitted: Fitted, networks: Sequence[Network], camera: Camera) -> bool:
+def _applies(fitted: FittedCause, networks: Sequence[Network], camera: Camera) -> bool:
     """Whether the estimates are those of a cause of the whole set: a change as a whole is 1, or in each image 1 or 0,
     groups differ, and a few images do not explain it alone."""
     cause, estimate, variance = fitted.cause, fitted.test.estimate, np.diag(fitted.test.covariance)

@@ -26,7 +26,7 @@ from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
-from stcal.sfm.checks.board import (
+from stcal.sfm.checks.board_checks import (
     KINDS,
     board_checks,
     measure_radii,
@@ -36,8 +36,8 @@ from stcal.sfm.checks.board import (
     rim_limit_mm,
 )
 from stcal.sfm.checks.causes import whole_set_cause
-from stcal.sfm.checks.faces import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
-from stcal.sfm.checks.images import (
+from stcal.sfm.checks.face_checks import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
+from stcal.sfm.checks.image_checks import (
     NO_ELLIPSES,
     by_eccentricity,
     camera_check,
@@ -50,9 +50,9 @@ from stcal.sfm.checks.images import (
     sigma_check,
     summed,
 )
-from stcal.sfm.checks.verdict import Trial, assess
+from stcal.sfm.checks.significance import Trial, assess
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
-from stcal.sfm.report.check import CHECKS, Check, Measured, impossible
+from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
 
 JOINT = ("agreement", "halves", "groups", "loops")
 """Checks that need the joint result and its covariances."""
@@ -213,7 +213,7 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     return replace(check, reason=reason, measured=check.measured + measured)
 
 
-def _control(evidence: Evidence) -> tuple[str, tuple[Measured, ...]]:
+def _control(evidence: Evidence) -> tuple[str, tuple[TestedValue, ...]]:
     camera, whole = evidence.calibration.camera, evidence.calibration.target
     models = [adjust(replace(m, shift_px=np.zeros_like(m.shift_px)), camera) for m in evidence.models]
     options = replace(evidence.options, solve="chain", frame="three-point", eccentricity=False)
@@ -225,7 +225,7 @@ def _control(evidence: Evidence) -> tuple[str, tuple[Measured, ...]]:
     }
     rms = float(np.sqrt(np.concatenate([m.residuals_px(camera).ravel() ** 2 for m in models]).mean()))
     rows = tuple(
-        Measured(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
+        TestedValue(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
     )
     largest = max(shifts.values(), default=0.0)
     return f"without it faces are off by up to {largest:.0f} µm at residuals of {rms:.4f} px", rows
@@ -250,9 +250,9 @@ def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: 
     fits = f"{name} would fit with {times:.4g} times its stated size, and the others agree with one another"
     if print_factor > MOST_PRINT_FACTOR:
         # σ that have grown so much would hide the contradiction that made them grow.
-        grown = Measured("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
+        grown = TestedValue("corners about the design", print_factor, MOST_PRINT_FACTOR, "× their stated σ", None)
         if name:
-            size = Measured(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
+            size = TestedValue(name, 100 * (times - 1), 100 * ALONE, "% larger than stated", None)
             return Check(key, title, "failed", fits, (size, grown), 1, (name,), f"correct the size of {name}")
         why = "the size or drawing of the print is another one, or its σ too small"
         reason = f"{grown.name} at {grown.words()}: {why}"

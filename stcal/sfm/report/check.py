@@ -61,7 +61,7 @@ the others, but groups that contradict one another make no fault within one of t
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class TestedValue:
     """One tested value."""
 
     name: str  # image, label, face, group, row …
@@ -96,7 +96,7 @@ class Check(Brief):
         A failed check makes the answer of the run "no".
     reason : str
         The verdict in words.
-    measured : tuple of Measured
+    measured : tuple of TestedValue
         Values, the worst first.
     tested : int
         Number of values tested.
@@ -112,7 +112,7 @@ class Check(Brief):
     title: str
     verdict: Verdict
     reason: str
-    measured: tuple[Measured, ...]
+    measured: tuple[TestedValue, ...]
     tested: int
     names: tuple[str, ...]
     remedy: str
@@ -124,7 +124,7 @@ class Check(Brief):
     @classmethod
     def read(cls, row: dict) -> "Check":
         """Returns the check of a row of ``report.json``."""
-        measured = tuple(Measured(**value) for value in row["measured"])
+        measured = tuple(TestedValue(**value) for value in row["measured"])
         return cls(**row | {"measured": measured, "names": tuple(row["names"])})
 
     def told(self) -> str:

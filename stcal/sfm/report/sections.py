@@ -6,7 +6,7 @@ from itertools import product
 from stcal.labels import parse_label
 from stcal.report.document import Block, Table, alarms, fold, subheading, verdict_word
 from stcal.report.text import NONE, cells, join, number
-from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, Measured, count_verdicts
+from stcal.sfm.report.check import BY_CHANCE, ORDER, Check, TestedValue, count_verdicts
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import SIZES, Judgement
 
@@ -202,7 +202,7 @@ def _check_row(check: Check) -> list:
     return [check.title, verdict_word(check.told()), *value, names, check.reason, check.remedy]
 
 
-def _number(measured: Measured) -> list[str]:
+def _number(measured: TestedValue) -> list[str]:
     """Returns value and limit with their unit."""
 
     def short(value: float) -> str:

@@ -27,7 +27,7 @@ from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.camera.calibrate import camera_of_labelled, weighted_rms_px
 from stcal.sfm.checks.causes import EXPLAINS, cause_of_file
-from stcal.sfm.checks.verdict import MOVED, MOVED_REMEDY, Check, moved_apart
+from stcal.sfm.checks.significance import MOVED, MOVED_REMEDY, Check, moved_apart
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group, detections_csv
 from stcal.sfm.data.note import BOARD_LEFT_OUT, Note
 from stcal.sfm.data.patterns import pitch_hint

@@ -16,7 +16,7 @@ from stcal.sfm.detect.predict import REMEDIES
 from stcal.sfm.report.check import BY_CHANCE, Check, count_verdicts, ranked
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import QUESTIONS, without_sigma_of
-from stcal.sfm.report.page import CONTROL, PUBLISHED, faces_table
+from stcal.sfm.report.run_page import CONTROL, PUBLISHED, faces_table
 from stcal.sfm.runs.report import face_row
 from stcal.sfm.runs.result import RunResult
 

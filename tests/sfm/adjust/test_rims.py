@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board, load_target, target_toml
 from stcal.sfm.adjust.joint import adjust_jointly
 from stcal.sfm.adjust.rims import Rim, _rim, find_rims, lost_radius_mm
-from stcal.sfm.checks.board import rim_check
+from stcal.sfm.checks.board_checks import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_single

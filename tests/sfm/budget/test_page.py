@@ -7,9 +7,9 @@ import pytest
 
 from stcal.report import document as pdf
 from stcal.report.text import significant
+from stcal.sfm.budget.budget_file import BudgetFile
+from stcal.sfm.budget.budget_page import REQUIRED, as_exact, budget_report
 from stcal.sfm.budget.combine import budget_of_run
-from stcal.sfm.budget.file import BudgetFile
-from stcal.sfm.budget.page import REQUIRED, as_exact, budget_report
 from stcal.sfm.runs.saved import load_run, verify
 from tests.outcome import INPUT, assert_error
 

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from stcal.sfm.report.page import report_html
+from stcal.sfm.report.run_page import report_html
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}

@@ -26,9 +26,9 @@ from stcal.report.document import (
     tone_of,
 )
 from stcal.report.text import cells, join, number
-from stcal.sfm.report import figures
-from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
+from stcal.sfm.report import run_figures
 from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
+from stcal.sfm.report.run_figures import FIRST_IMAGES, Residuals, photographs, space_parts
 from stcal.sfm.report.sections import (
     Words,
     checks_section,
@@ -60,7 +60,7 @@ def report_html(
     if judgement.verdict == "no":
         report = without_sigma(report)
     report = _with_named_groups(report)
-    colours = figures.group_colours([group["name"] for group in report["groups"]])
+    colours = run_figures.group_colours([group["name"] for group in report["groups"]])
     summary, words, options = report["summary"], Words.of(report), report["options"]
     others = {"comparison": ("As published", published_section), "crosscheck": ("Cross-check", crosscheck_section)}
     shown, rest = photographs(report, overlays, residuals or {}), len(report["images"]) - len(overlays) - gone
@@ -148,7 +148,7 @@ def _answer(report: dict, colours: dict[str, str], words: Words) -> list[Block]:
     space = [
         macro(
             "turned",
-            lambda: figures.upright(parts, report["scene"]["cameras"]),
+            lambda: run_figures.upright(parts, report["scene"]["cameras"]),
             f"Target, {with_it} in space",
             [("target", "Target"), ("all", f"With {with_it}")],
         ),
@@ -260,7 +260,7 @@ def _board_residuals(groups: list[dict]) -> list[Html]:
     height = max((abs(vector[2]) for vector in vectors), default=0.0)
     return [
         plot(
-            partial(figures.board_residuals, scale["board_residuals_um"], reach, height),
+            partial(run_figures.board_residuals, scale["board_residuals_um"], reach, height),
             f"Residual vectors of the board, group {name}",
             f"Group {name}: RMS {number(scale['board_rms_um'], 1)} µm",
             "",

@@ -20,9 +20,9 @@ from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.uncertainty import calibrated_target, result_of
-from stcal.sfm.checks.verdict import Guilt, Trial, assess
+from stcal.sfm.checks.significance import Guilt, Trial, assess
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.report.check import SUSPICIOUS, Check, Measured, impossible
+from stcal.sfm.report.check import SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_HALF = 2
 """Smallest number of images of a group in each half."""
@@ -268,7 +268,7 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     check = assess("agreement", [trial], "adjustments", remedy, covered=True)
     if joint.settled:
         return check
-    last = Measured("last step", joint.last_move_px, SETTLED_PX, "px", None)
+    last = TestedValue("last step", joint.last_move_px, SETTLED_PX, "px", None)
     return replace(
         check,
         verdict="suspicious" if check.verdict == "passed" else check.verdict,

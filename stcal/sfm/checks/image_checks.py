@@ -16,7 +16,7 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
-from stcal.sfm.checks.verdict import (
+from stcal.sfm.checks.significance import (
     FREE,
     MOST_SIGMAS,
     SHOWN,
@@ -28,7 +28,7 @@ from stcal.sfm.checks.verdict import (
     on_face,
 )
 from stcal.sfm.data.model import ImageObservations, Outlier
-from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, Measured, impossible
+from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 MIN_CIRCLES = 3
 """Smallest number of circles of the faces, and of the board, in an image that can show motion between both."""
@@ -78,7 +78,7 @@ def camera_check(
     rms = float(np.sqrt(max(test.statistic, 0) / max(test.freedom, 1)))
     check = assess("camera", [Trial("camera", rms, "σ", test.statistic, test.freedom, redundancy)], "cameras", remedy)
     single = tuple(
-        Measured(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
+        TestedValue(name, float(value), float(3.29 * s), "px" if name[0] in "fc" else "", None)
         for name, value, s in zip(names, estimate, sigma, strict=True)
     )
     values = ", ".join(f"{m.name} {m.value:+.2g}" for m in single if abs(m.value) > (m.limit or 0))
@@ -144,7 +144,7 @@ def sigma_check(networks: Sequence[Network], factor: float) -> Check:
         return impossible("centres", FREE, "add images")
     reason = f"residuals are {factor:.2f} times the centres' own σ, limit {low:g}; {redundancy:.0f} degrees of freedom"
     remedy = "look at the other checks first: camera, moved target, images; then at exposure and sharpness"
-    measured = (Measured("all images", factor, low, "×", None),)
+    measured = (TestedValue("all images", factor, low, "×", None),)
     names = () if verdict == "passed" else ("all images",)
     return Check("centres", CHECKS["centres"][0], verdict, reason, measured, 1, names, remedy if names else "")
 
@@ -359,7 +359,7 @@ def labels_check(
     lost = tuple(name for own in guilt for name in own.culprits)
     named = tuple(f"{o.image} {o.label}" for o in outliers)
     measured = tuple(
-        Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
+        TestedValue(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
     )
     verdict, reason = "suspicious", f"{len(outliers)} left out, first {named[0]}: {measured[0].words()}"
     if guilt:

@@ -5,15 +5,15 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 import stcal
 from stcal.design import StatedSize
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
-from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row, View
-from stcal.sfm.budget.lengths import LengthTest
+from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, GroupViews, Row
+from stcal.sfm.budget.length_test import LengthTest
 from stcal.sfm.budget.sources import REFERENCE_C, Origin, Statement
 from stcal.sfm.report.check import invalidated
 from stcal.sfm.report.judgement import Judgement, judgement_of
@@ -136,7 +136,7 @@ class BudgetFile(ResultFile):
         description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
     )
     redundancy: int = Field(description="degrees of freedom of the adjustment")
-    views: list[View] = Field(
+    views: list[GroupViews] = Field(
         description="of each `group`: `images`, and `spread_deg`, the largest angle between two camera axes"
     )
     sources: list[SourceRow] = Field(
@@ -245,7 +245,7 @@ class BudgetFile(ResultFile):
             faces={} if refused else faces,
             distances=[] if refused or not known else distances,
             circles={} if refused or not known else circles,
-            length_tests=[asdict(test) for test in tests],
+            length_tests=TypeAdapter(list[LengthTest]).validate_python([asdict(test) for test in tests]),
             notes=notes_of(budget, verified, run),
         )
 

@@ -25,7 +25,7 @@ SHARED = ("board_pitch", "board_expansion", "target_expansion")
 
 
 @dataclass(frozen=True, slots=True)
-class Length:
+class TestedLength:
     """A measured length against a reference; U of their difference, and E_n with its sign, None where none holds."""
 
     circles: tuple[str, ...]
@@ -41,7 +41,7 @@ class LengthTest:
     """A length test. ``reference`` : what the lengths are compared with; ``notes`` : what the test cannot detect."""
 
     reference: str
-    lengths: list[Length]
+    lengths: list[TestedLength]
     largest_e_n: Finite
     beyond: int | None
     limit: float
@@ -50,7 +50,7 @@ class LengthTest:
     notes: tuple[str, ...]
 
     @classmethod
-    def of(cls, reference: str, lengths: Sequence[Length], notes: tuple[str, ...]) -> "LengthTest":
+    def of(cls, reference: str, lengths: Sequence[TestedLength], notes: tuple[str, ...]) -> "LengthTest":
         """Returns the test. The limit of the largest E_n is 1 for one length, and more for many, as more go beyond by
         chance (Bonferroni)."""
         count, e_n = len(lengths), [abs(length.e_n) for length in lengths if length.e_n is not None]
@@ -177,7 +177,7 @@ def _require_size(budget: Budget) -> None:
 
 def _length(
     budget: Budget, ends: tuple[int, int], reference_mm: float, sigma_mm: float, without: Sequence[str] = ()
-) -> Length:
+) -> TestedLength:
     """Returns a corrected length of the run, with U by all sources except ``without`` and by the reference's σ."""
     measurand = distance(budget.joint, *ends)
     variance = sum(
@@ -187,4 +187,4 @@ def _length(
     expanded = 1e3 * COVERAGE_FACTOR * float(np.hypot(np.sqrt(variance), sigma_mm))
     error = 1e3 * (measured - reference_mm)
     e_n = error / expanded if expanded else float(np.copysign(np.inf, error)) if error else 0.0
-    return Length(measurand.circles, measured, reference_mm, error, expanded, e_n)
+    return TestedLength(measurand.circles, measured, reference_mm, error, expanded, e_n)

@@ -19,9 +19,9 @@ from stcal.report.document import (
     tiles,
 )
 from stcal.report.text import NONE, join, number, significant
+from stcal.sfm.budget.budget_file import BudgetFile, SourceRow, Uncertainty, refusals
 from stcal.sfm.budget.combine import Budget, budget_of_run
-from stcal.sfm.budget.file import BudgetFile, SourceRow, Uncertainty, refusals
-from stcal.sfm.budget.lengths import LengthTest, against_run, against_stated, common_views
+from stcal.sfm.budget.length_test import LengthTest, against_run, against_stated, common_views
 from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import AnyRun, saved_run, verify
 

@@ -15,10 +15,10 @@ from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.rims import Rim, common_dome, lost_radius_mm, radius_views
-from stcal.sfm.checks.images import MAD_EFFICIENCY
-from stcal.sfm.checks.verdict import Trial, assess
+from stcal.sfm.checks.image_checks import MAD_EFFICIENCY
+from stcal.sfm.checks.significance import Trial, assess
 from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, Measured, impossible
+from stcal.sfm.report.check import CHECKS, SUSPICIOUS, Check, TestedValue, impossible
 
 EDGE_BIAS_PX = 0.05
 """σ of the bias that light, lens and threshold add to all radii alike; it moves no centre."""
@@ -147,7 +147,7 @@ def rim_check(
         beyond = 0.0 if allowed is None else rim.height_mm - allowed
         what, surface = KINDS[kind]
         look = f"{what} look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep"
-        measured.append(Measured(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
+        measured.append(TestedValue(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
         if abs(beyond) > limit:
             names.append(what)
             where = "in front of" if beyond > 0 else "behind"
@@ -284,7 +284,7 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
         "board pitch" if has_board else "size of the circles' faces", 1e6 * size, "ppm", size**2 / variance, 1, freedom
     )
     check = assess("pitch", [trial], "boards", remedy)
-    single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
+    single = tuple(TestedValue(m.name, 1e6 * m.size, None, "ppm", None) for m in shown)
     reason = check.reason if measures == shown else f"{check.reason}; by positions alone, which radii contradict"
     return replace(check, reason=reason, measured=check.measured + single)
 

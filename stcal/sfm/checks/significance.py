@@ -20,7 +20,7 @@ from stcal.sfm.adjust.network import Network, ScoreTest, free_network, solve_sco
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import GroupModel, WorldModel
-from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, Measured, Verdict
+from stcal.sfm.report.check import CHECKS, FAILED, SUSPICIOUS, Check, TestedValue, Verdict
 
 KNOWN = 1e9
 """Degrees of freedom of a σ that is stated, not estimated."""
@@ -130,7 +130,7 @@ def judge(
         ratio = max(float(np.sqrt(statistic.sum() / freedom.sum())), *beyond)
         verdict, enlarges = ("suspicious", ratio) if ratio <= MOST_ENLARGED else ("failed", 1.0)
     measured = tuple(
-        Measured(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
+        TestedValue(trials[i].name, trials[i].value, trials[i].limit(count), trials[i].unit, float(probability[i]))
         for i in order[:SHOWN]
     )
     largest = f"{measured[0].name} at {measured[0].words()}"
