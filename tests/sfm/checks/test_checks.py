@@ -16,6 +16,7 @@ from stcal.sfm.adjust.joint import SETTLED_PX
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.rims import lost_radius_mm
+from stcal.sfm.checks import face_checks
 from stcal.sfm.checks.board_checks import board_checks
 from stcal.sfm.checks.image_checks import moved_check
 from stcal.sfm.checks.significance import MOST_ENLARGED, Trial, culprits, judge
