@@ -5,7 +5,7 @@ import numpy as np
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.geometry.clusters import NOTED
 from stcal.geometry.print_modes import stretch_in_words
-from stcal.report.camera import distortion_figure
+from stcal.report.camera import field_figure, moved_px
 from stcal.report.document import Answer, Block, Document, Section, Table, bullets, plot, plots
 from stcal.report.svg import INK, SMALL, VIRIDIS, Axes, Drawing, round_below
 from stcal.report.text import number
@@ -64,7 +64,9 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
         f"{result.rounds} rounds of detection",
         [
             Section(
-                "Parameters", [*blocks, plot(lambda: distortion_figure(lens), "What the lens moves")], terminal=True
+                "Parameters",
+                [*blocks, plot(lambda: field_figure(*moved_px(lens)), "What the lens moves")],
+                terminal=True,
             ),
             Section(
                 "Uncertainty over the image",
