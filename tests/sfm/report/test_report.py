@@ -6,6 +6,7 @@ import re
 from html import unescape
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
 from stcal.sfm.report.run_page import report_html
@@ -36,18 +37,6 @@ def face(pose: list, sigma: bool) -> dict:
     }
 
 
-def pair(i: int) -> dict:
-    return {
-        "first": NASTY,
-        "second": f"a/{i}.jpg",
-        "shared": 20,
-        "median_angle_rad": 0.9 - 0.01 * i,
-        "in_front": 1.0,
-        "forward": 0.25,
-        "verdict": "usable" if i else "chosen",
-    }
-
-
 def group() -> dict:
     residuals = {f"board:{r}:{c}": [3.0 * r, -4.0 * c, 0.5] for r in range(2) for c in range(2)}
     return {
@@ -57,7 +46,7 @@ def group() -> dict:
         "points": 12,
         "seeded": "COLMAP's estimate of the chosen pair",
         "rounds": 3,
-        "pairs": [pair(i) for i in range(17)],
+        "pairs": [{"first": NASTY, "second": "a/0.jpg", "median_angle_rad": 0.9}],
         "scale": {
             "mm_per_unit": 116.2175381,
             "mm_per_unit_rows": 116.2175976,
@@ -75,15 +64,6 @@ def group() -> dict:
 
 def by_image(name: str) -> dict:
     return {"image": name, "group": "a", "observations": 12, "rms_px": 0.0035312, "max_px": 0.01079, "worst": "1:0"}
-
-
-def by_label(label: str, of_group: str | None) -> dict:
-    return {"label": label, "group": of_group, "observations": 2, "rms_px": 0.0046, "max_px": 0.0166}
-
-
-def camera_in_space(name: str, x: float) -> dict:
-    axes = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]
-    return {"image": name, "group": "a", "position_mm": [x, 0.0, 900.0], "axes": axes}
 
 
 def make(sigma: bool = True, eccentricity: bool = True) -> dict:
@@ -130,12 +110,23 @@ def make(sigma: bool = True, eccentricity: bool = True) -> dict:
         },
         "groups": [group()],
         "residuals_by_image": [by_image(NASTY), by_image("a/1.jpg")],
-        "residuals_by_label": [*(by_label(c, None) for c in CIRCLES), by_label("board:0:0", "a")],
+        "residuals_by_label": [
+            {"label": label, "group": of_group, "observations": 2, "rms_px": 0.0046, "max_px": 0.0166}
+            for label, of_group in (*((circle, None) for circle in CIRCLES), ("board:0:0", "a"))
+        ],
         "left_out": {"files": [], "images": [], "circles": [], "notes": []},
         "notes": [],
         "images": [{"image_id": i, "name": n, "group": "a", "circles": 12} for i, n in enumerate(OVERLAYS, start=1)],
         "scene": {
-            "cameras": [camera_in_space(NASTY, -100.0), camera_in_space("a/1.jpg", 400.0)],
+            "cameras": [
+                {
+                    "image": name,
+                    "group": "a",
+                    "position_mm": [x, 0.0, 900.0],
+                    "axes": np.diag([1.0, -1.0, -1.0]).tolist(),
+                }
+                for name, x in ((NASTY, -100.0), ("a/1.jpg", 400.0))
+            ],
             "boards": {"a": [[200.0, 0.0, 0.0], [230.0, 0.0, 0.0], [200.0, 30.0, 0.0], [230.0, 30.0, 0.0]]},
             "circles": CIRCLES,
         },
@@ -226,10 +217,6 @@ def test_pictures_are_embedded_whole_and_refer_to_nothing_outside(joint):
     assert report_html(copy.deepcopy(make()), OVERLAYS) == joint
 
 
-def test_a_control_without_eccentricity_raises_an_alarm(joint, chained):
-    assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
-
-
 def test_numbers_have_their_digits(joint):
     faces = rows_of(joint, "faces")
     assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6] in faces
@@ -244,7 +231,8 @@ def test_numbers_have_their_digits(joint):
     assert ["1:0", "2", "0.0046", "0.0166"] in rows_of(joint, "residuals")
 
 
-def test_what_was_not_computed_is_a_dash(chained):
+def test_what_was_not_computed_is_a_dash_and_a_control_without_eccentricity_raises_an_alarm(joint, chained):
+    assert [page.count('role="alert"') for page in (joint, chained)] == [0, 1]
     face_row = next(row for row in rows_of(chained, "faces") if row[0] == "2")
     assert face_row[4:] == ["–"] * 6
     assert "None" not in Page(chained).text
