@@ -26,30 +26,8 @@ from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.adjust.scale import MIN_DOTS, known_points
-from stcal.sfm.checks.board_checks import (
-    KINDS,
-    board_checks,
-    measure_radii,
-    pitch_check,
-    radius_checks,
-    rim_check,
-    rim_limit_mm,
-)
+from stcal.sfm.checks import board_checks, face_checks, image_checks
 from stcal.sfm.checks.causes import whole_set_cause
-from stcal.sfm.checks.face_checks import Again, agreement_check, flatness_check, groups_check, halves_check, loops_check
-from stcal.sfm.checks.image_checks import (
-    NO_ELLIPSES,
-    by_eccentricity,
-    camera_check,
-    evenness_check,
-    field_check,
-    image_check,
-    labels_check,
-    moved_check,
-    sharpness_check,
-    sigma_check,
-    summed,
-)
 from stcal.sfm.checks.significance import Trial, assess
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
 from stcal.sfm.report.check import CHECKS, Check, TestedValue, impossible
@@ -112,14 +90,14 @@ def shows_rim(evidence: Evidence) -> bool:
     if evidence.calibration.joint is None or evidence.target.rim_of():
         return False
     rims, sigma_mm, _ = _rims(evidence)
-    return "circles" in rims and rims["circles"].height_mm > rim_limit_mm(rims["circles"], sigma_mm)
+    return "circles" in rims and rims["circles"].height_mm > board_checks.rim_limit_mm(rims["circles"], sigma_mm)
 
 
 def _before_circles_mm(evidence: Evidence, rims: Mapping[str, Rim], check: Check) -> dict[Label, float]:
     """Heights of the rims in front of circles and dots: estimated if allowed for or found, else as stated."""
     stated = {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
     of_label = {label: "dots" if isinstance(label, DotLabel) else "circles" for label in evidence.radius_mm()}
-    found = {kind for kind in rims if evidence.rim or KINDS[kind][0] in check.names}
+    found = {kind for kind in rims if evidence.rim or board_checks.KINDS[kind][0] in check.names}
     return {k: rims[kind].height_mm if kind in found else stated.get(k, 0.0) for k, kind in of_label.items()}
 
 
@@ -128,26 +106,28 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     rims, sigma_mm, allowed = _rims(evidence)
-    of_rims = rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
+    of_rims = board_checks.rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm()))
     before_mm = _before_circles_mm(evidence, rims, of_rims)
-    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
+    radii = board_checks.measure_radii(networks, evidence.images, evidence.radius_mm(), camera, before_mm)
     joint, known_faces = calibration.joint, {face.id for face in faces_of_known_shape(board)}
     factors = (1.0, 1.0) if joint is None else (joint.print_factor, joint.bend_factor)
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
-        lambda: camera_check(networks, evidence.camera, calibration, evidence.prior, evidence.camera_given),
-        lambda: field_check(networks, camera),
-        lambda: sigma_check(networks, calibration.sigma_factors.all),
+        lambda: image_checks.camera_check(
+            networks, evidence.camera, calibration, evidence.prior, evidence.camera_given
+        ),
+        lambda: image_checks.field_check(networks, camera),
+        lambda: image_checks.sigma_check(networks, calibration.sigma_factors.all),
         *_joint_checks(evidence, networks),
-        lambda: moved_check(networks),
-        lambda: image_check(networks),
-        lambda: sharpness_check(networks, evidence.blur_px),
-        lambda: evenness_check(networks, evidence.images, camera, bool(evidence.radius_mm())),
-        lambda: labels_check(networks, evidence.outliers, evidence.images, camera),
-        lambda: board_checks(networks, board),
-        lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
-        lambda: radius_checks(radii),
+        lambda: image_checks.moved_check(networks),
+        lambda: image_checks.image_check(networks),
+        lambda: image_checks.sharpness_check(networks, evidence.blur_px),
+        lambda: image_checks.evenness_check(networks, evidence.images, camera, bool(evidence.radius_mm())),
+        lambda: image_checks.labels_check(networks, evidence.outliers, evidence.images, camera),
+        lambda: board_checks.board_checks(networks, board),
+        lambda: board_checks.pitch_check(calibration.target, target, radii, bool(board.rows)),
+        lambda: board_checks.radius_checks(radii),
         lambda: of_rims,
-        lambda: flatness_check(networks, evidence.options.flatness_mm, known_faces, factors[1]),
+        lambda: face_checks.flatness_check(networks, evidence.options.flatness_mm, known_faces, factors[1]),
         lambda: control_check(evidence, networks),
     )
     if isinstance(board, ScaleReference):  # the target tells its size itself
@@ -177,14 +157,14 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
     if joint is None:
         reason = "needs the covariances of the joint adjustment"
         return [partial(impossible, key, reason, "run with --solve joint") for key in JOINT]
-    again = Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
+    again = face_checks.Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
     linked = {model.group for model in joint.models}
     linked_networks = [n for n in networks if n.model.group in linked]
     return [
-        partial(agreement_check, joint, linked_networks),
-        partial(halves_check, again),
-        partial(groups_check, again, linked_networks),
-        partial(loops_check, again),
+        partial(face_checks.agreement_check, joint, linked_networks),
+        partial(face_checks.halves_check, again),
+        partial(face_checks.groups_check, again, linked_networks),
+        partial(face_checks.loops_check, again),
     ]
 
 
@@ -197,13 +177,13 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         return impossible("control", "this run is the control", "run with eccentricity")
     if not any(n.model.shift_px.any() for n in networks):
         return impossible("control", "no circle is in the result", "add views of the faces with circles")
-    test = solve_score(*summed(networks, by_eccentricity))
+    test = solve_score(*image_checks.summed(networks, image_checks.by_eccentricity))
     if not test.freedom:
         return impossible("control", "poses and circles explain any eccentricity", "add tilted views of the faces")
     redundancy = sum(n.redundancy.sum() for n in networks)
     share = float(test.estimate[0])
     trial = Trial("share of the eccentricity found, minus 1", share, "", test.statistic, test.freedom, redundancy)
-    check = assess("control", [trial], "corrections", NO_ELLIPSES)
+    check = assess("control", [trial], "corrections", image_checks.NO_ELLIPSES)
     try:
         whole = evidence.calibration.target.target_from_face
         message, measured = _control(evidence) if whole else ("no face that it could move", ())
