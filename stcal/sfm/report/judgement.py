@@ -108,15 +108,11 @@ class _Run:
     """What is decided by, of the content of ``report.json``."""
 
     def __init__(self, report: dict):
-        self.report, self.faces, self.summary, self.options = (
-            report,
-            *(report[k] for k in ("faces", "summary", "options")),
-        )
-        every = ranked(
-            [Check.read(row) for row in report.get("checks", [])], {image["name"] for image in report["images"]}
-        )
-        self.cause = next((check for check in every if check.key == CAUSE), None)
-        self.every, self.checks = every, [check for check in every if check is not self.cause]
+        self.report, (self.faces, self.summary) = report, (report["faces"], report["summary"])
+        self.options, images = report["options"], {image["name"] for image in report["images"]}
+        self.every = ranked([Check.read(row) for row in report.get("checks", [])], images)
+        self.cause = next((check for check in self.every if check.key == CAUSE), None)
+        self.checks = [check for check in self.every if check is not self.cause]
         self.open = [check for check in self.checks if check.told() == "not possible"]
         self.made = sum(check.verdict != "not possible" for check in self.checks)
         self.lost = [note for note in report["notes"] if note["code"] == GROUP_LEFT_OUT]
@@ -182,16 +178,16 @@ class _Run:
         if self.cause and self.cause.verdict == "failed":
             of = f"; that is the likely cause of {n} of {made} checks that failed" if n else ""
             return "no", f"{self.cause.cause}{of}"
-        first = next((check for check in self.every if check is not self.cause), None)
-        if n and first:
-            return "no", f"{n} of {made} checks failed, the first: {first.title}"
+        if n:
+            return "no", f"{n} of {made} checks failed, the first: {self.checks[0].title}"
         if different := self.report.get("crosscheck", {}).get("differences"):
             return "with care", f"the native COLMAP comes to other faces ({different[0]})"
         if words := self._larger():
             return "with care", f"{words}{f'; the likely cause: {self.cause.cause}' if self.cause else ''}"
         if self.cause:
             return "with care", f"{self.cause.cause}, though no check failed"
-        if (n := counts["suspicious"]) and first:
+        if n := counts["suspicious"]:
+            first = self.checks[0]
             by_chance = f"; of {made} checks one is so by chance in one sound run of {round(1 / SUSPICIOUS / made)}"
             # A residual beyond its limit that was left out is none by chance, and has no probability.
             chance = all(value.probability is not None for value in first.measured[:1])
@@ -202,8 +198,7 @@ class _Run:
             return "with care", "groups were solved one by one; there are no σ, and there are fewer checks"
         testing = {check.verdict for check in self.checks if check.key in TESTED_BY}
         if testing == {"not possible"}:
-            few = f"the photographs are too few to test one another, {missing} checks were not possible"
-            return "with care", few
+            return "with care", f"the photographs are too few to test one another, {missing} checks were not possible"
         passed = f"{counts['passed']} checks passed" if counts["passed"] else "nothing was checked"
         open_ = f", {missing} {'was' if missing == 1 else 'were'} not possible" if missing else ""
         return "yes", f"{passed}{open_}"

@@ -57,9 +57,9 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
         scope += ". The σ stated of the size are in them" if {"faces", "distances"} & set(sources) else ""
         absent = [] if refined else ["the camera calibration"]
         absent += ["the pitch as a whole (100 ppm is 4 K on aluminium)"] if words.board else []
-        scope += (
-            f". An error of {', or of '.join(absent)} is not in them, and residuals hardly show it" if absent else ""
-        )
+        if absent:
+            errors = ", or of ".join(absent) + "," * (len(absent) > 1)
+            scope += f". An error of {errors} is not in them, and residuals hardly show it"
     factor, sigma0 = summary["sigma_factor"], summary["sigma0"]
     larger = "as large as" if 0.95 <= factor <= 1.05 else f"{factor:.1f} times"
     of_groups = f"group by group, residuals are {larger} the centres' own σ"
